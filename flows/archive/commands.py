@@ -20,7 +20,7 @@ from storage.archive.whole_files import to_json
 from storage.maintenance.garbage import Removal, clear_up
 from storage.maintenance.repair import Repaired, Rerun
 from storage.maintenance.verification import Finding
-from storage.remote.opening import open_archive, put_back_archive, repair_archive
+from storage.remote.opening import open_archive, put_back_archive, repair_archive, verify_archive
 
 DONE, FAILED, PARTLY = 0, 1, 3
 
@@ -121,7 +121,7 @@ def _versions() -> Mapping[str, int]:
 
 def _read_again(archive: Archive, console: Console) -> list[Finding]:
     with StageProgress(console, {"verify": "reading again"}) as bars:
-        findings = archive.verify_all(lambda uri, done: bars.show("verify", done, uri))
+        findings = verify_archive(archive, lambda uri, done: bars.show("verify", done, uri))
         bars.show("verify", 1.0, ended=True)
     return findings
 

@@ -19,11 +19,9 @@ from flows.terminal.shown_text import on_stdout
 from pipeline.errors import ArchiveError, SceneError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.simulator.scenes.farm.farm_scene import REMOVED_LAW, law_of_key
-from storage.archive.addresses import in_text
 from storage.archive.archive import Archive
-from storage.archive.changes import ABSENT, flatten
-from storage.archive.lineage import Catalogue
-from storage.archive.product_names import find_product
+from storage.archive.keys import in_text
+from storage.archive.lineage import ABSENT, Catalogue, find_product, flatten
 from storage.archive.records import Run
 from storage.archive.whole_files import to_json, written_aside
 from storage.arrays.class_maps import ClassMap, load_class_map

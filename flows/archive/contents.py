@@ -10,9 +10,7 @@ from typing import Any
 
 from flows.survey.scores import score_of
 from storage.archive.archive import Archive
-from storage.archive.changes import changes_between, version_before
-from storage.archive.lineage import Catalogue
-from storage.archive.product_names import find_product
+from storage.archive.lineage import Catalogue, changes_between, find_product, version_before
 from storage.archive.records import Run, Store
 from storage.maintenance.repair import plan_repair
 from storage.maintenance.verification import Finding

@@ -8,9 +8,18 @@ from pathlib import Path
 from typing import Any
 
 from flows.archive.export_layers import ExportedRun, Layer, seen_rows
-from storage.arrays.stored_images import load_bands
-from storage.export.stac_fields import ZARR, angular, clean_id, footprint, projection, spectral_bands, wavelengths
-from storage.export.stac_items import Collection, Item
+from storage.arrays.ground_maps import load_bands
+from storage.export.stac_items import (
+    ZARR,
+    Collection,
+    Item,
+    angular,
+    clean_id,
+    footprint,
+    projection,
+    spectral_bands,
+    wavelengths,
+)
 
 NOT_PLACED = (
     "The survey has no rig pose: its images lie on the camera's angular grid (transforms in radians), and where on "

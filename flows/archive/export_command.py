@@ -26,12 +26,11 @@ from pipeline.errors import ArchiveError, PipelineError
 from storage.archive.staging import take_lock
 from storage.archive.whole_files import remove_leftovers
 from storage.arrays.cubes import open_raw_cube
+from storage.arrays.ground_maps import load_bands, open_image
 from storage.arrays.layout import SHARD_ROWS
-from storage.arrays.stored_images import load_bands, open_image
 from storage.export.cog_files import need_rasterio, write_cog
 from storage.export.envi_writer import EnviFile, write_envi
-from storage.export.stac_fields import COG
-from storage.export.stac_items import check_owner, need_pystac, write_stac
+from storage.export.stac_items import COG, check_owner, need_pystac, write_stac
 from storage.remote.opening import open_archive
 
 ENVI_NUMBERS = "application/octet-stream"

@@ -18,12 +18,11 @@ from pipeline.errors import IncompleteStoreError, SettingsError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
 from storage.archive.archive import Archive, StageRef
 from storage.archive.records import RECEIPT, read_run
-from storage.arrays.georeference import load_geobox
-from storage.arrays.ground_maps import ClassLegend
+from storage.arrays.class_maps import ClassNames
+from storage.arrays.ground_maps import StoredImage, load_geobox, open_image
 from storage.arrays.layout import grid_of
-from storage.arrays.stored_images import StoredImage, open_image
 from storage.export.cog_files import ANGULAR, CogImage, Place
-from storage.export.stac_fields import classes
+from storage.export.stac_items import classes
 
 Rows = Iterator[tuple[int, NDArray[Any]]]
 RGB = ("red", "green", "blue")
@@ -148,9 +147,9 @@ def map_layers(run: ExportedRun) -> list[Layer]:
     ]
 
 
-def _legend(stored: StoredImage) -> ClassLegend:
+def _legend(stored: StoredImage) -> ClassNames:
     names, colours = (stored.about.get(f"class_{word}", ()) for word in ("names", "colours"))
-    return ClassLegend(tuple(names), np.array(colours, np.uint8).reshape(-1, 3))
+    return ClassNames(tuple(names), np.array(colours, np.uint8).reshape(-1, 3))
 
 
 def _tags(run: ExportedRun, product: str, place: Place) -> dict[str, str]:
@@ -181,7 +180,7 @@ def _layer(
     bands: tuple[str, ...],
     *,
     nodata: float,
-    legend: ClassLegend | None = None,
+    legend: ClassNames | None = None,
 ) -> tuple[CogImage, Callable[[], Rows]]:
     stored = open_image(run.path(product), array)
     place = _place(run, stored)

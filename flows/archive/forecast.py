@@ -15,11 +15,9 @@ from flows.survey.run import SurveyRun, open_run
 from flows.survey.stage import Stage, Wanted
 from flows.survey.survey import STAGES, judge, survey
 from pipeline.errors import IncompleteStoreError, PipelineError
-from storage.archive.addresses import store_at
 from storage.archive.archive import Archive, StageRef
-from storage.archive.changes import Change, changes_between
-from storage.archive.keys import plain
-from storage.archive.lineage import Catalogue
+from storage.archive.keys import plain, store_at
+from storage.archive.lineage import Catalogue, Change, changes_between
 from storage.archive.records import Store
 from storage.remote.opening import is_archive, open_archive
 

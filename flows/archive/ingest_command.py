@@ -15,8 +15,7 @@ from pipeline.errors import SceneError
 from storage.archive.archive import Archive, StageRef
 from storage.archive.staging import check_name, file_hash
 from storage.readers.cube_sources import CubeSource
-from storage.readers.ingested_cubes import Report, SourceFile, write_ingested_cube
-from storage.readers.scan_files import open_cube_source, with_wavelengths
+from storage.readers.scan_files import Report, SourceFile, open_cube_source, with_wavelengths, write_ingested_cube
 from storage.remote.opening import open_archive
 
 STAGE = "ingest"

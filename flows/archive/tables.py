@@ -14,7 +14,7 @@ from rich.tree import Tree
 
 from flows.publish.receipt import is_pending
 from flows.terminal.figures import DASH, counted, format_bytes, format_points, format_seconds
-from storage.archive.addresses import in_text
+from storage.archive.keys import in_text
 
 SHORT_KEY = 12
 WHOLE = ("when", "key", "seed", "budget", "mIoU", "size", "state", "age", "stage", "what")  # columns never folded

@@ -40,13 +40,11 @@ from storage.archive.archive import StageRef
 from storage.archive.records import StageRecord, read_run
 from storage.archive.run_folders import RunDraft
 from storage.archive.whole_files import to_json
-from storage.arrays.attention import load_attention
 from storage.arrays.class_maps import ClassMap, load_class_map
 from storage.arrays.cubes import RawCube
-from storage.arrays.ground_maps import load_ground_map
-from storage.arrays.patches import open_patches
+from storage.arrays.ground_maps import load_ground_map, open_image
+from storage.arrays.mosaics import load_attention, open_patches
 from storage.arrays.quicklooks import choose_bands
-from storage.arrays.stored_images import open_image
 
 IN_STORES = {  # products of a receipt: the stage that leaves them, and where in its store
     "effects": ("choose_effects", "/effects.json"),

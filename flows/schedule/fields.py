@@ -21,8 +21,7 @@ from flows.settings.survey_settings import Settings
 from pipeline.errors import ArchiveError, PipelineError, RigError, SettingsError
 from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES
 from storage.archive.ledger import Ledger
-from storage.archive.staging import take_lock
-from storage.archive.toml_files import read_toml
+from storage.archive.staging import read_toml, take_lock
 from storage.remote.opening import open_archive
 
 

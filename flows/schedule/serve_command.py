@@ -20,7 +20,7 @@ from flows.schedule.prefect_schedule import serve_prefect
 from flows.schedule.served import ServeRequest
 from flows.schedule.times import parse_timetable
 from pipeline.errors import SettingsError
-from storage.remote.object_places import is_remote
+from storage.remote.object_stores import is_remote
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,7 +13,7 @@ from flows.settings.rules import check_together, place_of
 from flows.settings.survey_settings import BUILT_IN_SCENES, PATHS, REPLACED, RIG_FIELD, Settings
 from pipeline.errors import PoseError, SettingsError
 from pipeline.simulator.scenes.farm.farm_scene import REMOVED_LAW
-from storage.archive.toml_files import read_toml
+from storage.archive.staging import read_toml
 
 
 def load_settings(path: str | Path | None = None, flags: Mapping[str, object] | None = None) -> Settings:

@@ -19,11 +19,9 @@ from models.reading.regions import HALO_CELLS, REGION_PX, Region, most_bytes, pl
 from pipeline.errors import SettingsError
 from pipeline.geometry.grid import SceneGrid
 from storage.arrays.layout import SHARD_COLUMNS, SHARD_ROWS
-from storage.arrays.mosaics import mosaic_wavelengths
-from storage.arrays.patches import open_patches
+from storage.arrays.mosaics import mosaic_wavelengths, open_patches
 from storage.arrays.tile_work import RESERVED_BYTES
-from storage.parallel.block_work import run_blocks
-from storage.parallel.crew import Crew
+from storage.parallel.crew import Crew, run_blocks
 
 SHARD = (SHARD_ROWS, SHARD_COLUMNS)
 IMAGE_BYTES = 128  # a coarse pixel, of what a policy of the whole image holds at once beside the columns

@@ -20,8 +20,7 @@ from models.weights.files import Weights, content_key, load_weights
 from pipeline.errors import WeightsError
 from pipeline.readings import beyond_range, readings_alone
 from storage.arrays.class_maps import write_class_tile
-from storage.arrays.mosaics import mosaic_strips, mosaic_wavelengths
-from storage.arrays.patches import PATCHES_A_SHARD, PatchStore, open_patches
+from storage.arrays.mosaics import PATCHES_A_SHARD, PatchStore, mosaic_strips, mosaic_wavelengths, open_patches
 from storage.arrays.tile_work import let_tiles_go
 
 Strange = tuple[int, int]  # coarse pixels, and fine ones, with a value that is no reading

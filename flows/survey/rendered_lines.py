@@ -10,8 +10,7 @@ from threading import Semaphore
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.simulated import BLOCK_LINES, SimulatedSource
 from pipeline.source import Line, Source
-from storage.parallel.block_work import run_blocks
-from storage.parallel.crew import Crew
+from storage.parallel.crew import Crew, run_blocks
 
 Take = Callable[[Line], None]
 

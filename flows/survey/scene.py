@@ -16,7 +16,7 @@ from pipeline.geometry.grid import UNLABELLED
 from pipeline.lazy import Once
 from pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE, farm_scene, law_of_key
 from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
-from storage.readers.declared_sizes import machine_bytes
+from storage.readers.cube_sources import machine_bytes
 from storage.readers.raster_files import load_raster
 from storage.readers.scene_files import load_scene_file
 

@@ -21,8 +21,7 @@ from pipeline.rectify.region import mosaic_rows
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
-from storage.arrays.codec_trials import CODECS, store_in_memory
-from storage.arrays.layout import round_bits
+from storage.arrays.layout import CODECS, round_bits, store_in_memory
 
 SHAPE = (384, 640)
 RAW_LINES = 96

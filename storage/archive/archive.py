@@ -25,15 +25,24 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import ArchiveError
-from storage.archive.addresses import StageRef, in_text, published_runs, published_stores, store_at, without_manifest
-from storage.archive.folder import open_folder
-from storage.archive.keys import plain, stage_key
+from storage.archive.keys import (
+    StageRef,
+    in_text,
+    open_folder,
+    plain,
+    published_runs,
+    published_stores,
+    stage_key,
+    store_at,
+    without_manifest,
+)
 from storage.archive.lineage import rests_on
 from storage.archive.manifests import (
     Cost,
-    Stopwatch,
     check_files,
+    clocks,
     cost_of,
+    cost_since,
     made_bytes,
     manifest_sha256,
     read_manifest,
@@ -50,9 +59,8 @@ from storage.archive.staging import (
     retire,
     take_lock,
 )
-from storage.maintenance.verification import Finding, Progress, verify_everything
 
-__all__ = ["Archive", "Cost", "Finding", "RunDraft", "StageRef", "StagedStore", "stage_key"]
+__all__ = ["Archive", "Cost", "RunDraft", "StageRef", "StagedStore", "stage_key"]
 
 
 @dataclass(frozen=True)
@@ -76,9 +84,7 @@ class Archive:
     def open(cls, root: str | Path, *, create: bool = True, write: bool = True) -> Archive:
         """Open the archive in a folder, or make it where ``create``; `storage.remote.opening` knows buckets as well.
 
-        Raises
-        ------
-        ArchiveError : the path is a file, is not there, or does not let itself be written to (``write``).
+        Raises ArchiveError: the path is a file, is not there, or does not let itself be written to (``write``).
         """
         path = Path(root).absolute()
         open_folder(path, create=create, write=write)
@@ -106,9 +112,8 @@ class Archive:
     def locate(self, address: str) -> Path:
         """Where on this machine a product lies by its address relative to the archive, as a receipt gives it.
 
-        Raises
-        ------
-        IncompleteStoreError : its store is not there, or a file of it is missing, cut short, a link or no file at all.
+        Raises IncompleteStoreError: its store is not there, or a file of it is missing, cut short, a link or no file at
+        all.
         """
         uri = in_text(address)
         if uri is not None:
@@ -118,9 +123,7 @@ class Archive:
     def find(self, stage: str, key: str) -> StageRef | None:
         """The published store, or None. Sizes are compared with the manifest, content only by :meth:`verify`.
 
-        Raises
-        ------
-        IncompleteStoreError : it is there, but its manifest or a file is missing, or has another size.
+        Raises IncompleteStoreError: it is there, but its manifest or a file is missing, or has another size.
         """
         ref = store_at(self.root, stage, key)
         if not os.path.lexists(ref.path):
@@ -141,13 +144,10 @@ class Archive:
     ) -> Iterator[StagedStore]:
         """Give a folder to write into, and publish it when the block ends well.
 
-        One process at a time makes a key; the others wait and then find ``done``. When the block fails, the folder
-        is removed and the archive is as before. The manifest says what the block took, with ``work``, how much it had
-        to do in units of the stage's own: from these the cost of the next one is estimated.
-
-        Raises
-        ------
-        ArchiveError : the disk refuses; the message names the path and what to do.
+        One process at a time makes a key; the others wait and then find ``done``. When the block fails, the folder is
+        removed and the archive is as before. The manifest says what the block took, with ``work``, how much it had to
+        do in units of the stage's own: from these the cost of the next one is estimated. Raises ArchiveError: the disk
+        refuses; the message names the path and what to do.
         """
         ref = self.ref(stage, key)
         final = self.root / ref.uri
@@ -158,10 +158,10 @@ class Archive:
             remove_tree(part)
             part.mkdir(parents=True)
             try:
-                watch = Stopwatch()
+                start = clocks()
                 yield StagedStore(part, ref, done)
                 if not done:
-                    facts |= {"cost": watch.cost(work), "created": date_of_store(self.root, ref.uri)}
+                    facts |= {"cost": cost_since(start, work), "created": date_of_store(self.root, ref.uri)}
                     write_manifest(part, facts)
                     self._put_in_place(part, final)
             finally:
@@ -252,15 +252,9 @@ class Archive:
     def verify(self, ref: StageRef) -> None:
         """Read every byte of one store again.
 
-        Raises
-        ------
-        IncompleteStoreError : names the first file that is missing, changed or not listed.
+        Raises IncompleteStoreError: names the first file that is missing, changed or not listed.
         """
         check_files(ref.path, hashes=True)
-
-    def verify_all(self, progress: Progress | None = None) -> list[Finding]:
-        """Check every store and every run; each file and shard that is broken has a finding of its own."""
-        return verify_everything(self.root, progress)
 
     def reclaim(self) -> list[str]:
         """Remove unfinished folders that no living process works on; gives their addresses."""
@@ -329,11 +323,8 @@ class Archive:
     def extend_run(self, run_id: str, *, wait: bool = True) -> RunDraft | None:
         """Begin to add to a published run; it stays as it is until :meth:`RunDraft.publish` of what is given.
 
-        One process at a time does so; None where another does and ``wait`` is false.
-
-        Raises
-        ------
-        ArchiveError : there is no run of this name.
+        One process at a time does so; None where another does and ``wait`` is false. Raises ArchiveError: there is no
+        run of this name.
         """
         check_name(run_id)
         folder = self.root / "runs" / (run_id + PART_SUFFIX)

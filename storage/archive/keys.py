@@ -1,4 +1,7 @@
-"""Keys of stages: a hash of what went in, so that the same work has the same address."""
+"""Keys of stages, a hash of what went in, so that the same work has the same address; and addresses in an archive.
+
+Stores and runs are told apart from what merely lies there, and the folder of an archive from what cannot be one.
+"""
 
 from __future__ import annotations
 
@@ -6,19 +9,24 @@ import dataclasses
 import hashlib
 import json
 import math
+import os
+import re
+import secrets
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from enum import Enum
-from pathlib import PurePath
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ArchiveError
+from storage.archive.staging import MANIFEST_NAME, PART_SUFFIX, check_name, is_name, refusals, sync_path
 
 KEY_LENGTH = 20
 SIGNIFICANT_DIGITS = 12
-_EXACT_INTEGERS = 2.0**53
 
 
 def stage_key(
@@ -27,11 +35,7 @@ def stage_key(
     """Key of one stage's output: 20 hex digits of the SHA-256 of stage, version, parameters and input keys.
 
     Floats count to 12 significant digits, 2 and 2.0 alike; the order of parameters does not count, that of a list of
-    inputs does.
-
-    Raises
-    ------
-    ArchiveError : a parameter is of a kind that has no lasting text, such as a function.
+    inputs does. Raises ArchiveError: a parameter is of a kind that has no lasting text, such as a function.
     """
     facts = {"stage": stage, "version": str(version), "params": params, "inputs": inputs}
     return hashlib.sha256(canonical_json(facts).encode()).hexdigest()[:KEY_LENGTH]
@@ -53,31 +57,19 @@ def plain(value: object) -> Any:
     if isinstance(value, int):
         return value
     if isinstance(value, float):
-        return _plain_float(value)
+        if not math.isfinite(value):
+            return f"{value}"
+        rounded = float(f"{value:.{SIGNIFICANT_DIGITS}g}")
+        return int(rounded) if rounded.is_integer() and abs(rounded) < 2.0**53 else rounded
     if isinstance(value, PurePath):
         return value.as_posix()
-    if isinstance(value, bytes | np.ndarray):
-        return _plain_bytes(value)
-    return _plain_group(value)
-
-
-def _plain_float(value: float) -> int | float | str:
-    if not math.isfinite(value):
-        return f"{value}"
-    rounded = float(f"{value:.{SIGNIFICANT_DIGITS}g}")
-    return int(rounded) if rounded.is_integer() and abs(rounded) < _EXACT_INTEGERS else rounded
-
-
-def _plain_bytes(value: bytes | np.ndarray[Any, Any]) -> dict[str, Any]:
     if isinstance(value, bytes):
         return {"sha256": hashlib.sha256(value).hexdigest()}
-    if value.dtype.kind == "O":
-        raise ArchiveError("an array of objects cannot be part of a key; give numbers")
-    content = hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
-    return {"dtype": value.dtype.str, "shape": list(value.shape), "sha256": content}
-
-
-def _plain_group(value: object) -> Any:
+    if isinstance(value, np.ndarray):
+        if value.dtype.kind == "O":
+            raise ArchiveError("an array of objects cannot be part of a key; give numbers")
+        content = hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
+        return {"dtype": value.dtype.str, "shape": list(value.shape), "sha256": content}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):
@@ -92,3 +84,109 @@ def _plain_group(value: object) -> Any:
 def array_digest(array: NDArray[np.generic]) -> str:
     """Hash of an array's shape and values."""
     return hashlib.sha256(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes()).hexdigest()[:20]
+
+
+STORE_URI = re.compile(r"stages/([^/\s]+)/([^/\s]+)")
+SECOND = len("20261120T101701")  # of a run's name: when it was begun
+
+
+@dataclass(frozen=True)
+class StageRef:
+    """Address of one published store: what tasks hand to each other instead of arrays."""
+
+    stage: str
+    key: str
+    path: Path
+
+    @property
+    def uri(self) -> str:
+        """Address relative to the archive."""
+        return f"stages/{self.stage}/{self.key}"
+
+
+def store_at(root: Path, stage: str, key: str) -> StageRef:
+    """Address of a store, whether it is there or not (ArchiveError: no such names can be)."""
+    check_name(stage)
+    check_name(key)
+    return StageRef(stage, key, root / "stages" / stage / key)
+
+
+def published_stores(root: Path, stage: str | None = None) -> list[StageRef]:
+    """Every published store (of one stage), by stage and key."""
+    folders = sorted((root / "stages").glob(f"{stage or '*'}/*"))
+    return [StageRef(path.parent.name, path.name, path) for path in folders if _is_published(path)]
+
+
+def published_runs(root: Path) -> list[Path]:
+    """Folders of the published runs, oldest first: by the second in their names, then by when they were written."""
+    folders = [path for path in (root / "runs").glob("*") if _is_published(path)]
+    ages = {path: (path / MANIFEST_NAME).lstat().st_mtime_ns for path in folders}
+    return sorted(ages, key=lambda folder: (folder.name[:SECOND], ages[folder], folder.name))
+
+
+def _is_published(folder: Path) -> bool:
+    """Whether a folder has a manifest, be it a damaged one, or a link."""
+    return not folder.name.endswith(PART_SUFFIX) and os.path.lexists(folder / MANIFEST_NAME)
+
+
+def without_manifest(root: Path) -> list[Path]:
+    """What lies among stores and runs and is neither: folders that lost their manifest, and other people's files."""
+    inside = [*root.glob("stages/*/*"), *root.glob("runs/*")]
+    loose = [path for path in root.glob("stages/*") if not path.is_dir()]
+    return sorted(path for path in (*inside, *loose) if not path.name.endswith(PART_SUFFIX) and not _is_published(path))
+
+
+def in_text(text: str) -> str | None:
+    """The store's address that a text such as ``stages/rectify/<key>/mosaic.zarr`` begins with, or None."""
+    found = STORE_URI.match(text)
+    if found is None or not all(is_name(part) for part in found.groups()):  # stages/../.. leads out of the archive
+        return None
+    return found.group(0)
+
+
+PARTS = ("stages", "runs", "spool", "schedule", ".aside", ".locks")
+
+
+def open_folder(path: Path, *, create: bool, write: bool) -> None:
+    """Make an archive's folder where ``create``, and see whether it can be used.
+
+    Raises ArchiveError: the path is a file, is not there, or does not let itself be read or written to (``write``).
+    """
+    try:
+        with refusals(path, "use the archive"):
+            _open_folder(path, create=create, write=write)
+    except ArchiveError:
+        raise
+    except (FileExistsError, NotADirectoryError) as error:
+        raise ArchiveError(
+            f"{error.filename} is or lies below a file, expected a folder; choose another --out"
+        ) from error
+    except OSError as error:  # at the door whatever the system answers means that this is no place for an archive
+        raise ArchiveError(f"cannot use {path} as an archive: {error.strerror}; choose another --out") from error
+
+
+def _open_folder(path: Path, *, create: bool, write: bool) -> None:
+    if path.exists() and not path.is_dir():
+        raise ArchiveError(f"{path} is a file, expected a folder for the archive; choose another --out")
+    if not create and not (path / "stages").is_dir():
+        state = "is a folder but no archive (it has no folder stages)" if path.is_dir() else "is not there"
+        raise ArchiveError(f"{path} {state}; check the name, or make an archive with survey --out")
+    for part in (*(path / name for name in PARTS), *(path / "stages").glob("*")):  # the archive's name may be a link
+        if part.is_symlink():
+            raise ArchiveError(
+                f"{part} is a link, which is not followed; put the folder that it leads to in its place, or "
+                f"mount it there"
+            )
+    if create and not (path / "stages").is_dir():
+        (path / "stages").mkdir(parents=True, exist_ok=True)
+        for named in (path, path.parent):
+            sync_path(named)
+    if write:  # a small file: rights alone do not tell of a read-only or full disk
+        probe = path / f".probe-{os.getpid()}-{secrets.token_hex(4)}"
+        try:
+            probe.write_bytes(b"written to see whether this can be written to")
+        finally:
+            with suppress(OSError):
+                probe.unlink(missing_ok=True)
+    if not os.access(path, os.R_OK | os.X_OK):
+        raise ArchiveError(f"cannot read the archive {path}: permission is denied; change the folder's rights")

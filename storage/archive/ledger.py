@@ -22,8 +22,7 @@ from typing import Any
 
 from pipeline.checked_lines import read_checked, with_check
 from pipeline.errors import ArchiveError
-from storage.archive.plain_files import open_plain, read_plain
-from storage.archive.staging import is_name, refusals, sync_path
+from storage.archive.staging import is_name, open_plain, read_plain, refusals, sync_path
 
 FOLDER = "schedule"
 SUFFIX = ".jsonl"
@@ -41,9 +40,7 @@ class Ledger:
     def lines(self) -> list[dict[str, Any]]:
         """Every line that can be believed, oldest first; none of a field that was never scheduled.
 
-        Raises
-        ------
-        ArchiveError : the file is there and cannot be read.
+        Raises ArchiveError: the file is there and cannot be read.
         """
         try:
             content = read_plain(self.path)
@@ -56,9 +53,7 @@ class Ledger:
     def append(self, line: Mapping[str, Any]) -> None:
         """Add one line, for good.
 
-        Raises
-        ------
-        ArchiveError : the disk refuses; what was there stays.
+        Raises ArchiveError: the disk refuses; what was there stays.
         """
         content = with_check(json.dumps(line, ensure_ascii=False, allow_nan=False).encode())
         with refusals(self._root, "write to the archive"):
@@ -66,7 +61,16 @@ class Ledger:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             descriptor = open_plain(self.path, os.O_RDWR | os.O_CREAT)
             try:
-                _write_at_end(descriptor, content)
+                end = os.lseek(descriptor, 0, os.SEEK_END)
+                torn = end > 0 and os.pread(descriptor, 1, end - 1) != b"\n"
+                try:
+                    waiting = memoryview(b"\n" + content if torn else content)
+                    while waiting:
+                        waiting = waiting[os.write(descriptor, waiting) :]
+                    os.fsync(descriptor)
+                except OSError:  # what the disk takes half of is taken back
+                    os.ftruncate(descriptor, end)
+                    raise
             finally:
                 os.close(descriptor)
             if fresh:
@@ -90,18 +94,3 @@ def ledgers(root: Path) -> list[Ledger]:
     """The ledgers of an archive, by the names of their fields."""
     found = sorted((root / FOLDER).glob(f"*{SUFFIX}"))
     return [Ledger(root, path.name.removesuffix(SUFFIX)) for path in found if is_name(path.name.removesuffix(SUFFIX))]
-
-
-def _write_at_end(descriptor: int, content: bytes) -> None:
-    """Write below the last line, torn or whole; what the disk takes half of is taken back."""
-    end = os.lseek(descriptor, 0, os.SEEK_END)
-    torn = end > 0 and os.pread(descriptor, 1, end - 1) != b"\n"
-    content = b"\n" + content if torn else content
-    try:
-        written = os.write(descriptor, content)
-        while written < len(content):
-            written += os.write(descriptor, content[written:])
-        os.fsync(descriptor)
-    except OSError:
-        os.ftruncate(descriptor, end)
-        raise

@@ -1,18 +1,22 @@
 """What rests on what: every store and run of an archive as their manifests and receipts tell.
 
-Nothing here trusts what it reads: a damaged manifest is a store with a problem, an input that is not there a name.
+Products by the names that people give them, and what differs between a store and the version of it before. Nothing here
+trusts what it reads: a damaged manifest is a store with a problem, an input that is not there a name.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+import difflib
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any, Literal
 
-from storage.archive.addresses import StageRef, in_text, published_runs, published_stores, without_manifest
+from pipeline.errors import ArchiveError
+from storage.archive.keys import StageRef, in_text, published_runs, published_stores, without_manifest
 from storage.archive.records import Run, Store, read_run, read_store
-from storage.archive.staging import MANIFEST_NAME
+from storage.archive.staging import MANIFEST_NAME, check_name
 
 RAW_STAGES = ("capture", "ingest")
 
@@ -32,7 +36,9 @@ class Catalogue:
         by_key: dict[str, list[str]] = {}
         for store in stores.values():
             by_key.setdefault(store.ref.key, []).append(store.ref.uri)
-        runs = sorted((read_run(path, by_key) for path in published_runs(root)), key=_age)
+        runs = sorted(
+            (read_run(path, by_key) for path in published_runs(root)), key=lambda run: (run.created, run.folder.name)
+        )
         lost = (path.relative_to(root).as_posix() for path in without_manifest(root))
         return cls(stores, runs, tuple(uri for uri in lost if in_text(uri) == uri))
 
@@ -133,8 +139,9 @@ def rests_on(root: Path, refs: Iterable[StageRef]) -> list[StageRef]:
         ref = waiting.pop()
         if ref.uri not in found:
             found[ref.uri] = ref
-            paths = (path for key in read_store(ref).inputs for path in _of_key(root, key))
-            waiting += [StageRef(path.parent.name, path.name, path) for path in paths]
+            stages = [path for path in (root / "stages").iterdir() if path.is_dir()]
+            paths = (stage / key for key in read_store(ref).inputs if "/" not in key for stage in stages)
+            waiting += [StageRef(p.parent.name, p.name, p) for p in paths if (p / MANIFEST_NAME).is_file()]
     return [found[uri] for uri in sorted(found)]
 
 
@@ -149,10 +156,177 @@ def reach(starts: Iterable[str], following: Callable[[str], Iterable[str]]) -> s
     return found - begun
 
 
-def _of_key(root: Path, key: str) -> list[Path]:
-    stages = [path for path in (root / "stages").iterdir() if path.is_dir()] if "/" not in key else []
-    return [path / key for path in stages if (path / key / MANIFEST_NAME).is_file()]
+SHORTEST = 4  # letters of a key
+LATEST = "latest"  # the newest run
 
 
-def _age(run: Run) -> tuple[str, str]:
-    return run.created, run.folder.name
+def find_product(catalogue: Catalogue, text: str) -> str | Run:
+    """The address of a store that is there, or a run.
+
+    Raises ArchiveError: nothing is called so, several things are, or it could not be a name in any archive.
+    """
+    parts = text.rstrip("/").split("/")
+    for part in parts:
+        check_name(part)
+    if parts[0] == "stages" and len(parts) > 2:
+        return _store(catalogue, "/".join(parts[:3]))
+    if parts[0] == "runs" and len(parts) > 1:
+        for run in catalogue.runs:
+            if run.folder.name == parts[1]:
+                return run
+        there = [run.uri for run in reversed(catalogue.runs)]
+        hint = f"there is {_some(there)}" if there else "see ls"
+        raise ArchiveError(f"there is no run {parts[1]} in this archive; {hint}")
+    if len(parts) == 2 and any(uri.startswith(f"stages/{parts[0]}/") for uri in catalogue.stores):
+        return _store(catalogue, "/".join(("stages", *parts)))
+    runs = [run for run in catalogue.runs if text in (run.folder.name, LATEST)]
+    return runs[-1] if runs else _named(catalogue, text)
+
+
+def _store(catalogue: Catalogue, uri: str) -> str:
+    if uri in catalogue.stores:
+        return uri
+    _, stage, key = uri.split("/")
+    begun = [one for one in catalogue.stores if len(key) >= SHORTEST and one.startswith(uri)]
+    if len(begun) == 1:
+        return begun[0]
+    there = sorted(begun or (one for one in catalogue.stores if one.startswith(f"stages/{stage}/")))
+    hint = f"there is {_some(there)}" if there else "there is no store of this stage; see ls"
+    lost = " (its folder is there, but has lost its manifest: run verify)" if uri in catalogue.lost else ""
+    raise ArchiveError(f"there is no store {uri} in this archive{lost}; {hint}")
+
+
+def _named(catalogue: Catalogue, text: str) -> str:
+    """A product of the newest run that can be read, or a store by the beginning of its key."""
+    newest = next((run for run in reversed(catalogue.runs) if run.products), None)
+    products = {} if newest is None else newest.products
+    if text in products:
+        uri = in_text(products[text])
+        if newest is not None and uri is None:
+            raise ArchiveError(f"{text} is no store but a file of {newest.uri}; explain {newest.uri} tells of that run")
+        return _store(catalogue, uri or text)
+    keys = [uri for uri in catalogue.stores if len(text) >= SHORTEST and uri.rpartition("/")[2].startswith(text)]
+    if len(keys) == 1:
+        return keys[0]
+    if keys:
+        raise ArchiveError(f"{text} begins {len(keys)} keys: {_some(keys)}; give more of it")
+    near = difflib.get_close_matches(text, products, n=1)
+    if near:
+        known = f"did you mean {near[0]}?"
+    elif products:
+        known = f"products of the newest run: {', '.join(products)}"
+    else:
+        known = f"no run has products; there is {_some(sorted(catalogue.stores)) or 'nothing in it'}"
+    raise ArchiveError(f"{text!r} is no product, key or run of this archive; {known}")
+
+
+def _some(names: list[str]) -> str:
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+
+
+ABSENT = "(none)"
+Kind = Literal["parameter", "input", "version", "library"]
+
+
+@dataclass(frozen=True)
+class Change:
+    """One thing that differs. ``where`` is the stage whose store differs: that asked for, or one that it rests on."""
+
+    where: str
+    kind: Kind
+    name: str
+    old: Any
+    new: Any
+
+
+def version_before(catalogue: Catalogue, uri: str) -> Store | None:
+    """The newest earlier store of the same stage, of the same part in a survey and of the same scene; None: the first.
+
+    The part is what runs call it (capture_fine), or else what kind of store it was made of. The scene is known where
+    it or a store that it rests on has a parameter ``scene``.
+    """
+    this = catalogue.stores[uri]
+    before = [
+        store
+        for store in catalogue.stores.values()
+        if store.ref.stage == this.ref.stage
+        and store.problem is None
+        and _moment(store) < _moment(this)
+        and _same_part(catalogue, store, this)
+    ]
+    scenes = _scenes(catalogue, uri)
+    same = [store for store in before if not scenes or _scenes(catalogue, store.ref.uri) in (scenes, set())]
+    return max(same, key=_moment, default=None)
+
+
+def changes_between(catalogue: Catalogue, old: Store, new: Store) -> list[Change]:
+    """What differs, and for inputs that differ what differs in them, down to where it began."""
+    found: list[Change] = []
+    seen, waiting = set[tuple[str, str]](), [(old, new)]
+    while waiting:
+        before, after = waiting.pop(0)
+        if (before.ref.uri, after.ref.uri) in seen:
+            continue
+        seen.add((before.ref.uri, after.ref.uri))
+        where = after.ref.stage
+        if before.version != after.version:
+            found.append(Change(where, "version", "stage", before.version, after.version))
+        found += _differing(where, "parameter", flatten(before.params), flatten(after.params))
+        found += _differing(where, "library", before.libraries, after.libraries)
+        inputs = _differing(where, "input", _by_stage(catalogue, before), _by_stage(catalogue, after))
+        found += inputs
+        for one in inputs:
+            was, now = catalogue.stores.get(one.old), catalogue.stores.get(one.new)
+            if was is not None and now is not None and was.ref.stage == now.ref.stage:
+                waiting.append((was, now))
+    return found
+
+
+def flatten(value: object, name: str = "") -> dict[str, Any]:
+    """Nested tables and lists of tables as dotted names: ``camera.samples``, ``sweeps[2].start_px``."""
+    if isinstance(value, Mapping) and value:
+        return {
+            inner: one
+            for key, part in value.items()
+            for inner, one in flatten(part, f"{name}.{key}" if name else str(key)).items()
+        }
+    if isinstance(value, list) and any(isinstance(part, Mapping | list) for part in value):
+        return {
+            inner: one for number, part in enumerate(value) for inner, one in flatten(part, f"{name}[{number}]").items()
+        }
+    return {name: value}
+
+
+def _differing(where: str, kind: Kind, old: Mapping[str, Any], new: Mapping[str, Any]) -> list[Change]:
+    names = [name for name in sorted(old.keys() | new.keys()) if name]
+    changes = [Change(where, kind, name, old.get(name, ABSENT), new.get(name, ABSENT)) for name in names]
+    return [one for one in changes if one.old != one.new]
+
+
+def _by_stage(catalogue: Catalogue, store: Store) -> dict[str, str]:
+    """Addresses of inputs, told apart by stage, and by number within one."""
+    found: dict[str, str] = {}
+    for uri in catalogue.inputs_of(store.ref.uri):
+        stage = uri.split("/")[1] if "/" in uri else "store that is not there"
+        number = sum(name.split(" #")[0] == stage for name in found)
+        found[stage if not number else f"{stage} #{number + 1}"] = uri
+    return found
+
+
+def _same_part(catalogue: Catalogue, *pair: Store) -> bool:
+    roles = [catalogue.roles(store.ref.uri) for store in pair]
+    if all(roles):
+        return bool(roles[0] & roles[1])
+    inputs = [[uri for uri in catalogue.inputs_of(store.ref.uri) if "/" in uri] for store in pair]
+    first = [given[0].split("/")[1] if given else "" for given in inputs]  # it tells a fine capture from a coarse one
+    return first[0] == first[1]
+
+
+def _scenes(catalogue: Catalogue, uri: str) -> set[str]:
+    stores = (catalogue.stores.get(one) for one in {uri, *catalogue.ancestors([uri])})
+    return {str(store.params["scene"]) for store in stores if store is not None and "scene" in store.params}
+
+
+def _moment(store: Store) -> tuple[str, int]:
+    """When a store was published; the file's own date decides where clocks were too coarse."""
+    return store.created, (store.ref.path / "manifest.json").stat().st_mtime_ns

@@ -12,7 +12,7 @@ import json
 import math
 import os
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -21,8 +21,16 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from pipeline.errors import ArchiveError, IncompleteStoreError
-from storage.archive.plain_files import NotPlainError, kind_of, plain_size, read_plain
-from storage.archive.staging import MANIFEST_NAME, file_hash, files_below, sync_path
+from storage.archive.staging import (
+    MANIFEST_NAME,
+    NotPlainError,
+    file_hash,
+    files_below,
+    kind_of,
+    plain_size,
+    read_plain,
+    sync_path,
+)
 
 FORMAT = 2
 PACKED = "packed"  # what a store was before an earlier version of this program packed its numbers with pcodec
@@ -41,25 +49,20 @@ class Cost:
     size: int  # of the store's files as they were made [bytes]
 
 
-class Stopwatch:
-    """Wall and CPU seconds of this process since it was made."""
+def cost_since(start: tuple[float, float], work: float | None) -> dict[str, Any]:
+    """The entry ``cost`` of a manifest, from the wall and CPU seconds that `clocks` gave at the start.
 
-    def __init__(self) -> None:
-        self._wall, self._cpu = time.perf_counter(), time.process_time()
+    Raises ArchiveError: ``work`` is no amount.
+    """
+    if work is not None and not (math.isfinite(work) and work >= 0):
+        raise ArchiveError(f"work is {work}, expected a number of units of work, 0 or more, or None")
+    wall, cpu = (round(now - then, 6) for now, then in zip(clocks(), start, strict=True))
+    return {"wall_s": wall, "cpu_s": cpu} | ({} if work is None else {"work": float(work)})
 
-    def cost(self, work: float | None) -> dict[str, Any]:
-        """The entry ``cost`` of a manifest.
 
-        Raises
-        ------
-        ArchiveError : ``work`` is no amount.
-        """
-        if work is not None and not (math.isfinite(work) and work >= 0):
-            raise ArchiveError(f"work is {work}, expected a number of units of work, 0 or more, or None")
-        times = {"wall_s": time.perf_counter() - self._wall, "cpu_s": time.process_time() - self._cpu}
-        return {name: round(value, 6) for name, value in times.items()} | (
-            {} if work is None else {"work": float(work)}
-        )
+def clocks() -> tuple[float, float]:
+    """Wall and CPU seconds of this process."""
+    return time.perf_counter(), time.process_time()
 
 
 def write_manifest(folder: Path, facts: Mapping[str, Any]) -> None:
@@ -84,10 +87,8 @@ def write_manifest(folder: Path, facts: Mapping[str, Any]) -> None:
 def read_manifest(folder: Path) -> dict[str, Any]:
     """Content of a published folder's manifest.
 
-    Raises
-    ------
-    IncompleteStoreError : there is none, it cannot be read, its own seal says that it has changed, or it lists what
-        cannot be a file of this folder.
+    Raises IncompleteStoreError: there is none, it cannot be read, its own seal says that it has changed, or it lists
+    what cannot be a file of this folder.
     """
     content, problem = try_manifest(folder)
     if problem is not None:
@@ -114,7 +115,9 @@ def parse_manifest(written: bytes) -> tuple[dict[str, Any], str | None]:
         content = json.loads(text)
         if not isinstance(content, dict) or not isinstance(content.get("files"), dict):
             raise TypeError("it lists no files")
-        _check_seal(text, content)
+        rest = {name: value for name, value in content.items() if name != "seal"}
+        if is_sealed(content) and (content.get("seal") != _seal(rest) or text != _text(content)):
+            raise ValueError("it has changed since it was published: its seal does not fit")
         for name, entry in content["files"].items():
             _check_entry(name, entry)
     except RecursionError:
@@ -132,9 +135,7 @@ def is_sealed(manifest: Mapping[str, Any]) -> bool:
 def manifest_sha256(folder: Path) -> str:
     """SHA-256 of a published folder's manifest.json: what a run records of each store that it rests on.
 
-    Raises
-    ------
-    IncompleteStoreError : there is none.
+    Raises IncompleteStoreError: there is none.
     """
     try:
         return file_hash(folder / MANIFEST_NAME)
@@ -147,7 +148,14 @@ def cost_of(manifest: Mapping[str, Any]) -> Cost | None:
     cost = manifest.get("cost")
     if not isinstance(cost, Mapping):
         return None
-    wall, cpu, work = (_amount(cost.get(name)) for name in ("wall_s", "cpu_s", "work"))
+
+    def amount(name: str) -> float | None:
+        value = cost.get(name)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value < 0:
+            return None
+        return float(value)
+
+    wall, cpu, work = amount("wall_s"), amount("cpu_s"), amount("work")
     return None if wall is None or cpu is None else Cost(wall, cpu, work, made_bytes(manifest))
 
 
@@ -164,7 +172,11 @@ def made_bytes(manifest: Mapping[str, Any]) -> int:
 
 def packed_from(manifest: Mapping[str, Any]) -> list[str]:
     """SHA-256 of the manifests that a store had before it was packed, oldest first; none where it never was."""
-    found = _table(manifest.get(PACKED)).get("manifests")
+    return _manifests_before(manifest.get(PACKED))
+
+
+def _manifests_before(entry: object) -> list[str]:
+    found = _table(entry).get("manifests")
     return [one for one in found if isinstance(one, str)] if isinstance(found, list) else []
 
 
@@ -184,8 +196,7 @@ def extended_facts(before: Mapping[str, Any], sha256: str) -> dict[str, Any]:
 
 def extended_from(manifest: Mapping[str, Any]) -> list[str]:
     """SHA-256 of the manifests that a run had before something was added to it, oldest first."""
-    found = _table(manifest.get(EXTENDED)).get("manifests")
-    return [one for one in found if isinstance(one, str)] if isinstance(found, list) else []
+    return _manifests_before(manifest.get(EXTENDED))
 
 
 def extended_at(manifest: Mapping[str, Any]) -> str:
@@ -197,9 +208,7 @@ def extended_at(manifest: Mapping[str, Any]) -> str:
 def check_files(folder: Path, *, hashes: bool) -> None:
     """Compare a published folder with its manifest: names and sizes, and every byte where ``hashes``.
 
-    Raises
-    ------
-    IncompleteStoreError : names the first file that is missing, has another size or content, or is not listed.
+    Raises IncompleteStoreError: names the first file that is missing, has another size or content, or is not listed.
     """
     for name, problem in broken_files(folder, read_manifest(folder), hashes=hashes):
         raise IncompleteStoreError(f"{folder / name} {problem}; {CURE}")
@@ -208,35 +217,23 @@ def check_files(folder: Path, *, hashes: bool) -> None:
 def broken_files(folder: Path, manifest: Mapping[str, Any], *, hashes: bool) -> Iterator[tuple[str, str]]:
     """Give name and problem of every file that is not as the manifest lists it; with ``hashes`` also extra ones."""
     listed = manifest["files"]
-    links = _linked_folders(folder, listed)
+    inner = {parent for name in listed for parent in PurePosixPath(name).parents}
+    links = sorted(one for one in inner if (folder / one).is_symlink())  # the outer ones first
     for name, entry in listed.items():
         link = next((one for one in links if one in PurePosixPath(name).parents), None)
-        problem = file_problem(folder / name, entry, hashes=hashes) if link is None else _below_link(link)
-        if problem is not None:
+        if link is not None:
+            yield name, f"cannot be read: {link if link.parts else 'its store'} is a link, which is not followed"
+        elif (problem := file_problem(folder / name, entry, hashes=hashes)) is not None:
             yield name, problem
-    if hashes:
-        for name in sorted(_no_folders(folder) - set(listed) - {MANIFEST_NAME}):
-            kind = kind_of(folder / name)
-            yield name, f"is {kind if kind != 'a file' else 'not in the manifest'}: take it out of the archive"
-
-
-def _linked_folders(folder: Path, names: Iterable[str]) -> list[PurePosixPath]:
-    """Which of the folders that files lie in are links, the outer ones first."""
-    inner = {parent for name in names for parent in PurePosixPath(name).parents}
-    return sorted(one for one in inner if (folder / one).is_symlink())
-
-
-def _below_link(link: PurePosixPath) -> str:
-    return f"cannot be read: {link if link.parts else 'its store'} is a link, which is not followed"
-
-
-def _no_folders(folder: Path) -> set[str]:
-    """Names of all that lies in a folder, however deep, and is no folder; no link is followed."""
+    if not hashes:
+        return
     found = set[str]()
-    for place, folders, files in os.walk(folder):
-        links = [name for name in folders if Path(place, name).is_symlink()]
-        found.update(Path(place, name).relative_to(folder).as_posix() for name in (*links, *files))
-    return found
+    for place, folders, files in os.walk(folder):  # which follows no link
+        found_links = [name for name in folders if Path(place, name).is_symlink()]
+        found.update(Path(place, name).relative_to(folder).as_posix() for name in (*found_links, *files))
+    for name in sorted(found - set(listed) - {MANIFEST_NAME}):
+        kind = kind_of(folder / name)
+        yield name, f"is {kind if kind != 'a file' else 'not in the manifest'}: take it out of the archive"
 
 
 def file_problem(path: Path, entry: Mapping[str, Any], *, hashes: bool) -> str | None:
@@ -264,15 +261,6 @@ def _seal(content: Mapping[str, Any]) -> str:
     return hashlib.sha256(_text(content).encode()).hexdigest()
 
 
-def _check_seal(text: str, content: dict[str, Any]) -> None:
-    """Every byte is either covered by the seal, or is not as it would be written."""
-    if not is_sealed(content):
-        return
-    rest = {name: value for name, value in content.items() if name != "seal"}
-    if content.get("seal") != _seal(rest) or text != _text(content):
-        raise ValueError("it has changed since it was published: its seal does not fit")
-
-
 def _check_entry(name: str, entry: object) -> None:
     parts = PurePosixPath(name).parts
     if not parts or name.startswith("/") or ".." in parts or "\0" in name:
@@ -280,12 +268,6 @@ def _check_entry(name: str, entry: object) -> None:
     size, digest = (entry.get("size"), entry.get("sha256")) if isinstance(entry, dict) else (None, None)
     if isinstance(size, bool) or not isinstance(size, int) or not isinstance(digest, str):
         raise ValueError(f"it gives no size and hash of {name!r}")
-
-
-def _amount(value: object) -> float | None:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value < 0:
-        return None
-    return float(value)
 
 
 @cache
@@ -296,3 +278,21 @@ def library_versions() -> Mapping[str, str]:
         with suppress(importlib.metadata.PackageNotFoundError):
             found[name] = importlib.metadata.version(name)
     return found
+
+
+def read_table(path: Path) -> dict[str, Any]:
+    """Content of a file directly in a published store's folder.
+
+    Raises IncompleteStoreError: the store's manifest does not list the file, or not one of these bytes.
+    """
+    entry = read_manifest(path.parent)["files"].get(path.name)
+    problem = "is in no manifest" if entry is None else file_problem(path, entry, hashes=True)
+    if problem is not None:
+        raise IncompleteStoreError(f"{path} {problem}; {CURE}")
+    table: dict[str, Any] = json.loads(read_plain(path))
+    return table
+
+
+def write_table(path: Path, content: Mapping[str, Any]) -> None:
+    """Write plain values in their own order; numpy's numbers become floats."""
+    path.write_text(json.dumps(content, indent=1, default=float) + "\n")

@@ -11,10 +11,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from storage.archive.addresses import StageRef, in_text
+from storage.archive.keys import StageRef, in_text
 from storage.archive.manifests import Cost, cost_of, extended_at, listed_bytes, try_manifest
-from storage.archive.plain_files import read_plain
-from storage.archive.staging import MANIFEST_NAME, file_hash
+from storage.archive.staging import MANIFEST_NAME, file_hash, read_plain
 
 RECEIPT = "receipt.json"
 MANIFEST_HASH = "manifest_sha256"  # in a receipt's stages: SHA-256 of the manifest.json of the store that each left

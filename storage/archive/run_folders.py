@@ -16,8 +16,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from storage.archive.addresses import published_runs
-from storage.archive.keys import plain
+from storage.archive.keys import plain, published_runs
 from storage.archive.manifests import (
     extended_facts,
     extended_from,
@@ -72,6 +71,7 @@ class RunDraft:
         self.id = run_id
         self.folder = folder
         self.extends = extends
+        self.send: Callable[[str], None] | None = None  # where a run goes by its address once it is published
         self._root = root
         self._release = release
 
@@ -119,6 +119,8 @@ class RunDraft:
                 write_manifest(self.folder, content)
                 rename_into_place(self.folder, final)
         self._release()
+        if self.send is not None:
+            self.send(f"runs/{self.id}")
         return final
 
     def abandon(self) -> None:
@@ -154,7 +156,11 @@ def try_exchange(one: Path, other: Path) -> bool:
     Linux does that (renameat2) on its local file systems; where it cannot, as on most network file systems, nothing is
     changed and the answer is False.
     """
-    error = _renameat2(one, other)
+    call = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    if call is None:
+        return False
+    failed = call(_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), ctypes.c_uint(_RENAME_EXCHANGE))
+    error = ctypes.get_errno() if failed else 0
     if error in _UNSUPPORTED:
         return False
     if error:
@@ -162,15 +168,6 @@ def try_exchange(one: Path, other: Path) -> bool:
     for parent in {one.parent, other.parent}:
         sync_path(parent)
     return True
-
-
-def _renameat2(one: Path, other: Path) -> int:
-    """0, or the error's number."""
-    call = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
-    if call is None:
-        return errno.ENOSYS
-    failed = call(_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), ctypes.c_uint(_RENAME_EXCHANGE))
-    return ctypes.get_errno() if failed else 0
 
 
 def unfinished_extensions(root: Path) -> Iterator[Path]:

@@ -20,12 +20,9 @@ _PREFIX = ".export-"
 def written_aside(folder: Path, names: Sequence[str]) -> Iterator[Path]:
     """Give an empty folder to write ``names`` into; when the block ends well they replace those in ``folder``.
 
-    What belongs together is never mixed: old files of all names but the first go before the first is replaced, and
-    the last one to appear vouches for the others. When the block fails, ``folder`` is as before.
-
-    Raises
-    ------
-    ArchiveError : the folder is or lies below a file, or the disk refuses; the message names it and what to do.
+    What belongs together is never mixed: old files of all names but the first go before the first is replaced, and the
+    last one to appear vouches for the others. When the block fails, ``folder`` is as before. Raises ArchiveError: the
+    folder is or lies below a file, or the disk refuses; the message names it and what to do.
     """
     with refusals(folder, "export to"):
         make_folder(folder)
@@ -51,9 +48,7 @@ def make_folder(folder: Path) -> None:
 def new_file(folder: Path, stem: str, suffix: str) -> Path:
     """Take a name that nothing in ``folder`` has: ``stem``, or ``stem-2`` and so on; an empty file keeps it.
 
-    Raises
-    ------
-    ArchiveError : the folder is or lies below a file, or the disk refuses.
+    Raises ArchiveError: the folder is or lies below a file, or the disk refuses.
     """
     with refusals(folder, "export to"):
         make_folder(folder)

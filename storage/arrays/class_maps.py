@@ -12,7 +12,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from pipeline.errors import ChunkError, ShapeError
+from pipeline.errors import ShapeError
 from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.layout import (
     AngularGrid,
@@ -24,6 +24,7 @@ from storage.arrays.layout import (
     image_spec,
     open_group,
     read_array,
+    whole_shards,
 )
 
 
@@ -49,9 +50,7 @@ class ClassNames:
 def write_class_map(path: Path, found: ClassMap) -> None:
     """Store classes with their names and colours, and the confidence.
 
-    Raises
-    ------
-    ShapeError : sizes differ, or a pixel has a class without a name.
+    Raises ShapeError: sizes differ, or a pixel has a class without a name.
     """
     create_class_map(path, found.classes.shape, ClassNames(found.names, found.colours), grid=found.grid)
     write_class_tile(path, (0, 0), found.classes, found.confidence)
@@ -62,9 +61,7 @@ def create_class_map(
 ) -> None:
     """Begin a class map of (y, x) ``shape`` in which no pixel has a class yet.
 
-    Raises
-    ------
-    ShapeError : there are not as many colours as names.
+    Raises ShapeError: there are not as many colours as names.
     """
     if len(legend.colours) != len(legend.names):
         raise ShapeError(
@@ -85,13 +82,9 @@ def write_class_tile(
 ) -> None:
     """Store (y, x) classes and confidence of whole shards from row and column ``origin`` on.
 
-    Threads and processes may write different tiles of one map at once.
-
-    Raises
-    ------
-    ShapeError : sizes differ, the tile does not fit the map, or a pixel has a class without a name.
-    ChunkError : the tile splits a shard.
-    IncompleteStoreError : there is no map.
+    Threads and processes may write different tiles of one map at once. Raises ShapeError: sizes differ, the tile does
+    not fit the map, or a pixel has a class without a name. ChunkError: the tile splits a shard. IncompleteStoreError:
+    there is no map.
     """
     with damage_named(str(path)):
         group = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
@@ -100,7 +93,13 @@ def write_class_tile(
     used = classes[classes != UNLABELLED]
     if used.size and used.max() >= count:
         raise ShapeError(f"class {int(used.max())} is in the map, but only {count} classes have names")
-    place = _place_of(origin, classes.shape, arrays[0])
+    place = tuple(slice(first, first + size) for first, size in zip(origin, classes.shape, strict=True))
+    for word, part, size in zip(("rows", "columns"), place, arrays[0].shape, strict=True):
+        if part.start < 0 or part.stop > size:
+            raise ShapeError(
+                f"{word} {part.start}:{part.stop} are not all in the class map of {arrays[0].shape} (y, x)"
+            )
+    whole_shards("the class map", place, arrays[0].shape, arrays[0].shards or ())
     if classes.shape != confidence.shape:
         raise ShapeError(
             f"classes {classes.shape} and confidence {confidence.shape} do not fit; give both of each pixel"
@@ -127,20 +126,6 @@ def clear_classes(path: Path, where: NDArray[np.bool_]) -> None:
             write_class_tile(path, (top, left), classes, confidence)
 
 
-def _place_of(origin: tuple[int, int], shape: tuple[int, ...], array: zarr.Array[Any]) -> tuple[slice, ...]:
-    """Where a tile lies in the map, checked against the map's size and shards."""
-    place = tuple(slice(first, first + size) for first, size in zip(origin, shape, strict=True))
-    for word, part, size, shard in zip(("rows", "columns"), place, array.shape, array.shards or (), strict=True):
-        if part.start < 0 or part.stop > size:
-            raise ShapeError(f"{word} {part.start}:{part.stop} are not all in the class map of {array.shape} (y, x)")
-        if part.start % shard or (part.stop % shard and part.stop != size):
-            raise ChunkError(
-                f"{word} {part.start}:{part.stop} split the class map's shards of {shard} {word}; start and end at "
-                "their multiples"
-            )
-    return place
-
-
 def class_flags(names: Sequence[str], colours: NDArray[np.uint8]) -> dict[str, Any]:
     """CF's flag attributes of an image of class indices."""
     return {
@@ -154,7 +139,12 @@ def class_flags(names: Sequence[str], colours: NDArray[np.uint8]) -> dict[str, A
 
 def load_class_names(path: Path) -> ClassNames:
     """Read what the classes of a map are called, and their colours. Raises IncompleteStoreError where there is none."""
-    attributes: dict[str, Any] = dict(open_group(path).attrs)
+    return legend_of(open_group(path))
+
+
+def legend_of(group: zarr.Group) -> ClassNames:
+    """The classes that a group's attributes name."""
+    attributes: dict[str, Any] = dict(group.attrs)
     colours = np.array(attributes.get("class_colours", ()), np.uint8).reshape(-1, 3)
     return ClassNames(tuple(attributes.get("class_names", ())), colours)
 
@@ -162,11 +152,5 @@ def load_class_names(path: Path) -> ClassNames:
 def load_class_map(path: Path) -> ClassMap:
     """Read a class map. Raises IncompleteStoreError where it is missing or damaged."""
     group = open_group(path)
-    attributes: dict[str, Any] = dict(group.attrs)
-    return ClassMap(
-        classes=read_array(group, "classes"),
-        confidence=read_array(group, "confidence"),
-        names=tuple(attributes.get("class_names", ())),
-        colours=np.array(attributes.get("class_colours", ()), np.uint8).reshape(-1, 3),
-        grid=grid_of(attributes),
-    )
+    classes, confidence, legend = read_array(group, "classes"), read_array(group, "confidence"), legend_of(group)
+    return ClassMap(classes, confidence, legend.names, legend.colours, grid_of(dict(group.attrs)))

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import zarr
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from pipeline.errors import IncompleteStoreError, ShapeError
 from pipeline.geometry.scan import Sweep
-from pipeline.rectify.calibration.calibrate import calibrate
 from pipeline.source import Line, References
 from storage.arrays.layout import (
     SHARD_ROWS,
@@ -30,11 +29,7 @@ from storage.arrays.layout import (
 )
 from storage.arrays.quicklooks import LineThumbnail, Quicklook, quicklook_of, write_quicklook
 
-if TYPE_CHECKING:
-    import xarray as xr
-
 _LINE_COORDINATES = "time mirror_x mirror_y exposure_ms valid_line"
-_NO_VALUES = np.empty((0, 0, 0), np.float32)
 
 
 @dataclass(frozen=True)
@@ -75,7 +70,11 @@ class RawCubeWriter:
 
     def __init__(self, path: Path, header: SweepHeader) -> None:
         self._header = header
-        self._group = create_group(path, f"raw sweep {header.sweep.name}", _attributes(header))
+        facts: dict[str, Any] = {"sweep": asdict(header.sweep), "source": header.source}
+        facts |= {} if header.started is None else {"started": header.started}
+        facts |= {"by_mirror": True} if header.references.by_mirror else {}
+        facts |= {} if header.simulation is None else {"simulation": dict(header.simulation)}
+        self._group = create_group(path, f"raw sweep {header.sweep.name}", facts)
         bands = write_bands(self._group, header.wavelength_nm, header.fwhm_nm)
         about = {"long_name": "raw numbers of the camera", "units": "1", "coordinates": f"{bands} {_LINE_COORDINATES}"}
         spec = image_spec(("line", "sample", "band"), header.shape, "<u2")
@@ -100,9 +99,7 @@ class RawCubeWriter:
     def write(self, lines: Sequence[Line]) -> None:
         """Take the next lines; any number, in order.
 
-        Raises
-        ------
-        ShapeError : a line is out of order, too many, or of another size than the references.
+        Raises ShapeError: a line is out of order, too many, or of another size than the references.
         """
         for line in lines:
             number = len(self._facts)
@@ -122,12 +119,7 @@ class RawCubeWriter:
                 self._flush()
 
     def close(self) -> None:
-        """Write what waits, the lines' coordinates and the picture.
-
-        Raises
-        ------
-        IncompleteStoreError : lines are missing.
-        """
+        """Write what waits, the lines' coordinates and the picture (IncompleteStoreError: lines are missing)."""
         if len(self._facts) != self._header.sweep.lines:
             raise IncompleteStoreError(
                 f"sweep {self._header.sweep.name} has {len(self._facts)} of {self._header.sweep.lines} lines; "
@@ -146,33 +138,18 @@ class RawCubeWriter:
             self._waiting.clear()
 
 
-def _attributes(header: SweepHeader) -> dict[str, Any]:
-    started = {} if header.started is None else {"started": header.started}
-    mirror = {"by_mirror": True} if header.references.by_mirror else {}
-    simulated = {} if header.simulation is None else {"simulation": dict(header.simulation)}
-    return {"sweep": asdict(header.sweep), "source": header.source, **started, **mirror, **simulated}
-
-
 def _write_references(group: zarr.Group, references: References) -> None:
-    for name, values in (("dark", references.dark), ("white", references.white)):
-        about = {"long_name": f"{name} reference frame", "units": "1", "coordinates": "wavelength"}
-        write_small(group, name, ("sample", "band"), np.asarray(values, np.float32), about)
-    about = {"long_name": "scene value of the white panel", "units": "1", "coordinates": "wavelength"}
-    write_small(group, "panel", ("band",), np.asarray(references.panel, np.float32), about)
     about = {"units": "1", "coordinates": "wavelength"}
-    if references.bad is not None:
-        named = {"long_name": "bad elements of the detector", **about}
-        write_small(group, "bad", ("sample", "band"), np.asarray(references.bad, np.bool_), named)
-    if references.flat is not None:
-        named = {"long_name": "relative response left over by the white frame", **about}
-        write_small(group, "flat", ("sample", "band"), np.asarray(references.flat, np.float32), named)
-
-
-def _read_references(group: zarr.Group) -> References:
-    """What :func:`_write_references` stored; cubes of before bad elements and flats have neither."""
-    dark, white, panel = (read_array(group, name) for name in ("dark", "white", "panel"))
-    bad, flat = (read_array(group, name) if name in group else None for name in ("bad", "flat"))
-    return References(dark, white, panel, bad, flat, bool(group.attrs.get("by_mirror", False)))
+    frames: dict[str, tuple[tuple[str, ...], Any, type[np.generic], str]] = {
+        "dark": (("sample", "band"), references.dark, np.float32, "dark reference frame"),
+        "white": (("sample", "band"), references.white, np.float32, "white reference frame"),
+        "panel": (("band",), references.panel, np.float32, "scene value of the white panel"),
+        "bad": (("sample", "band"), references.bad, np.bool_, "bad elements of the detector"),
+        "flat": (("sample", "band"), references.flat, np.float32, "relative response left over by the white frame"),
+    }
+    for name, (dims, values, kind, title) in frames.items():
+        if values is not None:
+            write_small(group, name, dims, np.asarray(values, kind), {"long_name": title, **about})
 
 
 def _write_line_facts(
@@ -232,17 +209,17 @@ class RawCube:
 def open_raw_cube(path: Path) -> RawCube:
     """Open a sweep that :class:`RawCubeWriter` stored.
 
-    Raises
-    ------
-    IncompleteStoreError : there is none, it was not closed, or it is damaged.
+    Raises IncompleteStoreError: there is none, it was not closed, or it is damaged.
     """
     group = open_group(path)
     wavelength, fwhm = read_bands(group)
+    dark, white, panel = (read_array(group, name) for name in ("dark", "white", "panel"))
+    bad, flat = (read_array(group, name) if name in group else None for name in ("bad", "flat"))
     with damage_named(str(path)):
         sweep = Sweep(**dict(group.attrs)["sweep"])  # type: ignore[arg-type]
     return RawCube(
         sweep=sweep,
-        references=_read_references(group),
+        references=References(dark, white, panel, bad, flat, bool(group.attrs.get("by_mirror", False))),
         wavelength_nm=wavelength,
         fwhm_nm=fwhm,
         position=np.stack([read_array(group, "mirror_x"), read_array(group, "mirror_y")], axis=-1),
@@ -253,52 +230,3 @@ def open_raw_cube(path: Path) -> RawCube:
         started=None if "started" not in group.attrs else str(group.attrs["started"]),
         group=group,
     )
-
-
-def open_reflectance(path: Path, *, saturated_dn: float) -> xr.DataArray:
-    """Open a sweep in scene values, calibrated 64 lines at a time when a part is asked for.
-
-    The file keeps the raw numbers: nothing is stored twice, and other references give other values.
-
-    Parameters
-    ----------
-    saturated_dn
-        Least DN that counts as saturated, as of :func:`pipeline.rectify.calibration.calibrate.calibrate`.
-
-    Returns
-    -------
-    (line, sample, band) float32 backed by dask, in the unit of the panel's values; NaN where a sample is not valid.
-    Coordinates: wavelength, fwhm, time, mirror_x, mirror_y, exposure_ms, valid_line.
-
-    Raises
-    ------
-    IncompleteStoreError : there is no sweep, it was not closed, or it is damaged; on computing, where a chunk is.
-    """
-    import dask.array as da
-    import xarray as xr
-
-    cube = open_raw_cube(path)
-    lines, samples, bands = cube.shape
-    starts = range(0, lines, SHARD_ROWS)
-    chunks = (tuple(min(SHARD_ROWS, lines - start) for start in starts), (samples,), (bands,))
-    values = da.map_blocks(  # type: ignore[no-untyped-call]
-        _reflectance_block, cube, saturated_dn, chunks=chunks, dtype=np.float32, meta=_NO_VALUES
-    )
-    with xr.open_zarr(path, consolidated=False, chunks=None) as stored:
-        coordinates = stored["dn"].coords.to_dataset().load().coords
-    about = {"long_name": "scene value", "units": "1"}
-    return xr.DataArray(values, coordinates, ("line", "sample", "band"), "reflectance", about)
-
-
-def _reflectance_block(
-    cube: RawCube, saturated_dn: float, block_info: Mapping[Any, Any] | None = None
-) -> NDArray[np.float32]:
-    """One block of lines, NaN where not valid; dask says which."""
-    assert block_info is not None
-    start, stop = block_info[None]["array-location"][0]
-    usable = cube.valid_line[start:stop]
-    position = np.where(usable[:, None], cube.position[start:stop], np.nan)  # of other lines it may be beyond the rim
-    values, valid = calibrate(cube.read(start, stop), cube.references, saturated_dn=saturated_dn, position=position)
-    values[~valid] = np.nan
-    values[~usable] = np.nan
-    return values

@@ -29,6 +29,8 @@ from pipeline.checked_lines import read_checked, with_check
 from pipeline.rig.devices import NotKept
 from storage.archive.plain_files import open_plain, plain_reader, plain_size, read_plain
 from storage.archive.staging import sync_path
+from pipeline.rig.device_errors import NotKept
+from storage.archive.staging import open_plain, plain_reader, plain_size, read_plain, sync_path
 
 SYNC_BYTES = 1 << 24
 SUMS = "%sums"  # which no quoted name ends with
@@ -58,9 +60,7 @@ class FetchedFiles:
     def size(self, name: str) -> int:
         """Bytes held of a file; 0 of one that is not there.
 
-        Raises
-        ------
-        NotKept : the disk does not give them, here or in other calls.
+        Raises NotKept: the disk does not give them, here or in other calls.
         """
         path = self._path(name)
         try:
@@ -87,9 +87,7 @@ class FetchedFiles:
     def append(self, name: str, data: bytes) -> None:
         """Add bytes at the end.
 
-        Raises
-        ------
-        NotKept : the disk refuses; a part that was written is taken away again.
+        Raises NotKept: the disk refuses; a part that was written is taken away again.
         """
         path = self._path(name)
         before = self.size(name)
@@ -115,12 +113,7 @@ class FetchedFiles:
             ) from error
 
     def drop(self, name: str) -> None:
-        """Hold no byte of a file any more.
-
-        Raises
-        ------
-        NotKept : the disk refuses.
-        """
+        """Hold no byte of a file any more (NotKept: the disk refuses)."""
         path = self._path(name)
         try:
             path.unlink(missing_ok=True)
@@ -170,9 +163,7 @@ class FetchedFiles:
 def first_unlike(path: Path) -> int | None:
     """From which byte on a fetched file is not as its sums say; None where all of it is. What is torn is no change.
 
-    Raises
-    ------
-    OSError : one of both cannot be read.
+    Raises OSError: one of both cannot be read.
     """
     found, _ = _vouched_for(path)
     sums = list(read_checked(read_plain(_sums_of(path))))

@@ -1,42 +1,164 @@
-"""The map of a posed survey: class, confidence and picture on a grid of the earth, and each class's area."""
+"""Maps of the ground: class, confidence and picture on a grid of the earth, and each class's area.
+
+Where an image lies is said by CF's grid mapping and coordinates and by GeoZarr's attributes; images too large for the
+memory are read some rows at a time.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import zarr
 from numpy.typing import NDArray
 
-from pipeline.errors import ChunkError, IncompleteStoreError, ShapeError
+from pipeline.errors import IncompleteStoreError, PoseError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
-from storage.arrays.class_maps import class_flags
-from storage.arrays.georeference import ON_THE_MAP, load_geobox, map_attributes, write_map_coordinates
+from storage.arrays.class_maps import ClassNames, class_flags, legend_of
 from storage.arrays.layout import (
     SHARD_COLUMNS,
     SHARD_ROWS,
     create_array,
     create_group,
+    damage_named,
     image_spec,
     open_group,
     read_array,
+    read_bands,
+    whole_shards,
+    write_small,
 )
 
 if TYPE_CHECKING:
+    from odc.geo.crs import CRS
     from odc.geo.geobox import GeoBox
 
-BLOCK = (4 * SHARD_ROWS, 2 * SHARD_COLUMNS)  # (y, x) px to write at a time: whole shards
-M2_PER_HECTARE = 10_000.0
+
+GRID_MAPPING = "spatial_ref"
+# on every image: CF's link to the grid mapping, and the same as a coordinate, so that plain xarray takes it for one
+ON_THE_MAP = {"grid_mapping": GRID_MAPPING, "coordinates": GRID_MAPPING}
+_CONVENTIONS = [
+    {
+        "uuid": uuid,
+        "name": name,
+        "schema_url": f"https://raw.githubusercontent.com/zarr-conventions/{name}/refs/tags/v0.1/schema.json",
+        "spec_url": f"https://github.com/zarr-conventions/{name}/blob/v0.1/README.md",
+        "description": description,
+    }
+    for uuid, name, description in (
+        ("f17cb550-5864-4468-aeb7-f3180cfb622f", "proj", "Coordinate reference system of the map"),
+        ("689b58e2-cf7b-45e0-9fff-9cfc0883d6b4", "spatial", "Relation of array indices to the map's coordinates"),
+    )
+]
+
+
+def map_attributes(geobox: GeoBox) -> dict[str, Any]:
+    """GeoZarr ``proj:`` and ``spatial:`` attributes of a map; the transform maps pixel corners.
+
+    Raises PoseError: the grid has no CRS, or does not lie along its axes.
+    """
+    crs = _crs_of(geobox)
+    code = {} if crs.epsg is None else {"proj:code": f"EPSG:{crs.epsg}"}
+    return {
+        **code,
+        "proj:wkt2": crs.to_wkt(),
+        "spatial:dimensions": ["y", "x"],
+        "spatial:shape": list(geobox.shape),
+        "spatial:transform_type": "affine",
+        "spatial:transform": [float(number) for number in geobox.affine[:6]],
+        "spatial:bbox": [float(number) for number in geobox.boundingbox.bbox],
+        "spatial:registration": "pixel",
+        "zarr_conventions": _CONVENTIONS,
+    }
+
+
+def write_map_coordinates(group: zarr.Group, geobox: GeoBox) -> None:
+    """Store ``x``, ``y`` and the grid mapping ``spatial_ref`` of a map, as CF wants them."""
+    from odc.geo.xr import xr_crs_coord
+
+    for name in ("x", "y"):
+        about = {
+            "standard_name": f"projection_{name}_coordinate",
+            "long_name": f"{name} of the pixel's centre on the map",
+            "units": "m",
+            "axis": name.upper(),
+        }
+        write_small(group, name, (name,), np.asarray(geobox.coordinates[name].values, np.float64), about)
+    mapping = xr_crs_coord(_crs_of(geobox), transform=geobox.transform)
+    write_small(group, GRID_MAPPING, (), np.asarray(mapping.values, np.int32), dict(mapping.attrs))
+
+
+def _crs_of(geobox: GeoBox) -> CRS:
+    if geobox.crs is None or not geobox.axis_aligned:
+        raise PoseError(f"a map needs a CRS and a grid along its axes, got {geobox!r}")
+    return geobox.crs
+
+
+def load_geobox(path: Path) -> GeoBox | None:
+    """Read the grid of a stored map; None where the store lies on an angular grid.
+
+    Raises IncompleteStoreError: the store is missing, or what says its grid is damaged.
+    """
+    if GRID_MAPPING not in open_group(path):
+        return None
+    import odc.geo.xr  # noqa: F401 - registers the accessor
+    import xarray as xr
+
+    with damage_named(f"the grid of {path}"), xr.open_zarr(path, consolidated=False) as content:
+        geobox: GeoBox | None = content.odc.geobox
+        if geobox is None or geobox.crs is None:
+            raise KeyError(f"{GRID_MAPPING}, x and y give none")
+    return geobox
 
 
 @dataclass(frozen=True)
-class ClassLegend:
-    """Names and colours of the classes."""
+class StoredImage:
+    """An image or cube of a store, (y, x) or (y, x, band), not yet read."""
 
-    names: tuple[str, ...]
-    colours: NDArray[np.uint8]  # (class, 3)
+    group: zarr.Group
+    name: str
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+
+    @property
+    def about(self) -> Mapping[str, Any]:
+        """Attributes of the store."""
+        return dict(self.group.attrs)
+
+    @property
+    def on_map(self) -> bool:
+        """Whether the store says where on the earth it lies."""
+        return GRID_MAPPING in self.group
+
+    def rows(self) -> Iterator[tuple[int, NDArray[Any]]]:
+        """Rows with the number of the first, as many at a time as a shard has.
+
+        Raises IncompleteStoreError: a checksum says that the bytes have changed.
+        """
+        for first in range(0, self.shape[0], SHARD_ROWS):
+            yield first, read_array(self.group, self.name, slice(first, min(first + SHARD_ROWS, self.shape[0])))
+
+
+def open_image(path: Path, name: str) -> StoredImage:
+    """Open one array of the store at ``path``. Raises IncompleteStoreError where it is missing or damaged."""
+    group = open_group(path)
+    with damage_named(f"{group.store_path}/{name}"):
+        array = group[name]
+        if not isinstance(array, zarr.Array):
+            raise KeyError(f"{name} is no array")
+        return StoredImage(group, name, array.shape, array.dtype)
+
+
+def load_bands(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+    """Wavelengths and widths [nm] of the store at ``path``. Raises IncompleteStoreError where they are damaged."""
+    return read_bands(open_group(path))
+
+
+BLOCK = (4 * SHARD_ROWS, 2 * SHARD_COLUMNS)  # (y, x) px to write at a time: whole shards
+M2_PER_HECTARE = 10_000.0
 
 
 @dataclass(frozen=True)
@@ -46,7 +168,7 @@ class GroundMap:
     classes: NDArray[np.uint8]  # (y, x) index into the legend's names, 255 = none or not seen
     confidence: NDArray[np.float32]  # (y, x) in 0..1, NaN where not seen
     picture: NDArray[np.uint8]  # (y, x, 3) red green blue, 0 where not seen
-    legend: ClassLegend
+    legend: ClassNames
     geobox: GeoBox
     areas: dict[str, dict[str, float]]  # of each class: m2, ha, share of the classified area
 
@@ -54,7 +176,7 @@ class GroundMap:
 class GroundMapWriter:
     """Write a map block by block, so that it never has to be in memory as a whole."""
 
-    def __init__(self, path: Path, geobox: GeoBox, legend: ClassLegend, *, about: Mapping[str, Any]) -> None:
+    def __init__(self, path: Path, geobox: GeoBox, legend: ClassNames, *, about: Mapping[str, Any]) -> None:
         place = map_attributes(geobox)
         names = {"class_names": list(legend.names), "class_colours": np.asarray(legend.colours).tolist()}
         self._group = create_group(path, "class map on the ground", {**place, **names, **about})
@@ -80,10 +202,8 @@ class GroundMapWriter:
     ) -> None:
         """Store one block.
 
-        Raises
-        ------
-        ShapeError : the block's arrays do not fit its place, or a class has no name.
-        ChunkError : the block splits a shard.
+        Raises ShapeError: the block's arrays do not fit its place, or a class has no name. ChunkError: the block splits
+        a shard.
         """
         size = (rows.stop - rows.start, columns.stop - columns.start)
         if not (classes.shape == confidence.shape == picture.shape[:2] == size):
@@ -91,7 +211,7 @@ class GroundMapWriter:
                 f"block {size} (y, x) got classes {classes.shape}, confidence {confidence.shape} and picture "
                 f"{picture.shape}; give one value a pixel"
             )
-        _check_place(rows, columns, self._shape)
+        whole_shards("the map", (rows, columns), self._shape, (SHARD_ROWS, SHARD_COLUMNS))
         worst = int(classes.max(initial=0, where=classes != UNLABELLED))
         if worst >= len(self._legend.names):
             raise ShapeError(f"class {worst} is in the map, but only {len(self._legend.names)} classes have names")
@@ -108,22 +228,10 @@ class GroundMapWriter:
         }
 
 
-def _check_place(rows: slice, columns: slice, shape: tuple[int, ...]) -> None:
-    for word, place, size, shard in zip(
-        ("rows", "columns"), (rows, columns), shape, (SHARD_ROWS, SHARD_COLUMNS), strict=True
-    ):
-        if place.start % shard or (place.stop % shard and place.stop != size) or place.stop > size:
-            raise ChunkError(
-                f"{word} {place.start}:{place.stop} of a map of {shape} split its shards of {shard}; "
-                f"start and end at multiples of {shard}"
-            )
-
-
 def load_ground_map(path: Path) -> GroundMap:
     """Read a map. Raises IncompleteStoreError where it is missing or damaged."""
     group = open_group(path)
-    attributes: dict[str, Any] = dict(group.attrs)
-    colours = np.array(attributes.get("class_colours", ()), np.uint8).reshape(-1, 3)
+    areas: Any = dict(group.attrs).get("areas", {})
     geobox = load_geobox(path)
     if geobox is None:
         raise IncompleteStoreError(f"{path} has no grid mapping; it is no map of the ground")
@@ -131,7 +239,7 @@ def load_ground_map(path: Path) -> GroundMap:
         classes=read_array(group, "classes"),
         confidence=read_array(group, "confidence"),
         picture=read_array(group, "picture"),
-        legend=ClassLegend(tuple(attributes.get("class_names", ())), colours),
+        legend=legend_of(group),
         geobox=geobox,
-        areas=attributes.get("areas", {}),
+        areas=areas,
     )

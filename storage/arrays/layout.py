@@ -1,7 +1,7 @@
 """What all stored arrays have in common: Zarr v3 codecs and chunks, bands, CF and GeoZarr attributes, rounding.
 
 Chunks of 32 x 32 px with all bands, in shards of 64 rows, each chunk with its own crc32c: one patch is one range read,
-and a flipped bit is an error instead of a wrong number.
+and a flipped bit is an error instead of a wrong number. Codecs to choose from are tried in memory in the same layout.
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ import numpy as np
 import zarr
 from numcodecs.errors import UnknownCodecError  # type: ignore[import-untyped]
 from numpy.typing import NDArray
-from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec
+from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec, ZstdCodec
+from zarr.storage import MemoryStore
 
-from pipeline.errors import IncompleteStoreError, ShapeError, WavelengthError
+from pipeline.errors import ChunkError, IncompleteStoreError, SettingsError, ShapeError, WavelengthError
 
 CHUNK_PX = 32
 SHARD_ROWS = 64
@@ -104,6 +105,16 @@ def _whole_chunks(size: int, chunk: int) -> int:
     return -(-size // chunk) * chunk
 
 
+def whole_shards(what: str, place: Sequence[slice], shape: Sequence[int], shards: Sequence[int]) -> None:
+    """Refuse rows and columns of an image that split its shards, or reach beyond it (ChunkError)."""
+    for word, part, size, shard in zip(("rows", "columns"), place, shape, shards, strict=False):
+        if part.start % shard or (part.stop != size and (part.stop % shard or part.stop > size)):
+            raise ChunkError(
+                f"{word} {part.start}:{part.stop} split {what}'s shards of {shard} {word}; start and end at multiples "
+                f"of {shard}"
+            )
+
+
 def create_array(group: zarr.Group, name: str, spec: ArraySpec, attributes: Mapping[str, Any]) -> zarr.Array[Any]:
     """Add an empty array: NaN where floating, 0 or ``_FillValue`` where not; a chunk's checksum comes last."""
     kind = np.dtype(spec.dtype)
@@ -156,12 +167,7 @@ def write_bands(group: zarr.Group, wavelength_nm: NDArray[np.float64], fwhm_nm: 
 
 
 def open_group(path: Path) -> zarr.Group:
-    """Open a store for reading.
-
-    Raises
-    ------
-    IncompleteStoreError : there is none, or its metadata is damaged.
-    """
+    """Open a store for reading (IncompleteStoreError: there is none, or its metadata is damaged)."""
     try:
         return zarr.open_group(path, mode="r", zarr_format=3, use_consolidated=False)
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -171,9 +177,7 @@ def open_group(path: Path) -> zarr.Group:
 def read_array(group: zarr.Group, name: str, selection: Any = ...) -> NDArray[Any]:
     """Read (part of) one array.
 
-    Raises
-    ------
-    IncompleteStoreError : there is no such array, or a checksum says that its bytes have changed.
+    Raises IncompleteStoreError: there is no such array, or a checksum says that its bytes have changed.
     """
     with damage_named(f"{group.store_path}/{name}"):
         array = group[name]
@@ -218,3 +222,38 @@ def round_bits(values: NDArray[np.floating], kept: int = KEPT_BITS) -> NDArray[n
     rounded &= ~((np.uint32(1) << drop) - np.uint32(1))
     as_float = rounded.view(np.float32)
     return np.where(np.isfinite(source) & np.isfinite(as_float), as_float, source)
+
+
+BLOSC = {"lz4-5": ("lz4", 5), "zstd-1": ("zstd", 1), "zstd-3": ("zstd", 3), "zstd-5": ("zstd", 5)}
+CODECS = ("none", *BLOSC, "zstd-3 bytes in order")
+
+
+def store_in_memory(values: NDArray[Any], codec: str) -> tuple[int, NDArray[Any]]:
+    """Write an image (y, x, band) with one codec and read it back; gives the bytes stored and what was read.
+
+    Raises SettingsError: the codec is none of ``CODECS``.
+    """
+    held: dict[str, Any] = {}
+    spec = image_spec(("y", "x", "band"), values.shape, values.dtype.str)
+    array = zarr.create_array(
+        MemoryStore(store_dict=held),
+        shape=spec.shape,
+        dtype=values.dtype,
+        chunks=spec.chunk,
+        shards=spec.shard,
+        compressors=(*_compressors(codec, values.dtype.itemsize), Crc32cCodec()),
+    )
+    array[...] = values
+    size = sum(len(part) for name, part in held.items() if not name.endswith("zarr.json"))
+    return size, np.asarray(array[...])
+
+
+def _compressors(codec: str, size: int) -> tuple[Any, ...]:
+    if codec == "none":
+        return ()
+    if codec == "zstd-3 bytes in order":
+        return (ZstdCodec(level=3),)
+    if codec not in BLOSC:
+        raise SettingsError(f"the codec must be one of {', '.join(CODECS)}, got {codec!r}")
+    name, level = BLOSC[codec]
+    return (BloscCodec(cname=name, clevel=level, shuffle=BloscShuffle.bitshuffle, typesize=size),)  # type: ignore[arg-type]

@@ -75,12 +75,7 @@ def write_lookup(path: Path, tables: Tables, facts: Mapping[str, Any] | None = N
 
 
 def open_lookup(path: Path) -> dict[str, tuple[tuple[Track, TieTable], ...]]:
-    """Read the tracks and tie tables of all sweeps, by name.
-
-    Raises
-    ------
-    IncompleteStoreError : the store is missing or damaged.
-    """
+    """Read the tracks and tie tables of all sweeps, by name (IncompleteStoreError: the store is missing or damaged)."""
     root = open_group(path)
     with damage_named(str(path)):
         names = [str(name) for name in root.attrs["sweeps"]]  # type: ignore[union-attr]

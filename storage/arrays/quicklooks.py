@@ -192,9 +192,7 @@ def load_quicklook(path: Path) -> Quicklook | None:
 def quicklook_of(group: zarr.Group) -> Quicklook | None:
     """The picture of an opened cube or mosaic, None where it has none (stores of before). The cube is not read.
 
-    Raises
-    ------
-    IncompleteStoreError : the picture is damaged.
+    Raises IncompleteStoreError: the picture is damaged.
     """
     if ARRAY not in group:
         return None

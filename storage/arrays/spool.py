@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import RigError
 from pipeline.source import Line
-from storage.archive.plain_files import open_plain, plain_reader, read_plain
-from storage.archive.staging import sync_path
+from storage.archive.staging import open_plain, plain_reader, read_plain, sync_path
 from storage.arrays.spool_index import FORMAT, Head, SpoolEntry, difference, read_head
 
 SYNC_LINES = 64
@@ -99,9 +98,7 @@ class Spool:
     def append(self, line: Line) -> None:
         """Write the next line; every 64th call waits until the disk has them.
 
-        Raises
-        ------
-        RigError : the line is out of order or of another size, or the disk refuses. The lines before it are kept.
+        Raises RigError: the line is out of order or of another size, or the disk refuses. The lines before it are kept.
         """
         self._check_line(line, self.count)
         content = _to_bytes(line.data)
@@ -122,11 +119,8 @@ class Spool:
     def mend(self, lines: Iterable[Line]) -> None:
         """Put lost lines back: one for each number in `lost`, in that order.
 
-        Afterwards both files are what they would be had nothing been lost; killed in between, some are lost yet.
-
-        Raises
-        ------
-        RigError : a line is out of order or of another size, or the disk refuses.
+        Afterwards both files are what they would be had nothing been lost; killed in between, some are lost yet. Raises
+        RigError: a line is out of order or of another size, or the disk refuses.
         """
         if not self.lost:
             return
@@ -174,9 +168,7 @@ class Spool:
     def blocks(self, size: int = SYNC_LINES) -> Iterator[list[Line]]:
         """Give the lines in blocks of ``size``; the last may be shorter.
 
-        Raises
-        ------
-        RigError : a line has changed since it was written, or is lost and not mended; names it.
+        Raises RigError: a line has changed since it was written, or is lost and not mended; names it.
         """
         if self._data is not None:
             self.sync()

@@ -1,6 +1,7 @@
 """Making a mosaic on disk from sweeps on disk: tile by tile, several at a time, within a bound of memory.
 
-A tile is a shard of the mosaic and a task of dask: whoever makes it writes files that nobody else touches.
+Registration says which lines of a sweep may be believed, and where they lie. A tile is a shard of the mosaic and a task
+of its own: whoever makes it writes files that nobody else touches.
 """
 
 from __future__ import annotations
@@ -19,14 +20,67 @@ from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.line_cache import LineCache
 from pipeline.rectify.placed import PixelGrid, Placed
 from pipeline.rectify.region import Reaches, Tile, cache_bytes, column_reach, mosaic_tile, plan_tiles, tile_bytes
+from pipeline.rectify.line_numbers import LineNumbers, number_lines
+from pipeline.rectify.placed import PixelGrid, Placed, place
+from pipeline.rectify.region import Reaches, column_reach, mosaic_tile
+from pipeline.rectify.registration.alignment import SweepShift, no_shifts
+from pipeline.rectify.resample import Kernel
 from pipeline.rectify.tie_points import TieTable
 from pipeline.rectify.tracks import Track
-from storage.arrays.cubes import open_raw_cube
-from storage.arrays.located_sweeps import Sighted, sight_sweeps
+from storage.archive.manifests import read_table
+from storage.arrays.cubes import RawCube, open_raw_cube
 from storage.arrays.lookups import open_lookup
 from storage.arrays.mosaics import MosaicWriter
-from storage.parallel.block_work import run_blocks
-from storage.parallel.crew import THREADS, Crew
+from storage.parallel.crew import THREADS, Crew, run_blocks
+
+
+@dataclass(frozen=True)
+class Sighted:
+    """One captured sweep, which of its lines may be believed, and its corrections."""
+
+    cube: RawCube
+    numbers: LineNumbers
+    shift: SweepShift
+    gain: NDArray[np.float32] | None
+
+    @property
+    def usable(self) -> NDArray[np.bool_]:
+        """(line,) valid lines with a time stamp and a position of their own."""
+        known = np.isfinite(self.cube.position.sum(axis=1))
+        usable: NDArray[np.bool_] = self.cube.valid_line & self.numbers.usable & known
+        return usable
+
+    @property
+    def shift_px(self) -> NDArray[np.float64]:
+        """(line, 2) pointing corrections along the line and the scan [px]."""
+        return self.shift.of_lines(len(self.cube.time_s))
+
+    def placed(self, camera: LineCamera, grid: PixelGrid | None = None) -> Placed:
+        """Find where its lines lie."""
+        return place(self.cube, camera, grid=grid, usable=self.usable, shift_px=self.shift_px, gain=self.gain)
+
+    def facts(self) -> dict[str, int]:
+        """Lines that were lost, sent twice, out of order or late."""
+        found = self.numbers
+        counts = {"lost": found.lost, "repeated": found.repeated, "backward": found.backward, "late": found.late}
+        return counts | {"invalid": int(np.count_nonzero(~self.cube.valid_line))}
+
+
+def sight_sweeps(cubes: Sequence[RawCube], registration: Path | None, camera: LineCamera) -> list[Sighted]:
+    """Judge the lines of opened sweeps, with their corrections from a registration's record, if there is one."""
+    shifts = {shift.name: shift for shift in no_shifts([cube.sweep.name for cube in cubes])}
+    gains: dict[str, NDArray[np.float32]] = {}
+    if registration is not None:
+        for name, one in read_table(registration)["sweeps"].items():
+            shifts[name] = SweepShift(name, np.array(one["offset_px"]), np.array(one["drift_px_per_line"]))
+            if one["gain"] is not None:
+                gains[name] = np.array(one["gain"], np.float32)
+    frame_s = camera.frame_ms * 1e-3
+    return [
+        Sighted(cube, number_lines(cube.time_s, frame_s), shifts[cube.sweep.name], gains.get(cube.sweep.name))
+        for cube in cubes
+    ]
+
 
 Tables = Mapping[str, Sequence[tuple[Track, TieTable]]]
 
@@ -61,31 +115,21 @@ class MosaicRecipe:
         return [path for path in given if path is not None]
 
     def sweeps(self) -> list[Sighted]:
-        """Open the sweeps, in the order of their names.
-
-        Raises
-        ------
-        IncompleteStoreError : one is missing or damaged.
-        """
+        """Open the sweeps, in the order of their names (IncompleteStoreError: one is missing or damaged)."""
         cubes = [open_raw_cube(path) for path in sorted(self.raw.glob("*.zarr"))]
         return sight_sweeps(cubes, self.registration, self.camera)
 
     def open(self) -> MosaicWork:
         """Open the sweeps and find where their lines lie, from stored tables where there are some.
 
-        Raises
-        ------
-        IncompleteStoreError : a sweep or the tables are missing or damaged.
+        Raises IncompleteStoreError: a sweep or the tables are missing or damaged.
         """
         tables: Tables = {} if self.lookup is None else open_lookup(self.lookup)
-        placed = [_with_tables(one, self.camera, tables) for one in self.sweeps()]
+        placed = []
+        for one in self.sweeps():  # without tables where its lines lie too unevenly for one
+            stored = tables.get(one.cube.sweep.name)
+            placed.append(Placed(one.cube, tuple(stored), one.gain) if stored else one.placed(self.camera))
         return MosaicWork(placed, self.camera, self.grid, self.kernel)
-
-
-def _with_tables(one: Sighted, camera: LineCamera, tables: Tables) -> Placed:
-    """A sweep with its stored tables; without, where its lines lie too unevenly for one."""
-    stored = tables.get(one.cube.sweep.name)
-    return Placed(one.cube, tuple(stored), one.gain) if stored else one.placed(camera)
 
 
 @dataclass(frozen=True)
@@ -262,9 +306,7 @@ def tile_budget(
 ) -> TileBudget:
     """Choose how many tiles to make at a time: as many as are allowed and memory holds; elsewhere memory is no matter.
 
-    Raises
-    ------
-    SettingsError : not even one tile at a time fits the memory.
+    Raises SettingsError: not even one tile at a time fits the memory.
     """
     processes = not crew.shares_memory
     most = max(1, min(1 if crew.elsewhere else crew.count, len(tiles)))

@@ -15,8 +15,8 @@ from odc.geo.geobox import GeoBox
 
 from pipeline.errors import ArchiveError, ShapeError
 from storage.archive.whole_files import written_aside
-from storage.arrays.georeference import map_attributes
-from storage.arrays.ground_maps import ClassLegend
+from storage.arrays.class_maps import ClassNames
+from storage.arrays.ground_maps import map_attributes
 from storage.arrays.layout import AngularGrid
 
 LARGEST_GHOST = 1024  # bytes that GDAL's note of the layout may take before the first directory
@@ -58,7 +58,7 @@ class CogImage:
     place: Place
     bands: tuple[str, ...]  # their descriptions
     nodata: float
-    legend: ClassLegend | None = None  # of an image of classes: overviews take the commonest, not the mean
+    legend: ClassNames | None = None  # of an image of classes: overviews take the commonest, not the mean
     tags: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -76,11 +76,8 @@ def write_cog(path: Path, image: CogImage, blocks: Blocks) -> None:
     """Write one file, replacing what was there as a whole. Blocks come in order; memory: one block, not the image.
 
     Classes get a colour table, their names as tags of the band, and as GDAL's category names in ``NAME.aux.xml``.
-
-    Raises
-    ------
-    ShapeError : the blocks do not fill the image.
-    ArchiveError : rasterio is not installed, the disk refuses, or what was written does not read back the same.
+    Raises ShapeError: the blocks do not fill the image. ArchiveError: rasterio is not installed, the disk refuses, or
+    what was written does not read back the same.
     """
     rasterio = need_rasterio()
     copy = importlib.import_module("rasterio.shutil").copy
@@ -89,24 +86,25 @@ def write_cog(path: Path, image: CogImage, blocks: Blocks) -> None:
         plain, made = aside / "plain.tif", aside / path.name
         try:
             _write_plain(rasterio, plain, image, blocks)
-            copy(str(plain), str(made), driver="COG", **_options(image))
+            options = {
+                "COMPRESS": "DEFLATE",  # every reader has it; not every build of GDAL has zstd
+                "PREDICTOR": "NO" if image.legend is not None else "YES",  # neighbouring class numbers have no slope
+                "OVERVIEW_RESAMPLING": "AVERAGE" if image.legend is None else "MODE",
+                "BLOCKSIZE": str(TILE),
+                "NUM_THREADS": "1",
+            }
+            copy(str(plain), str(made), driver="COG", **options)
             problems = [*cog_problems(made), *_differences(rasterio, plain, made)]
         except rasterio.errors.RasterioError as error:
             raise ArchiveError(f"{path} cannot be written: {error}; is there space on the disk?") from error
         if problems:
             raise ArchiveError(f"{path} did not come out as written: {problems[0]}; is the disk full? run again")
         if image.legend is not None:
-            _write_categories(aside / sidecar, image.legend)
-
-
-def _options(image: CogImage) -> dict[str, str]:
-    return {
-        "COMPRESS": "DEFLATE",  # every reader has it; not every build of GDAL has zstd
-        "PREDICTOR": "NO" if image.legend is not None else "YES",  # neighbouring class numbers have no slope
-        "OVERVIEW_RESAMPLING": "AVERAGE" if image.legend is None else "MODE",
-        "BLOCKSIZE": str(TILE),
-        "NUM_THREADS": "1",
-    }
+            root = ElementTree.Element("PAMDataset")
+            names = ElementTree.SubElement(ElementTree.SubElement(root, "PAMRasterBand", band="1"), "CategoryNames")
+            for name in image.legend.names:
+                ElementTree.SubElement(names, "Category").text = name
+            ElementTree.ElementTree(root).write(aside / sidecar, encoding="utf-8")
 
 
 def _write_plain(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> None:
@@ -128,7 +126,8 @@ def _write_plain(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> 
         file.update_tags(**image.tags)
         if image.legend is not None:
             file.update_tags(1, **class_tags(image.legend))
-            file.write_colormap(1, colour_table(image.legend))
+            colours = enumerate(image.legend.colours.tolist())
+            file.write_colormap(1, {number: (*colour, 255) for number, colour in colours})
         reached = 0
         for first, values in blocks:
             planes = np.moveaxis(values.reshape(*values.shape[:2], -1), -1, 0)
@@ -140,25 +139,12 @@ def _write_plain(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> 
         raise ShapeError(f"{path.name}: {reached} of {y} rows were given")
 
 
-def class_tags(legend: ClassLegend) -> dict[str, str]:
+def class_tags(legend: ClassNames) -> dict[str, str]:
     """Names of the classes as tags: ``CLASS_0`` and so on, and all of them as CF's ``flag_meanings``."""
     meanings = " ".join("_".join(name.split()) for name in legend.names)
     values = ", ".join(str(number) for number in range(len(legend.names)))
     each = {f"CLASS_{number}": name for number, name in enumerate(legend.names)}
     return {**each, "flag_values": values, "flag_meanings": meanings}
-
-
-def colour_table(legend: ClassLegend) -> dict[int, tuple[int, int, int, int]]:
-    """Red, green, blue and opacity of every class."""
-    return {number: (red, green, blue, 255) for number, (red, green, blue) in enumerate(legend.colours.tolist())}
-
-
-def _write_categories(path: Path, legend: ClassLegend) -> None:
-    root = ElementTree.Element("PAMDataset")
-    names = ElementTree.SubElement(ElementTree.SubElement(root, "PAMRasterBand", band="1"), "CategoryNames")
-    for name in legend.names:
-        ElementTree.SubElement(names, "Category").text = name
-    ElementTree.ElementTree(root).write(path, encoding="utf-8")
 
 
 def _differences(rasterio: Any, plain: Path, made: Path) -> list[str]:

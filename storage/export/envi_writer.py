@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import pyproj
@@ -36,17 +36,13 @@ class EnviFile:
 def write_envi(header: Path, file: EnviFile, blocks: Blocks) -> Path:
     """Write ``NAME.hdr`` and the numbers beside it, ``NAME.img`` in any order of bands; gives the latter's path.
 
-    A pair that is there is replaced; a header never stands beside numbers that are not its own. Blocks of lines come
-    in order; memory: two blocks.
-
-    Raises
-    ------
-    ShapeError : the blocks do not fill the file, or the type or interleave is none of ENVI's.
-    PoseError : the map's grid is turned, or its pixels do not run down and to the right.
-    ArchiveError : the disk refuses.
+    A pair that is there is replaced; a header never stands beside numbers that are not its own. Blocks of lines come in
+    order; memory: two blocks. Raises ShapeError: the blocks do not fill the file, or the type or interleave is none of
+    ENVI's. PoseError: the map's grid is turned, or its pixels do not run down and to the right. ArchiveError: the disk
+    refuses.
     """
     text = header_text(file)
-    data = header.with_suffix(".img")
+    data, kind = header.with_suffix(".img"), np.dtype(file.dtype)
     with written_aside(header.parent, [data.name, header.name]) as aside:
         with (aside / data.name).open("wb") as stream:
             reached = 0
@@ -56,7 +52,13 @@ def write_envi(header: Path, file: EnviFile, blocks: Blocks) -> Path:
                         f"{data.name}: lines from {first} with shape {values.shape} do not follow {reached} of a file "
                         f"of {file.shape} (line, sample, band)"
                     )
-                _write_lines(stream, file, first, values)
+                if file.interleave == "bsq":  # band after band
+                    for band in range(file.shape[2]):
+                        stream.seek((band * file.shape[0] + first) * file.shape[1] * kind.itemsize)
+                        stream.write(np.ascontiguousarray(values[..., band], kind).data)
+                else:
+                    order = (0, 2, 1) if file.interleave == "bil" else (0, 1, 2)
+                    stream.write(np.ascontiguousarray(values.transpose(order), kind).data)
                 reached += len(values)
         if reached != file.shape[0]:
             raise ShapeError(f"{data.name}: {reached} of {file.shape[0]} lines were given")
@@ -64,26 +66,11 @@ def write_envi(header: Path, file: EnviFile, blocks: Blocks) -> Path:
     return data
 
 
-def _write_lines(stream: BinaryIO, file: EnviFile, first: int, values: NDArray[Any]) -> None:
-    """Put some lines where they belong; of band after band, each band's part by itself."""
-    kind = np.dtype(file.dtype)
-    if file.interleave != "bsq":
-        order = (0, 2, 1) if file.interleave == "bil" else (0, 1, 2)
-        stream.write(np.ascontiguousarray(values.transpose(order), kind).data)
-        return
-    lines, samples, bands = file.shape
-    for band in range(bands):
-        stream.seek((band * lines + first) * samples * kind.itemsize)
-        stream.write(np.ascontiguousarray(values[..., band], kind).data)
-
-
 def header_text(file: EnviFile) -> str:
     """The header: sizes, type, byte order, bands, and the map where there is one.
 
-    Raises
-    ------
-    ShapeError : the type or interleave is none of ENVI's, or there are not as many wavelengths as bands.
-    PoseError : the map's grid is turned, or its pixels do not run down and to the right.
+    Raises ShapeError: the type or interleave is none of ENVI's, or there are not as many wavelengths as bands.
+    PoseError: the map's grid is turned, or its pixels do not run down and to the right.
     """
     return "".join(["ENVI\n", *(f"{key} = {value}\n" for key, value in _fields(file))])
 

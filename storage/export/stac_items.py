@@ -1,9 +1,13 @@
-"""STAC: one item a run, one collection a folder of exports, with relative links and nothing that needs a server."""
+"""STAC: one item a run, one collection a folder of exports, with relative links and nothing that needs a server.
+
+Footprints, grids, wavelengths, bands and classes are said in the words of its extensions.
+"""
 
 from __future__ import annotations
 
 import importlib
 import json
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -11,10 +15,119 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyproj
+from numpy.typing import NDArray
+from odc.geo.geobox import GeoBox
+from odc.geo.geom import multipoint
 
 from pipeline.errors import ArchiveError
 from storage.archive.whole_files import write_whole
-from storage.export.stac_fields import SCHEMAS, bounds
+from storage.arrays.class_maps import ClassNames
+from storage.arrays.ground_maps import map_attributes
+
+COG = "image/tiff; application=geotiff; profile=cloud-optimized"
+ZARR = "application/vnd.zarr; version=3"
+SCHEMAS = {
+    "proj": "https://stac-extensions.github.io/projection/v2.0.0/schema.json",
+    "processing": "https://stac-extensions.github.io/processing/v1.2.0/schema.json",
+    "hsi": "https://stac-extensions.github.io/hsi/v1.0.0/schema.json",
+    "classification": "https://stac-extensions.github.io/classification/v2.0.0/schema.json",
+    "eo": "https://stac-extensions.github.io/eo/v2.0.0/schema.json",
+}
+_DIGITS = 9  # of a degree: 0.1 mm
+
+
+def clean_id(text: str, otherwise: str) -> str:
+    """The text as an id that is also a file's name; ``otherwise`` where nothing of it is left."""
+    return re.sub(r"[^A-Za-z0-9_-]+", "-", text).strip("-") or otherwise
+
+
+def bounds(geometry: Mapping[str, Any]) -> list[float]:
+    """West, south, east and north of a GeoJSON polygon [degrees]."""
+    points = np.array(geometry["coordinates"][0])
+    return [*points.min(axis=0).tolist(), *points.max(axis=0).tolist()]
+
+
+def footprint(geobox: GeoBox, seen: Iterable[tuple[int, NDArray[np.bool_]]]) -> dict[str, Any] | None:
+    """Convex outline of what a map shows, as a GeoJSON polygon in longitude and latitude, anticlockwise.
+
+    Parameters
+    ----------
+    seen
+        First row and (row, x) whether the map shows anything there, in order.
+
+    Returns
+    -------
+    To within one pixel of the map; None where nothing is seen.
+    """
+    corners = []
+    for first, mask in seen:
+        rows = np.flatnonzero(mask.any(axis=1))
+        left, right = mask[rows].argmax(axis=1), mask.shape[1] - mask[rows, ::-1].argmax(axis=1)
+        for columns in (left, right):
+            corners += [np.stack([columns, first + rows + down], axis=-1) for down in (0, 1)]
+    points = np.concatenate(corners) if corners else np.empty((0, 2), np.intp)
+    if not len(points):
+        return None
+    a, _, c, _, e, f = (float(number) for number in geobox.affine[:6])
+    places = np.stack([c + a * points[:, 0], f + e * points[:, 1]], axis=-1)
+    hull = multipoint(places.tolist(), geobox.crs).convex_hull.simplify(abs(a))
+    to_degrees = pyproj.Transformer.from_crs(map_attributes(geobox)["proj:wkt2"], "EPSG:4326", always_xy=True)
+    ring = np.round(np.stack(to_degrees.transform(*np.array(hull.json["coordinates"][0]).T[:2]), axis=-1), _DIGITS)
+    x, y = (ring - ring[0]).T
+    if float(np.sum(x[:-1] * y[1:] - x[1:] * y[:-1])) < 0:  # twice the area, negative where clockwise
+        ring = ring[::-1]
+    return {"type": "Polygon", "coordinates": [ring.tolist()]}
+
+
+def projection(geobox: GeoBox) -> dict[str, Any]:
+    """Fields of the projection extension of an image on a map, from what its Zarr store says (PoseError: no CRS)."""
+    place = map_attributes(geobox)
+    code = place.get("proj:code")
+    return {
+        "proj:code": code,
+        **({"proj:wkt2": place["proj:wkt2"]} if code is None else {}),
+        "proj:shape": [int(size) for size in geobox.shape],
+        "proj:transform": [float(number) for number in geobox.affine[:6]],
+        "proj:bbox": [float(number) for number in geobox.boundingbox.bbox],
+    }
+
+
+def angular(transform: Sequence[float], shape: Sequence[int]) -> dict[str, Any]:
+    """Fields of the projection extension of an image without a CRS, its transform in radians."""
+    return {"proj:code": None, "proj:shape": list(map(int, shape)), "proj:transform": list(transform)}
+
+
+def wavelengths(centre_nm: NDArray[np.float64]) -> dict[str, float]:
+    """Fields of the hyperspectral extension [micrometres]."""
+    return {"hsi:wavelength_min": float(centre_nm.min()) / 1000, "hsi:wavelength_max": float(centre_nm.max()) / 1000}
+
+
+def spectral_bands(centre_nm: NDArray[np.float64], fwhm_nm: NDArray[np.float64] | None, about: Any) -> dict[str, Any]:
+    """Bands of a cube, each with its centre and width [micrometres] and what is true of all of them."""
+    bands = [
+        {"name": f"B{number:03d}", "eo:center_wavelength": centre / 1000, **about}
+        for number, centre in enumerate(centre_nm.tolist())
+    ]
+    for band, width in zip(bands, [] if fwhm_nm is None else fwhm_nm.tolist(), strict=fwhm_nm is not None):
+        band["eo:full_width_half_max"] = width / 1000
+    return {"bands": bands}
+
+
+def classes(legend: ClassNames) -> dict[str, Any]:
+    """Fields of the classification extension: every class's number, name and colour."""
+    return {
+        "classification:classes": [
+            {
+                "value": number,
+                "name": clean_id(name, f"class-{number}"),
+                "title": name,
+                "color_hint": "{:02X}{:02X}{:02X}".format(*colour),
+            }
+            for number, (name, colour) in enumerate(zip(legend.names, legend.colours.tolist(), strict=True))
+        ]
+    }
+
 
 COLLECTION = "collection.json"
 _EVERYWHERE = [-180.0, -90.0, 180.0, 90.0]
@@ -55,10 +168,8 @@ def need_pystac() -> Any:
 def write_stac(folder: Path, collection: Collection, item: Item) -> tuple[Path, Path]:
     """Write ``ID/ID.json`` and the collection of all items that lie in ``folder``; gives both paths.
 
-    Raises
-    ------
-    ArchiveError : pystac is not installed, the folder is another collection's, one of its items cannot be read, or
-        what would be written does not fit STAC's own schemas.
+    Raises ArchiveError: pystac is not installed, the folder is another collection's, one of its items cannot be read,
+    or what would be written does not fit STAC's own schemas.
     """
     pystac = need_pystac()
     check_owner(folder, collection.id)
@@ -133,15 +244,10 @@ def _item(pystac: Any, item: Item) -> Any:
         made.bbox = bounds(item.footprint)
     for key, about in item.assets.items():
         made.add_asset(key, pystac.Asset.from_dict(dict(about)))
-    names = {*item.properties, *(name for about in item.assets.values() for name in _names(about))}
+    names = {*item.properties, *(name for about in item.assets.values() for name in about)}
+    names.update(name for about in item.assets.values() for band in about.get("bands", ()) for name in band)
     made.stac_extensions = [SCHEMAS[prefix] for prefix in SCHEMAS if any(n.startswith(f"{prefix}:") for n in names)]
     return made
-
-
-def _names(about: Mapping[str, Any]) -> Iterable[str]:
-    yield from about
-    for band in about.get("bands", ()):
-        yield from band
 
 
 def _extent(pystac: Any, items: Sequence[Any]) -> Any:

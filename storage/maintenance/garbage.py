@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Literal
 
 from pipeline.errors import SettingsError
-from storage.archive.addresses import StageRef
 from storage.archive.archive import Archive
+from storage.archive.keys import StageRef
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Store
 from storage.archive.run_folders import unfinished_extensions
@@ -46,14 +46,11 @@ class Removal:
 
 @dataclass(frozen=True)
 class Clearance:
-    """What can go, in that order; ``kept`` is what no run names and stays nevertheless, with the reason.
-
-    ``obstacle`` says why no store goes, or is None.
-    """
+    """What can go, in that order."""
 
     removals: tuple[Removal, ...]
-    kept: dict[str, str]
-    obstacle: str | None
+    kept: dict[str, str]  # what no run names and stays nevertheless, with the reason
+    obstacle: str | None  # why no store goes
 
     @property
     def size(self) -> int:
@@ -71,9 +68,7 @@ def clear_up(
 ) -> Clearance:
     """Remove what `plan_clearance` finds; what another process holds stays, and is not among the removals given.
 
-    Raises
-    ------
-    ArchiveError : the disk refuses.
+    Raises ArchiveError: the disk refuses.
     """
     if dry_run:
         with refusals(archive.root, "clear up the archive"):
@@ -122,8 +117,13 @@ def plan_clearance(
     uploads = [
         Removal(uri, "upload", size, "it was never published") for uri, size in archive.leftovers(keep_days).items()
     ]
-    rest = (*_spools(archive, catalogue), *_unfinished(archive.root))
-    return Clearance((*removals, *uploads, *rest), kept, obstacle)
+    published = {store.ref.key for store in catalogue.stores.values() if store.problem is None}
+    spools = [
+        Removal(f"spool/{path.name}", "spool", bytes_below(path), "its lines are published")
+        for path in sorted((archive.root / "spool").glob("*"))
+        if path.name.removesuffix(_MADE_AHEAD) in published
+    ]
+    return Clearance((*removals, *uploads, *spools, *_unfinished(archive.root)), kept, obstacle)
 
 
 def _spared(catalogue: Catalogue, named: set[str], keep_days: float, raw_too: bool, now: datetime) -> dict[str, str]:
@@ -170,54 +170,37 @@ def _obstacle(archive: Archive, catalogue: Catalogue, staying: set[str]) -> str 
     return None
 
 
-def _spools(archive: Archive, catalogue: Catalogue) -> list[Removal]:
-    """Spools whose lines are published, and what earlier versions made of these beside them."""
-    published = {store.ref.key for store in catalogue.stores.values() if store.problem is None}
-    return [
-        Removal(f"spool/{path.name}", "spool", bytes_below(path), "its lines are published")
-        for path in sorted((archive.root / "spool").glob("*"))
-        if path.name.removesuffix(_MADE_AHEAD) in published
-    ]
-
-
 def _unfinished(root: Path) -> list[Removal]:
-    parts = [*root.glob(f"stages/*/*{PART_SUFFIX}"), *root.glob(f"runs/*{PART_SUFFIX}")]
-    return [
-        Removal(path.relative_to(root).as_posix(), "unfinished", bytes_below(path), "whoever made it is gone")
-        for path in sorted(set(parts) - set(unfinished_extensions(root)))
-        if _is_free(root, path)
-    ]
+    parts = {*root.glob(f"stages/*/*{PART_SUFFIX}"), *root.glob(f"runs/*{PART_SUFFIX}")}
+    found: list[Removal] = []
+    for path in sorted(parts - set(unfinished_extensions(root))):
+        uri, free = path.relative_to(root).as_posix(), True
+        if (lock := _lock_of(root, uri, "unfinished")).exists():
+            release = take_lock(lock, wait=False)
+            if free := release is not None:
+                release()
+        if free:
+            found.append(Removal(uri, "unfinished", bytes_below(path), "whoever made it is gone"))
+    return found
 
 
-def _is_free(root: Path, part: Path) -> bool:
-    lock = _lock_of(root, part)
-    if not lock.exists():
-        return True
-    release = take_lock(lock, wait=False)
-    if release is not None:
-        release()
-    return release is not None
-
-
-def _lock_of(root: Path, part: Path) -> Path:
-    return root / ".locks" / f"{part.parent.name}-{part.stem}.lock"
+def _lock_of(root: Path, uri: str, what: What) -> Path:
+    path = Path(uri)
+    name = f"capture-{path.name.removesuffix(_MADE_AHEAD)}" if what == "spool" else f"{path.parent.name}-{path.stem}"
+    return root / ".locks" / f"{name}.lock"
 
 
 def _remove(archive: Archive, removal: Removal) -> bool:
     """Take one thing away; False where another process holds it."""
+    path = archive.root / removal.uri
     if removal.what == "store":
-        _, stage, key = removal.uri.split("/")
-        return archive.discard(StageRef(stage, key, archive.root / removal.uri), wait=False)
+        return archive.discard(StageRef(path.parent.name, path.name, path), wait=False)
     if removal.what == "upload":
         archive.drop_leftover(removal.uri)
         return True
-    path = archive.root / removal.uri
     if removal.what == "spool":
         check_name(path.name)
-        lock = archive.root / ".locks" / f"capture-{path.name.removesuffix(_MADE_AHEAD)}.lock"
-    else:
-        lock = _lock_of(archive.root, path)
-    release = take_lock(lock, wait=False)
+    release = take_lock(_lock_of(archive.root, removal.uri, removal.what), wait=False)
     if release is None:
         return False
     try:

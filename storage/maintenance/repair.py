@@ -22,8 +22,6 @@ from storage.archive.records import RECEIPT, Run
 from storage.archive.staging import PART_SUFFIX, refusals, remove_tree, retire, sync_path, take_lock
 from storage.maintenance.verification import ASIDE, Finding
 
-_BY_HAND = f"its {RECEIPT} cannot be believed: run that survey again by hand, then remove this folder"
-
 Rerun = Callable[[dict[str, Any]], None]  # settings of a survey: runs and publishes it; PipelineError where it cannot
 
 
@@ -81,7 +79,7 @@ def repair(
     Parameters
     ----------
     findings
-        Of `Archive.verify_all`.
+        Of `storage.maintenance.verification.verify_everything`.
     rerun
         Runs a survey by its settings, as the receipt has them, into this archive. What is whole is found there.
     versions
@@ -97,7 +95,14 @@ def repair(
         put_back(archive.root)
         plan = plan_repair(archive, findings, versions=versions)
         for uri in plan.remade:
-            _set_aside(archive.root, uri)
+            _, stage, key = uri.split("/")
+            release = take_lock(archive.root / ".locks" / f"{stage}-{key}.lock")
+            try:
+                if os.path.lexists(archive.root / uri):
+                    _move(archive.root / uri, archive.root / ASIDE / stage / key)
+            finally:
+                if release is not None:
+                    release()
     done = Repaired(plan)
     try:
         succeeded = run_again(plan.surveys, rerun, done)
@@ -107,7 +112,12 @@ def repair(
     with refusals(archive.root, "repair the archive"):
         _settle(archive, done)
         for uri, text in plan.broken_runs.items():
-            _settle_run(archive, uri, text in succeeded, done)
+            if text in succeeded:  # its survey has run again, into a folder of its own
+                retire(archive.root / uri)
+                done.remade.append(uri)
+            else:
+                words = f"its {RECEIPT} or the settings in it cannot be read: run that survey again by hand"
+                done.failed.setdefault(uri, words)
     return done
 
 
@@ -177,28 +187,6 @@ def _settle(archive: Archive, done: Repaired) -> None:
                 _move(aside, archive.root / uri)
         remove_tree(aside)
     remove_tree(archive.root / ASIDE)
-
-
-def _settle_run(archive: Archive, uri: str, ran: bool, done: Repaired) -> None:
-    """Take a damaged run's folder away where its survey has run again, into a folder of its own."""
-    if ran:
-        retire(archive.root / uri)
-        done.remade.append(uri)
-    else:
-        done.failed.setdefault(
-            uri, f"its {RECEIPT} or the settings in it cannot be read: run that survey again by hand"
-        )
-
-
-def _set_aside(root: Path, uri: str) -> None:
-    _, stage, key = uri.split("/")
-    release = take_lock(root / ".locks" / f"{stage}-{key}.lock")
-    try:
-        if os.path.lexists(root / uri):
-            _move(root / uri, root / ASIDE / stage / key)
-    finally:
-        if release is not None:
-            release()
 
 
 def _move(path: Path, to: Path) -> None:

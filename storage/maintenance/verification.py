@@ -1,19 +1,25 @@
 """Reading a whole archive again: every byte against its manifest, every manifest against its seal and its runs.
 
-What is no file where one should be, such as a link or a pipe, is told and never opened.
+What is no file where one should be, such as a link or a pipe, is told and never opened. Of a broken file of an array it
+is told which part it holds, and which chunks of it can no longer be read.
 """
 
 from __future__ import annotations
 
+import itertools
+import json
+import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+import zarr
+from numcodecs.errors import UnknownCodecError  # type: ignore[import-untyped]
 from numcodecs.registry import codec_registry  # type: ignore[import-untyped]
 
-from storage.archive.addresses import without_manifest
+from storage.archive.keys import without_manifest
 from storage.archive.ledger import FOLDER
 from storage.archive.lineage import Catalogue
 from storage.archive.manifests import (
@@ -25,13 +31,133 @@ from storage.archive.manifests import (
     packed_from,
     try_manifest,
 )
-from storage.archive.plain_files import kind_of
-from storage.archive.records import Run, Store
 from storage.archive.run_folders import unfinished_extensions
-from storage.archive.staging import MANIFEST_NAME
+from storage.archive.staging import MANIFEST_NAME, kind_of, read_plain
 from storage.arrays.layout import missing_codec
 from storage.maintenance.growing_checks import SPOOLS, growing_problems
-from storage.maintenance.shard_names import name_damage
+
+WORDS = {"y": "rows", "x": "columns", "line": "lines", "sample": "samples", "band": "bands", "patch": "patches"}
+MOST_NAMED = 3
+_NO_ARRAY = (OSError, ValueError, KeyError, TypeError, IndexError, RecursionError)
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One file of a Zarr v3 array: the array, and the indices that the file holds."""
+
+    array: Path
+    dims: tuple[str, ...]
+    shape: tuple[int, ...]
+    box: tuple[slice, ...]  # of the file
+    chunk: tuple[int, ...]  # what has a checksum of its own
+
+    def words(self, box: Sequence[slice]) -> str:
+        """Index ranges of a part of the array; a dimension of which it has everything is left out."""
+        ranges = [
+            f"{WORDS.get(dim, dim)} {part.start} to {part.stop - 1}"
+            for dim, size, part in zip(self.dims, self.shape, box, strict=True)
+            if part.stop - part.start < size
+        ]
+        return ", ".join(ranges) or "all of it"
+
+    def chunks(self) -> list[tuple[slice, ...]]:
+        """What the file is made of, cut to the array."""
+        steps = [
+            [slice(start, min(start + step, part.stop)) for start in range(part.start, part.stop, step)]
+            for part, step in zip(self.box, self.chunk, strict=True)
+        ]
+        return list(itertools.product(*steps))
+
+    def unreadable(self) -> list[tuple[slice, ...]]:
+        """Chunks that fail their checksum or cannot be decoded; all of them where the file's index is damaged."""
+        array: zarr.Array[Any] = zarr.open_array(self.array, mode="r", zarr_format=3)
+        return [box for box in self.chunks() if not _can_be_read(array, box)]
+
+
+def name_damage(store: Path, name: str) -> str:
+    """What is known of a broken file of a store, in words to follow its name; empty where it belongs to no array.
+
+    For example ``(values: rows 0 to 63, columns 0 to 639; unreadable: rows 32 to 63, columns 0 to 31)``.
+    """
+    if any(path.is_symlink() for path in (store / name).parents if path.is_relative_to(store)):
+        return ""
+    try:
+        shard = find_shard(store, name)
+        if shard is None:
+            return ""
+        where = f"{shard.array.relative_to(store).as_posix()}: {shard.words(shard.box)}"
+        return f" ({where}{_damage_words(shard) if kind_of(store / name) == 'a file' else ''})"
+    except _NO_ARRAY:
+        return ""
+
+
+def _damage_words(shard: Shard) -> str:
+    broken, count = shard.unreadable(), len(shard.chunks())
+    if count == 1:
+        return ""
+    if not broken:
+        return "; every chunk of it can still be read"
+    if len(broken) == count:
+        return "; none of its chunks can be read"
+    named = "; ".join(shard.words(box) for box in broken[:MOST_NAMED])
+    more = f" and {len(broken) - MOST_NAMED} more" if len(broken) > MOST_NAMED else ""
+    return f"; unreadable: {named}{more}"
+
+
+def find_shard(store: Path, name: str) -> Shard | None:
+    """The part of an array that ``name``, a file of a store, holds; None where it is no array's file.
+
+    Raises OSError, ValueError, KeyError, TypeError, IndexError: the array's own description is damaged.
+    """
+    file = store / name
+    for array in file.parents:
+        if array == store or not array.is_relative_to(store):
+            return None
+        if kind_of(array / "zarr.json") == "a file":
+            break
+    about = json.loads(read_plain(array / "zarr.json"))
+    if about.get("node_type") != "array" or file == array / "zarr.json":
+        return None
+    shape = tuple(int(size) for size in about["shape"])
+    sizes = [int(size) for size in about["chunk_grid"]["configuration"]["chunk_shape"]]
+    numbers = _chunk_numbers(file.relative_to(array).as_posix(), len(shape))
+    box = tuple(
+        slice(number * size, min((number + 1) * size, whole))
+        for number, size, whole in zip(numbers, sizes, shape, strict=True)
+    )
+    dims = tuple(about.get("dimension_names") or (f"axis {axis}" for axis in range(len(shape))))
+    return Shard(array, dims, shape, box, _inner_chunk(about, sizes))
+
+
+def _chunk_numbers(name: str, dims: int) -> list[int]:
+    """Of ``c/0/3/0`` (or ``c.0.3.0``) the numbers."""
+    words = name.replace(".", "/").split("/")
+    if words[0] != "c" or len(words) != dims + 1:
+        raise ValueError(f"{name} is no chunk of {dims} dimensions")
+    return [int(word) for word in words[1:]]
+
+
+def _inner_chunk(about: dict[str, Any], sizes: list[int]) -> tuple[int, ...]:
+    for codec in about["codecs"]:
+        if codec["name"] == "sharding_indexed":
+            sizes = [int(size) for size in codec["configuration"]["chunk_shape"]]
+    if not all(size > 0 for size in sizes):
+        raise ValueError(f"chunks of {sizes}")
+    return tuple(sizes)
+
+
+def _can_be_read(array: zarr.Array[Any], box: tuple[slice, ...]) -> bool:
+    """Whether one chunk decodes. Whatever a decoder says of damaged bytes, the answer is no (no codec: it raises)."""
+    if math.prod(part.stop - part.start for part in box) <= 0:
+        return True
+    try:
+        array[box]
+    except UnknownCodecError:
+        raise
+    except Exception:
+        return False
+    return True
+
 
 ASIDE = ".aside"
 Kind = Literal["whole", "broken", "missing", "stray", "growing", "unreadable"]
@@ -62,7 +188,7 @@ def verify_everything(
     read_again = problems_of or _problems
     catalogue = Catalogue.read(root)
     places = [(uri, store.ref.path, store.size) for uri, store in catalogue.stores.items()]
-    places += [(run.uri, run.folder, _bytes(run)) for run in catalogue.runs]
+    places += [(run.uri, run.folder, listed_bytes(run.facts) if run.facts else 0) for run in catalogue.runs]
     total, done = sum(size for *_, size in places) or 1, 0
     found: list[Finding] = []
     for uri, path, size in places:
@@ -75,9 +201,16 @@ def verify_everything(
         if problems and _changed_since(catalogue, uri):  # its files and its manifest changed together
             catalogue = Catalogue.read(root)
             problems = list(read_again(path)) + list(_identity_problems(catalogue, uri))
-        found += [Finding(uri, problem, "broken") for problem in problems] or [_whole(catalogue.stores.get(uri), uri)]
-    misplaced, growing = _misplaced_runs(catalogue), verify_growing(root)
-    return [*found, *misplaced, *_lost(root), *_missing(catalogue), *_left_aside(root), *_half_extended(root), *growing]
+        found += [Finding(uri, problem, "broken") for problem in problems]
+        if problems:
+            continue
+        store = catalogue.stores.get(uri)  # every byte is as published; whether its numbers can be read?
+        if store is None or not packed_from(store.facts) or "pcodec" in codec_registry:
+            found.append(Finding(uri, None))
+        else:
+            words = missing_codec("every byte of it is as published, but it", "pcodec")
+            found.append(Finding(uri, words, "unreadable"))
+    return [*found, *_misplaced(catalogue, root), *_missing(catalogue), *_broken_off(root), *verify_growing(root)]
 
 
 def verify_growing(root: Path) -> Iterator[Finding]:
@@ -93,21 +226,10 @@ def verify_growing(root: Path) -> Iterator[Finding]:
                     yield Finding(uri, f"is {kind}, expected a file; take it out of the archive", "stray")
 
 
-def _whole(store: Store | None, uri: str) -> Finding:
-    """A store or run of which every byte is as published; whether its numbers can be read is another question."""
-    if store is None or not packed_from(store.facts) or "pcodec" in codec_registry:
-        return Finding(uri, None)
-    return Finding(uri, missing_codec("every byte of it is as published, but it", "pcodec"), "unreadable")
-
-
 def _changed_since(catalogue: Catalogue, uri: str) -> bool:
     """Whether something was added to a run after the catalogue was read."""
     run = next((run for run in catalogue.runs if run.uri == uri), None)
     return run is not None and extended_from(try_manifest(run.folder)[0]) != extended_from(run.facts)
-
-
-def _bytes(run: Run) -> int:
-    return listed_bytes(run.facts) if run.facts else 0
 
 
 def _problems(folder: Path) -> Iterator[str]:
@@ -128,42 +250,26 @@ def _identity_problems(catalogue: Catalogue, uri: str) -> Iterator[str]:
     stated = f"stages/{store.facts.get('stage')}/{store.facts.get('key')}"
     if stated != uri:
         yield f"its {MANIFEST_NAME} is that of {stated}; move it back, or take it out of the archive"
-    doubter = _doubter(catalogue, store)
-    if doubter is not None:
-        yield f"its {MANIFEST_NAME} has changed since {doubter.uri} was published (its SHA-256 differs)"
-
-
-def _doubter(catalogue: Catalogue, store: Store) -> Run | None:
-    """A run that knows another manifest, unless a run knows this one, or one that the store had before it was packed.
-
-    Nor is a store doubted that was made anew since.
-    """
-    knowing = [run for run in catalogue.runs if store.ref.uri in run.recorded]
+    knowing = [run for run in catalogue.runs if uri in run.recorded]
     if not knowing:
-        return None
-    own = {manifest_sha256(store.ref.path), *packed_from(store.facts)}
-    if any(run.recorded[store.ref.uri] in own for run in knowing):
-        return None
+        return
+    own = {manifest_sha256(store.ref.path), *packed_from(store.facts)}  # also those of before it was packed
     anew = is_sealed(store.facts) and all(store.created > run.sealed for run in knowing)
-    return None if anew else knowing[-1]
+    if not anew and not any(run.recorded[uri] in own for run in knowing):
+        yield f"its {MANIFEST_NAME} has changed since {knowing[-1].uri} was published (its SHA-256 differs)"
 
 
-def _misplaced_runs(catalogue: Catalogue) -> Iterator[Finding]:
-    """Folders of runs that say that they are another: copies, or renamed."""
+def _misplaced(catalogue: Catalogue, root: Path) -> Iterator[Finding]:
+    """Runs that say that they are another (copies, or renamed), and what lies beside them without a manifest."""
     there = {run.folder.name for run in catalogue.runs}
     for run in catalogue.runs:
         stated = run.facts.get("run", run.folder.name)
         if stated != run.folder.name:
             do = "it is a copy: take it out of the archive" if stated in there else "give it its name back"
             yield Finding(run.uri, f"its {MANIFEST_NAME} is that of runs/{stated}; {do}", "stray")
-
-
-def _lost(root: Path) -> Iterator[Finding]:
-    """What lies among stores and runs without a manifest."""
     for path in without_manifest(root):
-        uri = path.relative_to(root).as_posix()
-        kind = kind_of(path)
-        if kind != "a folder" or len(path.relative_to(root).parts) < 2:
+        uri, kind = path.relative_to(root).as_posix(), kind_of(path)
+        if kind != "a folder" or uri.count("/") < 1:
             yield Finding(uri, f"is {kind}, expected a folder with a manifest; take it out of the archive", "stray")
         else:
             yield Finding(uri, f"{MANIFEST_NAME} is missing", "broken")
@@ -183,12 +289,9 @@ def _missing(catalogue: Catalogue) -> Iterator[Finding]:
                 yield Finding(given, f"is not there, but {uri} was made of it", "missing")
 
 
-def _half_extended(root: Path) -> Iterator[Finding]:
+def _broken_off(root: Path) -> Iterator[Finding]:
+    for path in sorted((root / ASIDE).glob("*/*")):
+        yield Finding(path.relative_to(root).as_posix(), "a repair was broken off; run verify --repair again", "stray")
     for part in unfinished_extensions(root):
         words = "what was added to it lacks its last step, a name; any command that writes into the archive gives it"
         yield Finding(f"runs/{part.stem}", words, "stray")
-
-
-def _left_aside(root: Path) -> Iterator[Finding]:
-    for path in sorted((root / ASIDE).glob("*/*")):
-        yield Finding(path.relative_to(root).as_posix(), "a repair was broken off; run verify --repair again", "stray")

@@ -1,30 +1,38 @@
-"""Blocks on other processes: a cluster of this machine, started for the work, or one that a dask scheduler leads."""
+"""Blocks on other processes: a cluster of this machine, started for the work, or one that a dask scheduler leads.
+
+For the same bytes to come out, code, threads of arithmetic and files have to be the same wherever blocks are made.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import os
+import pickle
+import platform
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager, suppress
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from multiprocessing import resource_tracker
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 from uuid import uuid4
 
-import dask
-
 from pipeline.errors import SettingsError, WorkerError
-from storage.parallel.crew import Crew, check_sendable
-from storage.parallel.worker_facts import ONE_THREAD, about_here, check_facts, versions_here
 
 ANSWER_S = 5.0  # a scheduler that is there answers at once
 LOOK_S, MOST_WAIT_S = 0.02, 60.0  # how often, and how long at most, blocks are waited for that nobody wants any more
 AHEAD = 2  # blocks sent to a worker: one in the making, one waiting
+MOST_SENT = 2**18  # bytes that work or one of its items may take on its way to another process: paths, not arrays
+ROOMS = ("pipeline", "models", "storage", "flows")  # blocks of regions are made in flows
+LIBRARIES = ("numpy", "zarr", "numcodecs", "torch", "distributed")
+ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 # one thread of arithmetic a worker, and freed memory kept: large arrays cost more page faults than arithmetic
 _ENVIRONMENT = {
     **ONE_THREAD,
@@ -45,6 +53,28 @@ _QUIET = {
 }
 
 
+def ahead_of_the_oldest(
+    submit: Callable[[int], Any],
+    wait: Callable[[list[Any]], Iterable[Any]],
+    running: dict[Any, int],
+    count: int,
+    window: int,
+) -> Iterator[tuple[int, Any]]:
+    """Begin blocks 0 to ``count`` in order, and give number and future of each as it ends.
+
+    None is begun ``window`` or more after the oldest unfinished one: neighbours share what they read. ``running`` holds
+    the futures of those under way.
+    """
+    sent = 0
+    while running or sent < count:
+        while sent < count and sent - min(running.values(), default=sent) < window:
+            running[submit(sent)] = sent
+            sent += 1
+        for future in sorted(wait(list(running)), key=running.__getitem__):
+            yield running[future], future
+            del running[future]
+
+
 class ProcessTeam:
     """Workers that blocks can be sent to. Close it."""
 
@@ -58,36 +88,36 @@ class ProcessTeam:
     def run(self, make: Callable[[Any], Any], items: Sequence[Any], ended: Callable[[int, Any], None]) -> None:
         """Send blocks a few ahead of the oldest unfinished one, and give each result to ``ended``.
 
-        Raises
-        ------
-        WorkerError : workers died while they made the same block again and again, or all of them left.
+        Raises WorkerError: workers died while they made the same block again and again, or all of them left.
         """
-        from dask.distributed import wait
+        name, running = f"block-{uuid4().hex}-", dict[Any, int]()
 
-        waited: Callable[..., Any] = wait
-        window, name = AHEAD * self._threads(), f"block-{uuid4().hex}-"
-        running: dict[Any, int] = {}
-        sent = 0
+        def submit(number: int) -> Any:
+            check_sendable("item", items[number])
+            return self._client.submit(make, items[number], key=f"{name}{number}")
+
         try:
-            while running or sent < len(items):
-                while sent < len(items) and sent - min(running.values(), default=sent) < window:
-                    check_sendable("item", items[sent])
-                    running[self._client.submit(make, items[sent], key=f"{name}{sent}")] = sent
-                    sent += 1
-                try:
-                    with self._client.as_current():
-                        done = waited(list(running), timeout=ANSWER_S, return_when="FIRST_COMPLETED").done
-                except TimeoutError:
-                    self._threads()  # a block may take long; a team without workers never ends one
-                    continue
-                except CancelledError:
-                    raise self._gone() from None
-                for future in sorted(done, key=running.__getitem__):
-                    ended(running[future], self._result(future))
-                    del running[future]
+            blocks = ahead_of_the_oldest(submit, self._wait, running, len(items), AHEAD * self._threads())
+            for number, future in blocks:
+                ended(number, self._result(future))
         except BaseException as error:
             self._take_back(list(running), name, wait=isinstance(error, Exception))
             raise
+
+    def _wait(self, futures: list[Any]) -> Iterable[Any]:
+        """Those that have ended, none where all go on: a team without workers never ends one, and is refused."""
+        from dask.distributed import wait  # half a second, for crews of processes alone
+
+        waited: Callable[..., Any] = wait
+        try:
+            with self._client.as_current():
+                done: Iterable[Any] = waited(futures, timeout=ANSWER_S, return_when="FIRST_COMPLETED").done
+                return done
+        except TimeoutError:
+            self._threads()
+            return ()
+        except CancelledError:
+            raise self._gone() from None
 
     def _take_back(self, futures: Sequence[Any], name: str, *, wait: bool) -> None:
         """Cancel blocks, and ``wait`` until nobody makes one of them any more and could write."""
@@ -101,7 +131,6 @@ class ProcessTeam:
         return WorkerError(f"{self._name}: the scheduler is gone; the same command goes on once it is there again")
 
     def _result(self, future: Any) -> Any:
-        """What a block gave, or why it did not."""
         from dask.distributed import KilledWorker
 
         try:
@@ -131,10 +160,8 @@ class ProcessTeam:
     def check(self, paths: Sequence[Path]) -> None:
         """Ask the scheduler and every worker for their versions, and workers for their threads and some folders.
 
-        Raises
-        ------
-        SettingsError : one differs from this process; names it, both values and what to do.
-        WorkerError : a worker was lost meanwhile.
+        Raises SettingsError: one differs from this process; names it, both values and what to do. WorkerError: a worker
+        was lost meanwhile.
         """
         self._threads()
         folders = [str(path.absolute()) for path in paths]
@@ -158,13 +185,82 @@ def is_making(name: str, dask_worker: Any) -> bool:
     return any(str(task.key).startswith(name) for task in dask_worker.state.executing)
 
 
-def start(workers: int) -> ProcessTeam:
-    """Start a cluster of one-thread processes on this machine.
+def check_sendable(what: str, value: object) -> None:
+    """Refuse what cannot be pickled, or is so large that it must hold arrays (TypeError)."""
+    try:
+        size = len(pickle.dumps(value))
+    except Exception as error:
+        raise TypeError(
+            f"the {what} of blocks cannot be sent to other processes: expected a function of a module, or a dataclass "
+            f"of paths and settings; got {type(value).__name__} ({error})"
+        ) from None
+    if size > MOST_SENT:
+        raise TypeError(
+            f"the {what} of blocks takes {size} bytes on its way to another process, at most {MOST_SENT} are allowed; "
+            f"give {type(value).__name__} paths to open instead of arrays"
+        )
 
-    Raises
-    ------
-    WorkerError : the processes do not start.
-    """
+
+# --- what has to be the same ------------------------------------------------------------------------------------------
+
+
+def about_here(folders: Sequence[str]) -> dict[str, str]:
+    """What this process runs, on how many threads, and what it sees in some folders, by name."""
+    all_threads = os.environ.get("OMP_NUM_THREADS", "not set")  # which counts where the others do not stand
+    threads = {name: os.environ.get(name, all_threads) for name in ONE_THREAD}
+    return versions_here() | threads | {folder: _seen(Path(folder)) for folder in folders}
+
+
+@cache
+def versions_here() -> dict[str, str]:
+    """What this process runs, by name, as it was when first asked: so it runs whatever changes on the disk."""
+    facts = {"python": platform.python_version(), "spectralzoom": _code_digest()}
+    for name in LIBRARIES:
+        try:
+            facts[name] = version(name)
+        except PackageNotFoundError:
+            facts[name] = "missing"
+    return facts
+
+
+def check_facts(who: str, facts: Mapping[str, str], expected: Mapping[str, str]) -> None:
+    """Refuse a worker that differs (SettingsError): names it, the first thing that does, both values and what to do."""
+    for what, value in expected.items():
+        if facts.get(what) == value:
+            continue
+        if what in ONE_THREAD:
+            cure = " in its environment, as dask's nannies set it: sums of several threads are rounded otherwise"
+        elif what.startswith("/"):
+            cure = (
+                " as here; workers must see the same files under the same path: put the archive on a disk that all of"
+                " them mount"
+            )
+        else:
+            cure = " as here; install the same there"
+        raise SettingsError(f"{who} has {what} {facts.get(what)}, expected {value}{cure}")
+
+
+def _code_digest() -> str:
+    """Hash of the source that blocks run: a version number does not tell one checkout from another."""
+    root, found = Path(__file__).parents[2], hashlib.sha256()
+    for path in sorted(path for room in ROOMS for path in (root / room).rglob("*.py")):
+        found.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
+    return f"of code {found.hexdigest()[:12]}"
+
+
+def _seen(folder: Path) -> str:
+    if not folder.is_dir():
+        return "not there"
+    names = sorted(path.name for path in folder.iterdir())
+    return f"with {len(names)} names ({hashlib.sha256(repr(names).encode()).hexdigest()[:8]})"
+
+
+# --- clusters ---------------------------------------------------------------------------------------------------------
+
+
+def start(workers: int) -> ProcessTeam:
+    """Start a cluster of one-thread processes on this machine (WorkerError: they do not start)."""
+    import dask  # half a second, for crews of processes alone
     from dask.distributed import Client, LocalCluster
 
     name = f"{workers} worker processes"
@@ -192,27 +288,22 @@ def start(workers: int) -> ProcessTeam:
     raise AssertionError("an exit stack swallows nothing")
 
 
-def connect(crew: Crew) -> ProcessTeam:
-    """Find the scheduler of a crew that is elsewhere.
-
-    Raises
-    ------
-    SettingsError : none answers there.
-    """
+def connect(scheduler: str) -> ProcessTeam:
+    """Find the scheduler at an address (SettingsError: none answers there)."""
     from dask.distributed import Client
 
     with ExitStack() as closing:
         closing.enter_context(_quiet_logs())
         try:
             client = closing.enter_context(
-                Client(crew.scheduler, timeout=ANSWER_S, set_as_default=False)  # type: ignore[no-untyped-call]
+                Client(scheduler, timeout=ANSWER_S, set_as_default=False)  # type: ignore[no-untyped-call]
             )
         except (OSError, TimeoutError, ValueError) as error:
             raise SettingsError(
-                f"--scheduler {crew.scheduler}: expected a dask scheduler there, none answered within {ANSWER_S:g} s "
+                f"--scheduler {scheduler}: expected a dask scheduler there, none answered within {ANSWER_S:g} s "
                 f"({type(error).__name__}); start `dask scheduler`, or use --scheduler processes"
             ) from None
-        return ProcessTeam(client, f"--scheduler {crew.scheduler}", closing.pop_all())
+        return ProcessTeam(client, f"--scheduler {scheduler}", closing.pop_all())
     raise AssertionError("an exit stack swallows nothing")
 
 

@@ -1,34 +1,30 @@
-"""A crew: who makes blocks, how many at a time, and its workers for as long as it is open."""
+"""One task a block, on threads of this process, on processes beside it, or on a cluster somewhere else.
+
+A block is a whole shard (or reads whole shards): no two tasks ever touch one file, so nothing has to be locked and the
+bytes do not depend on who made them. What processes and clusters need of their workers is in ``cluster_work``.
+"""
 
 from __future__ import annotations
 
 import os
-import pickle
 import re
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, TypeVar
 
-from pipeline.errors import SettingsError
+from pipeline.errors import SettingsError, WorkerError
+from storage.archive.staging import PART_SUFFIX
+from storage.parallel import cluster_work
 
-MOST_SENT = 2**18  # bytes that work or one of its items may take on its way to another process: paths, not arrays
 _ADDRESS = re.compile(r"(tcp|tls)://[^\s/:]+:\d+|(tcp|tls)://\[[0-9a-fA-F:]+\]:\d+")
 
-
-class Team(Protocol):
-    """Workers on other processes that blocks can be sent to."""
-
-    def run(self, make: Callable[[Any], Any], items: Sequence[Any], ended: Callable[[int, Any], None]) -> None:
-        """Send blocks a few ahead of the oldest unfinished one, and give each result to ``ended``."""
-
-    def check(self, paths: Sequence[Path]) -> None:
-        """Refuse workers that see other files in these folders, or run other versions."""
-
-    def close(self) -> None:
-        """Let the workers go."""
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+Report = Callable[[float], None]  # share done, 0..1, from the thread that asked
 
 
 @dataclass(frozen=True)
@@ -76,17 +72,19 @@ class Crew:
         finally:
             with _guard:
                 held.users -= 1
-                team = held.team if held.users == 0 else None
-                if held.users == 0:
+                last = held.users == 0
+                if last:
                     del _open[self]
-            if team is not None:
-                team.close()
+            if last and held.team is not None:
+                held.team.close()
 
-    def team(self, start: Callable[[Crew], Team]) -> Team:
+    def team(self) -> cluster_work.ProcessTeam:
         """The workers of an open crew, started now where nobody needed them before."""
         with _guard:
             held = _open[self]
-            held.team = held.team or start(self)
+            if held.team is None:
+                at = self.scheduler
+                held.team = cluster_work.connect(at) if self.elsewhere else cluster_work.start(self.count)
             return held.team
 
     def dismiss(self) -> None:
@@ -103,10 +101,8 @@ THREADS = Crew()
 
 @dataclass
 class _Open:
-    """A crew that is open, and its workers once they were needed."""
-
     users: int = 0
-    team: Team | None = None
+    team: cluster_work.ProcessTeam | None = None
 
 
 _guard = threading.RLock()
@@ -118,22 +114,97 @@ def count_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def check_sendable(what: str, value: object) -> None:
-    """Refuse what cannot travel to another process.
+def run_blocks(
+    make: Callable[[Item], Result],
+    items: Sequence[Item],
+    crew: Crew = THREADS,
+    *,
+    keep: bool = True,
+    report: Report = lambda done: None,
+    each: Callable[[Item, Result], None] | None = None,
+    paths: Sequence[Path] = (),
+) -> list[Result]:
+    """Call ``make`` with every item, each in a task of its own.
+
+    They are begun in order, none more than a few before the oldest unfinished one: neighbours share what they read.
+    The first error is raised once no block is being made any more: none writes after that.
+
+    Parameters
+    ----------
+    make
+        On threads anything that may be called from several at once. Otherwise it and the items are pickled: they hold
+        absolute paths, never arrays or open files, and writing a block twice must give the same bytes.
+    keep
+        Whether to return the results; False drops each once ``each`` has seen it.
+    report
+        Called with the share done after each block.
+    each
+        Called with an item and its result, one at a time, in the order in which they end.
+    paths
+        Folders that the work reads or writes: workers elsewhere are asked whether they see the same in them. From
+        those in a staged store (``*.part``) goes what a killed worker left of a file that another wrote again.
+
+    Returns
+    -------
+    Results in the order of the items; empty without ``keep``.
 
     Raises
     ------
-    TypeError : it cannot be pickled, or is so large that it must hold arrays.
+    SettingsError : no scheduler answers, or its workers see other files or run other versions.
+    WorkerError : workers died, more often than a block is tried again.
+    TypeError : work or items that cannot be sent to another process, or hold arrays.
     """
+    results: list[Any] = [None] * len(items) if keep else []
+    count = 0
+
+    def ended(number: int, result: Any) -> None:
+        nonlocal count
+        if each is not None:
+            each(items[number], result)
+        if keep:
+            results[number] = result
+        count += 1
+        report(count / len(items))
+
+    if not items:
+        return []
+    if crew.shares_memory:
+        _run_on_threads(make, items, min(crew.count, len(items)), ended)
+        return results
+    cluster_work.check_sendable("work", make)
+    with crew.open():
+        team = crew.team()
+        if crew.elsewhere:
+            team.check(paths)
+        try:
+            team.run(make, items, ended)
+        except WorkerError:
+            crew.dismiss()
+            raise
+    for folder in paths:
+        if any(part.endswith(PART_SUFFIX) for part in folder.parts):
+            for file in folder.rglob("*.partial"):  # zarr gives a shard its name when it is whole
+                file.unlink(missing_ok=True)
+    return results
+
+
+def _run_on_threads(
+    make: Callable[[Any], Any], items: Sequence[Any], workers: int, ended: Callable[[int, Any], None]
+) -> None:
+    if workers == 1:
+        for number, item in enumerate(items):
+            ended(number, make(item))
+        return
+    pool = ThreadPoolExecutor(workers)
     try:
-        size = len(pickle.dumps(value))
-    except Exception as error:
-        raise TypeError(
-            f"the {what} of blocks cannot be sent to other processes: expected a function of a module, or a dataclass "
-            f"of paths and settings; got {type(value).__name__} ({error})"
-        ) from None
-    if size > MOST_SENT:
-        raise TypeError(
-            f"the {what} of blocks takes {size} bytes on its way to another process, at most {MOST_SENT} are allowed; "
-            f"give {type(value).__name__} paths to open instead of arrays"
+        blocks = cluster_work.ahead_of_the_oldest(
+            lambda number: pool.submit(make, items[number]),
+            lambda futures: wait(futures, return_when=FIRST_COMPLETED).done,
+            {},
+            len(items),
+            workers,
         )
+        for number, future in blocks:
+            ended(number, future.result())
+    finally:
+        pool.shutdown(cancel_futures=True)

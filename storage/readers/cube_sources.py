@@ -1,11 +1,14 @@
 """What readers give: an array as it stands in its file, or a cube that gives its lines when asked; and what is known.
 
-Those who open a cube (``scan_files``, ``zarr_scenes``) fill it in; whoever stores it asks for 64 lines at a time.
+Those who open a cube fill it in; whoever stores it asks for 64 lines at a time. What a file says it holds is judged,
+against its bytes and the machine, before anything of that size is asked for.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,7 +19,41 @@ from numpy.typing import NDArray
 from pipeline.errors import SceneError
 from pipeline.rectify.calibration.calibrate import calibrate
 from pipeline.source import References
-from storage.readers.wavelengths import BandWavelengths
+from storage.readers.scene_toml import BandWavelengths
+
+DEFLATE_RATIO = 1100  # bytes that one byte of zlib's can stand for, rounded up: it is 1032
+MOST_RATIO = 10_000  # by which any packed numbers may exceed their bytes
+SPARE_BYTES = 1 << 20  # that a file may claim whatever its size: numbers that are all alike take none
+_GROUP_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
+
+
+def machine_bytes() -> int:
+    """Memory of this machine, or of the part of it that this process may use [bytes]."""
+    there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    for limit in _GROUP_LIMITS:
+        with suppress(OSError, ValueError):  # no such file, or "max"
+            there = min(there, int(limit.read_text()))
+    return there
+
+
+def check_claim(where: object, claimed: int, stored: int, ratio: int = MOST_RATIO) -> None:
+    """Refuse more bytes of numbers than ``stored`` bytes can mean (SceneError)."""
+    if claimed > max(stored * ratio, SPARE_BYTES):
+        raise SceneError(
+            f"{where} claims {claimed} bytes of numbers, and {stored} bytes lie on the disk: it is damaged or made to "
+            "fill the memory; copy it again"
+        )
+
+
+def check_memory(where: object, needed: int) -> None:
+    """Refuse what takes more memory than there is (SceneError)."""
+    there = machine_bytes()
+    if needed > there:
+        raise SceneError(
+            f"{where}: reading it takes about {needed / 1e9:.1f} GB of memory, this machine has {there / 1e9:.1f}; cut "
+            "a part out of it, or store it as ENVI, GeoTIFF in tiles or Zarr, which are read a few lines at a time"
+        )
+
 
 BLOCK_LINES = 64
 MOST_MISSING = 1 << 14  # lines a cube may promise beyond those it has: each costs memory before any of them is seen
@@ -39,6 +76,13 @@ class Raster:
     indices: NDArray[np.uint8] | None = None  # (y, x) of an image that numbers its colours
     known: BandWavelengths | None = None  # what the file says of its bands
     files: tuple[Path, ...] = ()  # that it was read from, where that is more than the one named
+
+    def three_axes(self, path: Path) -> NDArray[Any]:
+        """(y, x, band) values; two axes are one band (SceneError: it has others)."""
+        cube = self.values[..., None] if self.values.ndim == 2 else self.values
+        if cube.ndim != 3:
+            raise SceneError(f"{path} holds shape {cube.shape}; expected (y, x, band), or (y, x) for one band")
+        return cube
 
 
 @dataclass(frozen=True)

@@ -121,17 +121,15 @@ def split_labels(
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Labels to train on (where the mask's class is the label's) and the labelled rest, each (y, x), 255 elsewhere.
 
-    A mask that disagrees with the labels, or lies where there is none, trains nothing there.
-
-    Raises
-    ------
-    SceneError : the scene has no labels or classes by colour, the mask has another size, or a number that no class has.
+    A mask that disagrees with the labels, or lies where there is none, trains nothing there. Raises SceneError: the
+    scene has no labels or classes by colour, the mask has another size, or a number that no class has.
     """
     if scene.labels is None:
         raise SceneError(f"{scene.path} has no labels, which a training mask needs; give --labels")
     mask, _ = load_codes(train_mask, by_number=True)
     if mask.shape != scene.labels.shape:
-        raise SceneError(f"mask {train_mask} is {_size(mask)} px, the scene is {_size(scene.labels)} px (y x x)")
+        sizes = [f"{image.shape[0]} x {image.shape[1]} px" for image in (mask, scene.labels)]
+        raise SceneError(f"mask {train_mask} is {sizes[0]}, the scene is {sizes[1]} (y x x)")
     wanted = _mask_to_index(scene, train_mask, int(mask.max(initial=0)), mask_classes)[np.maximum(mask, 0)]
     trains = (wanted == scene.labels) & (wanted != UNLABELLED)
     return (np.where(trains, scene.labels, np.uint8(UNLABELLED)), np.where(trains, np.uint8(UNLABELLED), scene.labels))
@@ -155,10 +153,6 @@ def _mask_to_index(
     return np.array([UNLABELLED, *(numbers[number] for number in given[:highest])], np.uint8)
 
 
-def _size(image: NDArray[np.generic]) -> str:
-    return f"{image.shape[0]} x {image.shape[1]}"
-
-
 def _scene_files(path: str | Path, train_mask: str | Path | None) -> dict[str, str]:
     file, _ = split_variable(path)
     if not file.is_dir():
@@ -168,8 +162,12 @@ def _scene_files(path: str | Path, train_mask: str | Path | None) -> dict[str, s
     inner = file / "images"
     folder = inner if inner.is_dir() else file
     found = sorted(entry for entry in folder.iterdir() if entry.suffix.lower() in SCENE_ENDINGS and entry.is_file())
-    others = _no_scenes(file, found, train_mask)
-    found = [entry for entry in found if entry.resolve() not in others]
+    labels = load_scene_settings(file / SETTINGS_NAME).labels if (file / SETTINGS_NAME).is_file() else None
+    filled = set() if labels is None else {labels.replace("{number}", scene_number(one) or "") for one in found}
+    others = [file / split_variable(name)[0] for name in filled]  # which hold labels, or the mask
+    others += [] if train_mask is None else [split_variable(train_mask)[0]]
+    resolved = {other.resolve() for other in others}
+    found = [entry for entry in found if entry.resolve() not in resolved]
     if not found:
         raise SceneError(
             f"{folder} holds no scene ({', '.join(SCENE_ENDINGS)}); give a folder with images/ and a {SETTINGS_NAME}"
@@ -178,14 +176,3 @@ def _scene_files(path: str | Path, train_mask: str | Path | None) -> dict[str, s
     by_number = all(numbers) and len(set(numbers)) == len(found)
     names = numbers if by_number else [entry.stem for entry in found]
     return dict(zip(names, map(str, found), strict=True))
-
-
-def _no_scenes(folder: Path, found: Sequence[Path], train_mask: str | Path | None) -> set[Path]:
-    """Files of the folder that hold the labels of those found, or the mask."""
-    settings = folder / SETTINGS_NAME
-    labels = load_scene_settings(settings).labels if settings.is_file() else None
-    numbers = {scene_number(entry) or "" for entry in found}
-    filled = set() if labels is None else {labels.replace("{number}", number) for number in numbers}
-    named = [folder / split_variable(name)[0] for name in filled]
-    named += [] if train_mask is None else [split_variable(train_mask)[0]]
-    return {path.resolve() for path in named}

@@ -63,11 +63,8 @@ class EnviCube:
 def open_envi_cube(path: str | Path) -> EnviCube:
     """Open a cube by its header or its data file, of any interleave, type, byte order and header offset.
 
-    A file that is cut off keeps the lines that are whole in all bands, and ``lost_lines`` and a note say so.
-
-    Raises
-    ------
-    SceneError : header or data are missing or cannot be used, or no line is whole.
+    A file that is cut off keeps the lines that are whole in all bands, and ``lost_lines`` and a note say so. Raises
+    SceneError: header or data are missing or cannot be used, or no line is whole.
     """
     header_path, data_path = find_envi_pair(Path(path))
     header = load_envi_header(header_path)
@@ -77,7 +74,11 @@ def open_envi_cube(path: str | Path) -> EnviCube:
     item = header.dtype.itemsize
     line_bytes = header.samples * header.bands * item
     promised = size // line_bytes if header.lines is None else header.lines
-    held = min(promised, _whole_lines(header, promised, size))
+    whole = size // line_bytes
+    if header.interleave == "bsq":  # band after band: the last one says how far all of them reach
+        row = header.samples * item
+        whole = max(size - (header.bands - 1) * promised * row, 0) // row
+    held = min(promised, max(whole, 0))
     if held < 1:
         raise SceneError(
             f"{data_path} holds {max(size, 0)} bytes after an offset of {header.offset}, no whole line of "
@@ -90,17 +91,19 @@ def open_envi_cube(path: str | Path) -> EnviCube:
         notes.append(f"{data_path.name} is cut off: {held} of {promised} lines are whole")
     elif size > promised * line_bytes:
         notes.append(f"{data_path.name} holds {size - promised * line_bytes} bytes more than its header says")
-    values = _view(data_path, header, promised, held)
+    samples, bands = header.samples, header.bands
+    strides = {
+        "bil": (bands * samples * item, item, samples * item),
+        "bip": (samples * bands * item, bands * item, item),
+        "bsq": (samples * item, item, promised * samples * item if bands > 1 else item),  # lines may be any promise
+    }[header.interleave]
+    content = np.memmap(data_path, np.uint8, mode="r")
+    values: NDArray[Any] = np.ndarray((held, samples, bands), header.dtype, content, header.offset, strides)
     return EnviCube(data_path, header, values, promised - held, tuple(notes))
 
 
 def find_envi_pair(path: Path) -> tuple[Path, Path]:
-    """Give header and data file of an address that names either.
-
-    Raises
-    ------
-    SceneError : one of them is missing.
-    """
+    """Give header and data file of an address that names either (SceneError: one of them is missing)."""
     if path.suffix.lower() == ".hdr":
         stem = path.with_suffix("")
         endings = (ending for name in DATA_ENDINGS for ending in {name: None, name.upper(): None})
@@ -119,32 +122,10 @@ def find_envi_pair(path: Path) -> tuple[Path, Path]:
     return header, path
 
 
-def _whole_lines(header: EnviHeader, lines: int, size: int) -> int:
-    """Lines that ``size`` bytes hold in all bands."""
-    row = header.samples * header.dtype.itemsize
-    if header.interleave == "bsq":  # band after band: the last one says how far all of them reach
-        return max(size - (header.bands - 1) * lines * row, 0) // row
-    return max(size, 0) // (row * header.bands)
-
-
-def _view(path: Path, header: EnviHeader, lines: int, held: int) -> NDArray[Any]:
-    """(line, sample, band) over the file's bytes; strides alone tell the interleaves apart."""
-    item, samples, bands = header.dtype.itemsize, header.samples, header.bands
-    strides = {
-        "bil": (bands * samples * item, item, samples * item),
-        "bip": (samples * bands * item, bands * item, item),
-        "bsq": (samples * item, item, lines * samples * item if bands > 1 else item),  # lines may be any promise
-    }[header.interleave]
-    content = np.memmap(path, np.uint8, mode="r")
-    return np.ndarray((held, samples, bands), header.dtype, content, header.offset, strides)
-
-
 def load_envi_header(path: Path) -> EnviHeader:
     """Read one header file.
 
-    Raises
-    ------
-    SceneError : there is no such file, or it is no ENVI header that can be used; the message says why.
+    Raises SceneError: there is no such file, or it is no ENVI header that can be used; the message says why.
     """
     try:
         if path.exists() and not path.is_file():
@@ -186,17 +167,19 @@ def parse_envi_header(text: str, where: str = "the header") -> EnviHeader:
     _refuse_layouts(fields, kind, where)
     channels = samples if "spectral library" in kind.lower() else bands
     wavelength, scale = wavelengths_nm(fields, channels, notes)
+    dtype, interleave = _data_type(fields, where, notes), _interleave(fields, bands, where, notes)
+    widths = None if wavelength is None else listed_numbers(fields, "fwhm", channels, notes)
     return EnviHeader(
         where=where,
         samples=samples,
         lines=_whole(fields, "lines", where, least=0) if "lines" in fields else None,
         bands=bands,
-        dtype=_data_type(fields, where, notes),
-        interleave=_interleave(fields, bands, where, notes),
+        dtype=dtype,
+        interleave=interleave,
         offset=_whole(fields, "header offset", where, least=0) if "header offset" in fields else 0,
         kind=kind,
         wavelength_nm=wavelength,
-        fwhm_nm=None if wavelength is None else _widths(fields, channels, scale, notes),
+        fwhm_nm=None if widths is None or not (widths > 0).all() else widths * scale,
         band_names=tuple(name.strip() for name in fields["band names"].split(",")) if "band names" in fields else (),
         nodata=finite_number(fields.get("data ignore value", "")),
         fields=fields,
@@ -250,8 +233,3 @@ def _interleave(fields: Mapping[str, str], bands: int, where: str, notes: list[s
         says = f"interleave = {found!r}" if found else "no interleave"
         raise SceneError(f"{where}: {says}, expected one of {', '.join(INTERLEAVES)}; correct it")
     return found
-
-
-def _widths(fields: Mapping[str, str], channels: int, scale: float, notes: list[str]) -> NDArray[np.float64] | None:
-    values = listed_numbers(fields, "fwhm", channels, notes)
-    return None if values is None or not (values > 0).all() else values * scale

@@ -1,4 +1,4 @@
-"""Folders of a Headwall camera: parts of one cube, when their frames were taken, dark and white references.
+"""ENVI cubes as sources of lines: one file, or the parts of one cube in a folder of a Headwall camera.
 
 ::
 
@@ -25,10 +25,13 @@ from numpy.typing import NDArray
 from pipeline.errors import SceneError
 from pipeline.rig.camera.camera_texts import LONGEST_LINE, FrameIndex, LineTimes, parse_frame_index, times_of_lines
 from storage.readers.cube_sources import MOST_MISSING
+from pipeline.rig.camera.frame_index import LONGEST_LINE, FrameIndex, LineTimes, parse_frame_index, times_of_lines
+from storage.readers.cube_sources import MOST_MISSING, Bands, CubeSource, LineFacts
 from storage.readers.envi_cubes import EnviCube, find_envi_pair, open_envi_cube
 
 _PART = re.compile(r"raw_(\d{1,12})(\.[A-Za-z]{1,4})?", re.IGNORECASE)
 _INDEX = re.compile(r"frameindex_(\d{1,12})\.txt", re.IGNORECASE)
+_EXPOSURE = "exposure (ms)"  # a setting in the comments of Headwall's headers
 
 
 @dataclass(frozen=True)
@@ -44,78 +47,120 @@ class CubePart:
         return self.start + len(self.cube.values)
 
 
-@dataclass(frozen=True)
-class PartedCube:
-    """Files that follow each other as one cube of ``lines``, some of which may be in none of them."""
+def open_envi_source(path: Path) -> CubeSource:
+    """Open one ENVI cube by its header or data file; the lines that it lost are its last (SceneError as there)."""
+    header, data = find_envi_pair(path)
+    parts, notes = [CubePart(0, open_envi_cube(header))], list[str]()
+    lines = parts[0].stop + _lost_at_end(parts, notes)
+    return _source(data.name, parts, lines, None, notes=(*parts[0].cube.notes, *notes))
 
-    parts: tuple[CubePart, ...]
-    lines: int
-    times: LineTimes | None
-    index_files: tuple[Path, ...]
-    notes: tuple[str, ...]
-    by_names: tuple[tuple[int, ...], ...] = ()  # of parts and indices, where lines or times follow from their names
 
-    def valid_lines(self) -> NDArray[np.bool_]:
-        """(line,) lines that a file holds whole."""
-        valid = np.zeros(self.lines, np.bool_)
-        for part in self.parts:
-            valid[part.start : part.stop] = True
-        return valid
+def open_headwall_cube(folder: Path) -> CubeSource:
+    """Open the parts of a folder as one cube, in the order of their frames.
 
-    def read(self, start: int, stop: int) -> NDArray[Any]:
-        """Lines in native byte order, (line, sample, band); those in no file are 0."""
-        first = self.parts[0].cube.values
-        block = np.zeros((stop - start, *first.shape[1:]), first.dtype.newbyteorder("="))
-        for part in self.parts:
+    A part whose name says a later frame than where the one before it ends leaves lines between them that no file holds;
+    so does a file that is cut off. A part without any byte is left out. Raises SceneError: a part cannot be used, parts
+    differ in their frames, or too many lines between them are missing.
+    """
+    headers, notes = _headers(folder), list[str]()
+    if not headers:
+        raise SceneError(
+            f"{folder} is a folder, expected a file, a Zarr store, or a folder with raw_<frame> files of a Headwall "
+            "camera; name one of the files in it"
+        )
+    opened: dict[int, EnviCube] = {}
+    for number, header in headers.items():
+        _, data = find_envi_pair(header)
+        if data.stat().st_size == 0:
+            notes.append(f"{data.name} is empty and left out")
+        else:
+            opened[number] = open_envi_cube(header)
+    if not opened:
+        raise SceneError(f"every part of {folder} is empty; copy the folder again")
+    _check_alike(list(opened.values()))
+    parts = _placed(opened, notes)
+    lines = parts[-1].stop + _lost_at_end(parts, notes)
+    found = {
+        int(match[1]): file for file in folder.iterdir() if file.is_file() and (match := _INDEX.fullmatch(file.name))
+    }
+    used = {number: found[number] for number in opened if number in found}
+    told_by_name = any(before.stop != after.start for before, after in pairwise(parts))
+    times = None
+    if used:
+        times, counted = _times(used, dict(zip(opened, parts, strict=True)), lines, notes)
+        told_by_name = told_by_name or counted or len(used) < len(opened)
+    names = (tuple(opened), tuple(used)) if told_by_name else ()
+    return _source(folder.resolve().name, parts, lines, times, tuple(notes), tuple(used.values()), names)
+
+
+def _source(
+    name: str,
+    parts: Sequence[CubePart],
+    lines: int,
+    times: LineTimes | None,
+    notes: tuple[str, ...],
+    index_files: tuple[Path, ...] = (),
+    by_names: tuple[tuple[int, ...], ...] = (),
+) -> CubeSource:
+    """Files that follow each other as one cube of ``lines``, some of which may be in none of them: these are 0."""
+    first, values = parts[0].cube.header, parts[0].cube.values
+    native = values.dtype.newbyteorder("=")
+    headers = [Path(part.cube.header.where) for part in parts]
+    told = next((part.cube.header for part in parts if part.cube.header.wavelength_nm is not None), None)
+    bands = Bands()
+    if told is not None:
+        units = told.fields.get("wavelength units", "")
+        bands = Bands(told.wavelength_nm, told.fwhm_nm, units, f"wavelengths from {Path(told.where).name}")
+
+    def read(start: int, stop: int) -> NDArray[Any]:
+        block = np.zeros((stop - start, *values.shape[1:]), native)
+        for part in parts:
             low, high = max(start, part.start), min(stop, part.stop)
             if low < high:
                 block[low - start : high - start] = part.cube.values[low - part.start : high - part.start]
         return block
 
+    data = [file for header, part in zip(headers, parts, strict=True) for file in (header, part.cube.path)]
+    return CubeSource(
+        name=name,
+        shape=(lines, values.shape[1], values.shape[2]),
+        dtype=native,
+        read=read,
+        files=(*data, *index_files),
+        lines=_line_facts(parts, lines, times),
+        bands=bands,
+        nodata=first.nodata,
+        headers={header.name: header.read_bytes().decode("utf-8", errors="replace") for header in headers},
+        notes=notes,
+        by_names=by_names,
+    )
 
-def is_headwall_folder(folder: Path) -> bool:
-    """Whether a folder holds parts of a cube as the camera names them."""
-    return any(_PART.fullmatch(entry.name) and entry.is_file() for entry in folder.iterdir())
 
-
-def open_parts(folder: Path) -> PartedCube:
-    """Open the parts of a folder as one cube, in the order of their frames.
-
-    A part whose name says a later frame than where the one before it ends leaves lines between them that no file holds;
-    so does a file that is cut off. A part without any byte is left out.
-
-    Raises
-    ------
-    SceneError : a part cannot be used, parts differ in their frames, or too many lines between them are missing.
-    """
-    opened: list[tuple[int, EnviCube]] = []
-    notes: list[str] = []
-    for number, header in _headers(folder).items():
-        _, data = find_envi_pair(header)
-        if data.stat().st_size == 0:
-            notes.append(f"{data.name} is empty and left out")
+def _line_facts(parts: Sequence[CubePart], lines: int, times: LineTimes | None) -> LineFacts:
+    """Which lines a file holds whole; exposures by the frame indices, else by the headers."""
+    valid, exposure = np.zeros(lines, np.bool_), np.full(lines, np.nan)
+    for part in parts:
+        valid[part.start : part.stop] = True
+        try:
+            exposure[part.start : part.stop] = float(part.cube.header.settings.get(_EXPOSURE, "nan"))
+        except ValueError:
             continue
-        opened.append((number, open_envi_cube(header)))
-    if not opened:
-        raise SceneError(f"every part of {folder} is empty; copy the folder again")
-    _check_alike(opened)
-    parts = _placed(opened, notes)
-    return _with_times(folder, [number for number, _ in opened], parts, notes)
-
-
-def one_part(cube: EnviCube) -> PartedCube:
-    """A single file as a cube of parts; the lines that it lost are its last."""
-    notes: list[str] = []
-    parts = [CubePart(0, cube)]
-    return PartedCube(tuple(parts), len(cube.values) + _lost_at_end(parts, notes), None, (), (*cube.notes, *notes))
+    if times is not None:
+        exposure = np.where(np.isnan(times.exposure_ms), exposure, times.exposure_ms)
+    told = None if np.isnan(exposure).all() else exposure
+    if times is None:
+        return LineFacts(valid, exposure_ms=told)
+    known = times.stamp_us >= 0
+    if not known.any():
+        return LineFacts(valid, exposure_ms=told, frame=times.frame)
+    first = int(times.stamp_us[known][0])
+    return LineFacts(valid, np.where(known, (times.stamp_us - first) * 1e-6, np.nan), told, times.frame, first)
 
 
 def find_reference(folder: Path, kind: str) -> Path | None:
     """Header of the ``dark`` or ``white`` frame in a folder, by how its name begins.
 
-    Raises
-    ------
-    SceneError : there are several; name one.
+    Raises SceneError: there are several; name one.
     """
     headers = (entry for entry in sorted(folder.iterdir()) if entry.suffix.lower() == ".hdr")
     found = [entry for entry in headers if entry.name.lower().startswith(kind)]
@@ -128,9 +173,7 @@ def find_reference(folder: Path, kind: str) -> Path | None:
 def load_frame_index(path: Path) -> FrameIndex:
     """Read one index. Lines that are no frame are passed over and counted; of a frame listed twice the first counts.
 
-    Raises
-    ------
-    SceneError : the file cannot be read, or no line of it is a frame.
+    Raises SceneError: the file cannot be read, or no line of it is a frame.
     """
     try:
         with path.open(encoding="utf-8-sig", errors="replace") as file:
@@ -158,10 +201,10 @@ def _headers(folder: Path) -> dict[int, Path]:
     return headers
 
 
-def _check_alike(opened: Sequence[tuple[int, EnviCube]]) -> None:
+def _check_alike(cubes: Sequence[EnviCube]) -> None:
     """All parts must have one frame size, type and set of wavelengths."""
-    first = opened[0][1]
-    for _, cube in opened[1:]:
+    first = cubes[0]
+    for cube in cubes[1:]:
         if cube.values.shape[1:] != first.values.shape[1:] or cube.values.dtype != first.values.dtype:
             raise SceneError(
                 f"{cube.path} has frames of {cube.values.shape[1:]} (sample, band) {cube.values.dtype}, "
@@ -172,11 +215,11 @@ def _check_alike(opened: Sequence[tuple[int, EnviCube]]) -> None:
             raise SceneError(f"{cube.path} has other wavelengths than {first.path.name}; ingest them by themselves")
 
 
-def _placed(opened: Sequence[tuple[int, EnviCube]], notes: list[str]) -> list[CubePart]:
+def _placed(opened: dict[int, EnviCube], notes: list[str]) -> list[CubePart]:
     parts: list[CubePart] = []
     end = missing = 0
-    for number, cube in opened:
-        start = number - opened[0][0]
+    for number, cube in opened.items():
+        start = number - min(opened)
         if start < end:
             notes.append(f"{cube.path.name} begins {end - start} frames before the part before it ends")
         elif start > end:
@@ -202,27 +245,21 @@ def _lost_at_end(parts: Sequence[CubePart], notes: list[str]) -> int:
     return 0
 
 
-def _with_times(folder: Path, numbers: Sequence[int], parts: Sequence[CubePart], notes: list[str]) -> PartedCube:
-    lines = parts[-1].stop + _lost_at_end(parts, notes)
-    entries = [entry for entry in folder.iterdir() if entry.is_file()]
-    found = {int(match[1]): entry for entry in entries if (match := _INDEX.fullmatch(entry.name))}
-    used = {number: found[number] for number in numbers if number in found}
-    names = (tuple(numbers), tuple(used))
-    told_by_name = any(before.stop != after.start for before, after in pairwise(parts))
-    if not used:
-        return PartedCube(tuple(parts), lines, None, (), tuple(notes), names if told_by_name else ())
-    times = LineTimes(np.full(lines, -1), np.full(lines, -1), np.full(lines, np.nan), ())
-    for number, part in zip(numbers, parts, strict=True):
+def _times(used: dict[int, Path], parts: dict[int, CubePart], lines: int, notes: list[str]) -> tuple[LineTimes, bool]:
+    """Times of all lines by the indices, and whether an index counts other lines than its part has."""
+    times, counted = LineTimes(np.full(lines, -1), np.full(lines, -1), np.full(lines, np.nan), ()), False
+    for number, part in parts.items():
         if number not in used:
             notes.append(f"there is no frame index for {part.cube.path.name}")
             continue
         index = load_frame_index(used[number])
         own = times_of_lines(index, number, len(part.cube.values), part.cube.lost_lines)
-        told_by_name = told_by_name or len(index.frame) != len(part.cube.values)
-        for whole, piece in ((times.frame, own.frame), (times.stamp_us, own.stamp_us)):
+        counted = counted or len(index.frame) != len(part.cube.values)
+        for whole, piece in (
+            (times.frame, own.frame),
+            (times.stamp_us, own.stamp_us),
+            (times.exposure_ms, own.exposure_ms),
+        ):
             whole[part.start : part.stop] = piece
-        times.exposure_ms[part.start : part.stop] = own.exposure_ms
         notes.extend((*index.notes, *(f"{used[number].name}: {note}" for note in own.notes)))
-    told_by_name = told_by_name or len(used) < len(numbers)
-    index_files = tuple(used.values())
-    return PartedCube(tuple(parts), lines, times, index_files, tuple(notes), names if told_by_name else ())
+    return times, counted

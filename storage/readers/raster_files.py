@@ -1,4 +1,8 @@
-"""Arrays out of image, array and MATLAB files, with what the file says of its colours."""
+"""Arrays out of image, TIFF, array and MATLAB files, with what the file says of its colours.
+
+TIFF goes through rasterio, some rows at a time, or whole through tifffile where that is all there is. Several images of
+one size in a file are its bands, in their order: so cameras that know no bands write cubes.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +10,10 @@ import importlib
 import math
 import re
 import threading
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +23,149 @@ from PIL import Image
 
 from pipeline.errors import SceneError
 from storage.readers.array_files import NAMED_ENDINGS, load_named, load_npy
-from storage.readers.cube_sources import GREY_NM, RGB_NM, Raster, check_numbers
-from storage.readers.declared_sizes import DEFLATE_RATIO, check_claim, check_memory
+from storage.readers.cube_sources import (
+    DEFLATE_RATIO,
+    GREY_NM,
+    NEAR_INFRARED_NM,
+    RGB_NM,
+    Raster,
+    check_claim,
+    check_memory,
+    check_numbers,
+)
 from storage.readers.envi_cubes import open_envi_cube
-from storage.readers.tiff_files import TIFF_ENDINGS, read_tiff
-from storage.readers.wavelengths import BandWavelengths
+from storage.readers.scene_toml import BandWavelengths
+
+TIFF_ENDINGS = (".tif", ".tiff")
+_NODATA_TAG = 42113  # GDAL's
+_ROWS = 64  # about as many as are read at a time
+
+
+@dataclass(frozen=True)
+class TiffRows:
+    """A TIFF, opened: (y, x, band) of ``dtype``, without its alpha channel."""
+
+    path: Path
+    shape: tuple[int, int, int]
+    dtype: np.dtype[Any]
+    bands: tuple[tuple[str, tuple[int, ...]], ...]  # image of the file, and those of its bands, counted from 0
+    assumed_nm: tuple[float, ...] | None
+    nodata: float | None
+    notes: tuple[str, ...]
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Rows ``start`` to ``stop`` (SceneError where they are damaged)."""
+        rasterio = importlib.import_module("rasterio")
+        rows = rasterio.windows.Window(0, start, self.shape[1], stop - start)
+        planes = []
+        for image, bands in self.bands:
+            with _tiff(rasterio, self.path, image) as file:
+                planes.append(file.read([band + 1 for band in bands], window=rows))
+        return np.ascontiguousarray(np.moveaxis(np.concatenate(planes), 0, -1), self.dtype)
+
+
+def open_tiff_rows(path: Path) -> TiffRows | None:
+    """Open a TIFF to be read some rows at a time; None where rasterio, which can do so, is not installed.
+
+    Raises SceneError: the file is missing or damaged, or claims more than its bytes can mean.
+    """
+    try:
+        rasterio = importlib.import_module("rasterio")
+    except ImportError:
+        return None
+    if not path.is_file():
+        raise SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
+    with _tiff(rasterio, path, str(path)) as file:
+        images, notes = _images(rasterio, path, file)
+        keep, assumed, more = _named_bands([kind.name for kind in file.colorinterp])
+        kind = np.result_type(*(np.dtype(file.dtypes[band]) for band in keep or [0]))
+        bands = tuple((image, tuple(keep)) for image in images)
+        shape = (file.height, file.width, len(keep) * len(images))
+        check_claim(path, math.prod(shape) * kind.itemsize, path.stat().st_size)
+        block = math.prod(max(file.block_shapes)) * file.count * kind.itemsize
+        check_memory(path, block + min(_ROWS, shape[0]) * shape[1] * shape[2] * kind.itemsize)
+        assumed = assumed if len(images) == 1 else None
+        return TiffRows(path, shape, kind, bands, assumed, file.nodata, (*notes, *more))
+
+
+def read_tiff(path: Path) -> Raster:
+    """Read a whole TIFF (SceneError as for :func:`open_tiff_rows`)."""
+    rows = open_tiff_rows(path)
+    if rows is None:
+        return _read_plain_tiff(path)
+    check_memory(path, 2 * math.prod(rows.shape) * rows.dtype.itemsize)
+    return Raster(rows.read(0, rows.shape[0]), rows.assumed_nm, rows.nodata, rows.notes)
+
+
+def _images(rasterio: Any, path: Path, first: Any) -> tuple[list[str], tuple[str, ...]]:
+    """Names of the images that are bands of one cube; the first alone where another is of another kind."""
+    names = list(first.subdatasets)
+    if len(names) < 2:
+        return [str(path)], ()
+    for name in names:
+        with _tiff(rasterio, path, name) as other:
+            if (other.shape, other.dtypes) != (first.shape, first.dtypes):
+                return [str(path)], (f"the first of {len(names)} images in the file, which are of several kinds",)
+    return names, (f"{len(names)} images of one size in the file are taken as its bands",)
+
+
+@contextmanager
+def _tiff(rasterio: Any, path: Path, image: str) -> Iterator[Any]:
+    """One image of a file, as TIFF and nothing else: other formats of GDAL's may name any file or server."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)  # a scene lies on the camera's grid
+        try:
+            with rasterio.open(image, driver="GTiff") as file:
+                yield file
+        except SceneError:
+            raise
+        except Exception as error:  # decoders raise anything at all on damaged bytes
+            raise SceneError(f"{path} cannot be read as TIFF: {error}; is it damaged?") from error
+
+
+def _named_bands(names: list[str]) -> tuple[list[int], tuple[float, ...] | None, tuple[str, ...]]:
+    """Which bands are kept (alpha is not), their wavelengths, and notes.
+
+    Wavelengths are assumed only where the file names its bands red, green and blue, or grey.
+    """
+    keep = [index for index, name in enumerate(names) if name != "alpha"]
+    notes = ("alpha channel dropped",) if len(keep) < len(names) else ()
+    kinds = [names[index] for index in keep]
+    assumed: tuple[float, ...] | None = None
+    if kinds[:3] == ["red", "green", "blue"] and len(kinds) == 3:
+        assumed = RGB_NM
+    elif kinds[:3] == ["red", "green", "blue"] and len(kinds) == 4 and kinds[3] in ("undefined", "nir"):
+        assumed = (*RGB_NM, NEAR_INFRARED_NM)
+    elif kinds in (["gray"], ["palette"]):
+        assumed = (GREY_NM,)
+    return keep, assumed, notes
+
+
+def _read_plain_tiff(path: Path) -> Raster:
+    try:
+        tifffile = importlib.import_module("tifffile")
+    except ImportError as error:
+        raise SceneError(
+            f"{path} is a TIFF, which needs rasterio; pip install 'spectralzoom[geo]', or save it as .npy"
+        ) from error
+    with tifffile.TiffFile(path, _multifile=False) as file:  # headers may name other files
+        page = file.pages[0]
+        series = file.series[0]
+        check_claim(path, int(series.nbytes), path.stat().st_size)
+        check_memory(path, 2 * int(series.nbytes))
+        values, axes = series.asarray(), series.axes
+        rgb, extra = page.photometric.name == "RGB", [kind.name for kind in page.extrasamples or ()]
+        nodata = page.tags.valueof(_NODATA_TAG)
+    if values.ndim == 3 and axes.index("Y") == 1:
+        values = np.moveaxis(values, 0, -1)
+    count = 1 if values.ndim == 2 else values.shape[2]
+    names = ["red", "green", "blue"] if rgb else ["gray"]
+    names += ["alpha" if "ALPHA" in kind else "undefined" for kind in extra]
+    names += ["undefined"] * (count - len(names))
+    void = None if nodata is None else float(nodata)
+    keep, assumed, notes = _named_bands(names[:count])
+    return Raster(values.reshape(*values.shape[:2], count)[..., keep], assumed, void, notes)
+
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp")
 SCENE_ENDINGS = (*IMAGE_ENDINGS, *TIFF_ENDINGS, ".npy", *NAMED_ENDINGS, ".hdr")
@@ -41,11 +185,8 @@ def split_variable(address: str | Path) -> tuple[Path, str | None]:
 def load_raster(address: str | Path, *, dims: int) -> Raster:
     """Read one file; of a file with several arrays, the only one with ``dims`` axes (or the variable named).
 
-    Arrays of .npy and ENVI files are read-only views: their numbers stay in the file until they are asked for.
-
-    Raises
-    ------
-    SceneError : no such file, a kind that is not read, a damaged file, or an array that holds no real numbers.
+    Arrays of .npy and ENVI files are read-only views: their numbers stay in the file until they are asked for. Raises
+    SceneError: no such file, a kind that is not read, a damaged file, or an array that holds no real numbers.
     """
     path, variable = split_variable(address)
     if path.is_dir():
@@ -71,34 +212,23 @@ def load_raster(address: str | Path, *, dims: int) -> Raster:
 
 def _read(path: Path, ending: str, variable: str | None, dims: int) -> Raster:
     if ending in IMAGE_ENDINGS:
-        return _read_image(path)
+        with _of_any_size(), Image.open(path, formats=_FORMATS) as image:
+            claimed = math.prod(image.size) * len(image.getbands()) * _BYTES.get(image.mode, 1)
+            if image.format != "JPEG":  # which may say that blocks without end are alike
+                check_claim(path, claimed, path.stat().st_size, DEFLATE_RATIO)
+            check_memory(path, 3 * claimed)
+            image.load()
+            return _read_deep_colour(path) if _is_deep_colour(path) else _from_pillow(image)
     if ending in TIFF_ENDINGS:
         return read_tiff(path)
     if ending == ".npy":
         return Raster(load_npy(path))
-    if ending == ".hdr":
-        return _read_envi(path)
-    return Raster(load_named(path, variable, dims))
-
-
-def _read_envi(path: Path) -> Raster:
-    cube = open_envi_cube(path)
-    known = None
+    if ending != ".hdr":
+        return Raster(load_named(path, variable, dims))
+    cube, known = open_envi_cube(path), None
     if cube.header.wavelength_nm is not None:
         known = BandWavelengths(cube.header.wavelength_nm, cube.header.fwhm_nm, f"wavelengths from {path}")
     return Raster(cube.values, None, cube.header.nodata, cube.notes, known=known, files=(path, cube.path))
-
-
-# --- images -----------------------------------------------------------------------------------------------------------
-
-
-def _read_image(path: Path) -> Raster:
-    with _of_any_size(), Image.open(path, formats=_FORMATS) as image:
-        _check_image(path, image)
-        image.load()
-        if _is_deep_colour(path):
-            return _read_deep_colour(path)
-        return _from_pillow(image)
 
 
 @contextmanager
@@ -110,14 +240,6 @@ def _of_any_size() -> Iterator[None]:
             yield
         finally:
             Image.MAX_IMAGE_PIXELS = before
-
-
-def _check_image(path: Path, image: Image.Image) -> None:
-    """Refuse a size that the file's bytes cannot mean, or that takes more memory than there is."""
-    claimed = math.prod(image.size) * len(image.getbands()) * _BYTES.get(image.mode, 1)
-    if image.format != "JPEG":  # which may say that blocks without end are alike
-        check_claim(path, claimed, path.stat().st_size, DEFLATE_RATIO)
-    check_memory(path, 3 * claimed)
 
 
 def _is_deep_colour(path: Path) -> bool:

@@ -1,26 +1,38 @@
-"""Anything that holds a cube, opened to be read 64 lines at a time: ENVI, Headwall folders, Zarr, images and arrays."""
+"""Anything that holds a cube, opened to be read 64 lines at a time, and stored so: as one immutable array.
+
+::
+
+    cube.zarr/values          (line, sample, band): whole numbers as uint8 or uint16 where they fit, else float32
+    cube.zarr/wavelength      (band,) nm, fwhm beside it; missing where nothing says them
+    cube.zarr/valid_line      (line,) false for lines that no file holds whole; time, exposure_ms, frame where told
+    cube.zarr/dark, white     (sample, band) reference frames, where there are some
+    cube.zarr/quicklook       (y, x, 3) uint8 for viewers; the same as quicklook.png beside the cube
+
+Attributes say where it came from: file names without folders, sizes, SHA-256, header texts, notes.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import zarr
 from numpy.typing import NDArray
+from PIL import Image
 
 from pipeline.errors import SceneError
-from storage.readers.cube_sources import Bands, CubeSource, LineFacts, check_cube_source
-from storage.readers.dataset_layouts import find_layout
-from storage.readers.envi_cubes import DATA_ENDINGS, EnviHeader, find_envi_pair, open_envi_cube
-from storage.readers.headwall_folders import PartedCube, find_reference, is_headwall_folder, one_part, open_parts
-from storage.readers.raster_files import SCENE_ENDINGS, load_raster, split_variable
-from storage.readers.scene_toml import SceneSettings, find_scene_settings
-from storage.readers.tiff_files import TIFF_ENDINGS, TiffRows, open_tiff_rows
-from storage.readers.wavelengths import BandWavelengths, settle_wavelengths
+from storage.arrays.layout import create_array, create_group, image_spec, write_bands, write_small
+from storage.arrays.quicklooks import LineThumbnail, write_quicklook
+from storage.readers.cube_sources import BLOCK_LINES, Bands, CubeSource, LineFacts, check_cube_source
+from storage.readers.envi_cubes import DATA_ENDINGS, find_envi_pair, open_envi_cube
+from storage.readers.headwall_folders import find_reference, open_envi_source, open_headwall_cube
+from storage.readers.labels import find_layout
+from storage.readers.raster_files import SCENE_ENDINGS, TIFF_ENDINGS, load_raster, open_tiff_rows, split_variable
+from storage.readers.scene_toml import BandWavelengths, SceneSettings, find_scene_settings, settle_wavelengths
 from storage.readers.zarr_scenes import find_zarr_store, open_zarr_cube
-
-_EXPOSURE = "exposure (ms)"  # a setting in the comments of Headwall's headers
 
 
 def is_scan(address: str | Path) -> bool:
@@ -52,18 +64,20 @@ def open_cube_source(
     SceneError : there is no such thing, it is damaged, or not of a kind or shape that can be used.
     """
     path, variable = split_variable(address)
+    stated, found = [("dark", dark), ("white", white)], list[tuple[str, Path | None]]()
     store = find_zarr_store(path)
     if store is not None:
         source = open_zarr_cube(store, variable)
     elif path.is_dir():
-        source = _headwall_source(path, dark is None, white is None)
+        source = open_headwall_cube(path)
+        found = [(kind, find_reference(path, kind)) for kind, frame in stated if frame is None]
     elif is_scan(path):
-        source = _envi_source(path)
+        source = open_envi_source(path)
     else:
         source = _raster_source(address)
-    for kind, stated in (("dark", dark), ("white", white)):
-        if stated is not None:
-            source = _with_frame(source, kind, stated)
+    for kind, frame in (*found, *stated):
+        if frame is not None:
+            source = _with_frame(source, kind, frame)
     check_cube_source(source)
     return source
 
@@ -86,9 +100,7 @@ def known_bands(source: CubeSource) -> BandWavelengths | None:
 def load_frame(address: str | Path) -> tuple[NDArray[np.float32], tuple[Path, ...]]:
     """Read one reference frame, (sample, band), the mean of its lines, and the files that it stands in.
 
-    Raises
-    ------
-    SceneError : the file cannot be read or holds no real numbers.
+    Raises SceneError: the file cannot be read or holds no real numbers.
     """
     path, _ = split_variable(address)
     if is_scan(path):
@@ -104,31 +116,6 @@ def load_frame(address: str | Path) -> tuple[NDArray[np.float32], tuple[Path, ..
     return np.asarray(frame.mean(axis=0, dtype=np.float64), np.float32), files
 
 
-# --- ENVI -------------------------------------------------------------------------------------------------------------
-
-
-def _envi_source(path: Path) -> CubeSource:
-    header, data = find_envi_pair(path)
-    cube = open_envi_cube(header)
-    return _parted_source(data.name, one_part(cube), [header], (), cube.header)
-
-
-def _headwall_source(folder: Path, find_dark: bool, find_white: bool) -> CubeSource:
-    if not is_headwall_folder(folder):
-        raise SceneError(
-            f"{folder} is a folder, expected a file, a Zarr store, or a folder with raw_<frame> files of a Headwall "
-            "camera; name one of the files in it"
-        )
-    whole = open_parts(folder)
-    headers = [Path(part.cube.header.where) for part in whole.parts]
-    source = _parted_source(folder.resolve().name, whole, headers, whole.index_files, whole.parts[0].cube.header)
-    for kind, wanted in (("dark", find_dark), ("white", find_white)):
-        file = find_reference(folder, kind) if wanted else None
-        if file is not None:
-            source = _with_frame(source, kind, file)
-    return source
-
-
 def _with_frame(source: CubeSource, kind: str, address: str | Path) -> CubeSource:
     """The same cube with its dark or white frame, and a note on where that is from."""
     frame, more = load_frame(address)
@@ -138,73 +125,24 @@ def _with_frame(source: CubeSource, kind: str, address: str | Path) -> CubeSourc
     return replace(source, white=frame, files=files, notes=notes)
 
 
-def _parted_source(
-    name: str, whole: PartedCube, headers: Sequence[Path], extra: tuple[Path, ...], first: EnviHeader
-) -> CubeSource:
-    values = whole.parts[0].cube.values
-    told = next((p.cube.header for p in whole.parts if p.cube.header.wavelength_nm is not None), first)
-    bands = Bands()
-    if told.wavelength_nm is not None:
-        units = told.fields.get("wavelength units", "")
-        bands = Bands(told.wavelength_nm, told.fwhm_nm, units, f"wavelengths from {Path(told.where).name}")
-    data = [file for header, part in zip(headers, whole.parts, strict=True) for file in (header, part.cube.path)]
-    return CubeSource(
-        name=name,
-        shape=(whole.lines, values.shape[1], values.shape[2]),
-        dtype=values.dtype.newbyteorder("="),
-        read=whole.read,
-        files=(*data, *extra),
-        lines=_line_facts(whole),
-        bands=bands,
-        nodata=first.nodata,
-        headers={header.name: header.read_bytes().decode("utf-8", errors="replace") for header in headers},
-        notes=whole.notes,
-        by_names=whole.by_names,
-    )
-
-
-def _line_facts(whole: PartedCube) -> LineFacts:
-    valid, stated = whole.valid_lines(), [_header_exposure(part.cube.header) for part in whole.parts]
-    if whole.times is None and np.isnan(stated).all():
-        return LineFacts(valid)
-    exposure = np.full(whole.lines, np.nan)
-    for part, value in zip(whole.parts, stated, strict=True):
-        exposure[part.start : part.stop] = value
-    if whole.times is None:
-        return LineFacts(valid, exposure_ms=_told(exposure))
-    stamps, known = whole.times.stamp_us, whole.times.stamp_us >= 0
-    exposure = np.where(np.isnan(whole.times.exposure_ms), exposure, whole.times.exposure_ms)
-    if not known.any():
-        return LineFacts(valid, exposure_ms=_told(exposure), frame=whole.times.frame)
-    first = int(stamps[known][0])
-    time_s = np.where(known, (stamps - first) * 1e-6, np.nan)
-    return LineFacts(valid, time_s, _told(exposure), whole.times.frame, first)
-
-
-def _header_exposure(header: EnviHeader) -> float:
-    try:
-        return float(header.settings.get(_EXPOSURE, "nan"))
-    except ValueError:
-        return float("nan")
-
-
-def _told(values: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    return None if np.isnan(values).all() else values
-
-
-# --- images and arrays ------------------------------------------------------------------------------------------------
-
-
 def _raster_source(address: str | Path) -> CubeSource:
     path, variable = split_variable(address)
     rows = open_tiff_rows(path) if path.suffix.lower() in TIFF_ENDINGS else None
     if rows is not None:
-        return _tiff_source(rows)
+        return CubeSource(
+            name=path.name,
+            shape=rows.shape,
+            dtype=rows.dtype,
+            read=rows.read,
+            files=(path,),
+            lines=LineFacts(np.ones(rows.shape[0], np.bool_)),
+            bands=_raster_bands(path, rows.assumed_nm, None, rows.shape[2]),
+            nodata=rows.nodata,
+            notes=rows.notes,
+        )
     layout = find_layout(path, variable)
     raster = layout.raster if layout is not None else load_raster(address, dims=3)
-    values = raster.values[..., None] if raster.values.ndim == 2 else raster.values
-    if values.ndim != 3:
-        raise SceneError(f"{path} holds shape {values.shape}; expected (y, x, band), or (y, x) for one band")
+    values = raster.three_axes(path)
     native = values.dtype.newbyteorder("=")
     return CubeSource(
         name=path.name,
@@ -216,20 +154,6 @@ def _raster_source(address: str | Path) -> CubeSource:
         bands=_raster_bands(path, raster.assumed_nm, raster.known, values.shape[2]),
         nodata=raster.nodata,
         notes=raster.notes,
-    )
-
-
-def _tiff_source(rows: TiffRows) -> CubeSource:
-    return CubeSource(
-        name=rows.path.name,
-        shape=rows.shape,
-        dtype=rows.dtype,
-        read=rows.read,
-        files=(rows.path,),
-        lines=LineFacts(np.ones(rows.shape[0], np.bool_)),
-        bands=_raster_bands(rows.path, rows.assumed_nm, None, rows.shape[2]),
-        nodata=rows.nodata,
-        notes=rows.notes,
     )
 
 
@@ -246,3 +170,143 @@ def _raster_bands(path: Path, assumed_nm: Sequence[float] | None, known: BandWav
     )
     folder = "" if settings.path is None else f"{settings.path.parent}/"
     return Bands(found.centre_nm, found.fwhm_nm, "nm", found.origin.replace(folder, ""))
+
+
+KIND = "ingested cube"
+LONGEST_HEADER = 1 << 16  # characters of a header's text that are kept
+
+Report = Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class SourceFile:
+    """One file that a cube came from."""
+
+    name: str  # without folders, but those within a store
+    size: int
+    sha256: str
+
+    def record(self) -> dict[str, Any]:
+        """As attributes and receipts hold it."""
+        return {"name": self.name, "size": self.size, "sha256": self.sha256}
+
+
+def write_ingested_cube(
+    folder: Path, source: CubeSource, files: Sequence[SourceFile], *, name: str, report: Report = lambda done: None
+) -> None:
+    """Store a cube as ``cube.zarr`` and ``quicklook.png`` in a folder, 64 lines at a time.
+
+    Parameters
+    ----------
+    files
+        What the cube came from, for its attributes.
+    name
+        What the cube is called.
+    report
+        Told how far it is, 0..1.
+
+    Raises
+    ------
+    SceneError : lines cannot be read.
+    """
+    kind = stored_dtype(source, lambda done: report(0.3 * done))
+    looked_at = source.dtype.kind in "ui" and source.dtype not in (np.uint8, np.uint16)
+    begin = 0.3 if looked_at else 0.0
+    group = create_group(folder / "cube.zarr", f"{KIND} {name}", _attributes(source, files, name))
+    coordinates = _write_coordinates(group, source)
+    about = {"long_name": "numbers of the file", "units": "1", **({"coordinates": coordinates} if coordinates else {})}
+    array = create_array(group, "values", image_spec(("line", "sample", "band"), source.shape, kind.str), about)
+    thumbnail = LineThumbnail(
+        source.shape, source.bands.wavelength_nm, dark=source.dark, white=source.white, panel=source.panel
+    )
+    for start, stop in _blocks(source):
+        lines = source.read(start, stop)
+        valid = source.lines.valid[start:stop]
+        with np.errstate(over="ignore"):  # a float64 beyond float32 becomes infinite, which a scene takes for missing
+            block = lines.astype(kind)
+        if not valid.all():
+            block[~valid] = np.nan if kind.kind == "f" else 0
+        array[start:stop] = block
+        thumbnail.add(start, lines, valid)
+        report(begin + (1 - begin) * stop / source.shape[0])
+    picture = thumbnail.finish()
+    write_quicklook(group, picture)
+    Image.fromarray(picture.image).save(folder / "quicklook.png")
+
+
+def stored_dtype(source: CubeSource, report: Report = lambda done: None) -> np.dtype[Any]:
+    """Type of the store: uint8 and uint16 stay, other whole numbers become uint16 where all fit, the rest float32."""
+    if source.dtype.kind == "b" or source.dtype == np.uint8:
+        return np.dtype(np.uint8)
+    if source.dtype == np.uint16:
+        return np.dtype(np.uint16)
+    if source.dtype.kind not in "ui":
+        return np.dtype(np.float32)
+    for start, stop in _blocks(source):
+        lines = source.read(start, stop)
+        if lines.min() < 0 or lines.max() > np.iinfo(np.uint16).max:
+            return np.dtype(np.float32)
+        report(stop / source.shape[0])
+    return np.dtype(np.uint16)
+
+
+def _blocks(source: CubeSource) -> Iterator[tuple[int, int]]:
+    for start in range(0, source.shape[0], BLOCK_LINES):
+        yield start, min(start + BLOCK_LINES, source.shape[0])
+
+
+def _attributes(source: CubeSource, files: Sequence[SourceFile], name: str) -> dict[str, Any]:
+    facts: dict[str, Any] = {
+        "kind": KIND,
+        "name": name,
+        "files": [file.record() for file in files],
+        "headers": {file: text[:LONGEST_HEADER] for file, text in source.headers.items()},
+        "source_dtype": source.dtype.str,
+        "lost_lines": source.lost_lines,
+        "notes": list(source.notes),
+        "wavelength_origin": source.bands.origin or "nothing says the wavelengths",
+        "wavelength_units_in_file": source.bands.units,
+    }
+    if source.nodata is not None and np.isfinite(source.nodata):
+        facts["nodata"] = source.nodata
+    if source.position is not None:
+        facts["by_mirror"] = True
+    if source.lines.first_stamp_us is not None:
+        facts["first_stamp_us"] = source.lines.first_stamp_us
+    return facts
+
+
+def _write_coordinates(group: zarr.Group, source: CubeSource) -> str:
+    """Store what is known of lines and bands, and the reference frames; give the coordinates' names."""
+    names: list[str] = []
+    if source.bands.wavelength_nm is not None:
+        names.append(write_bands(group, source.bands.wavelength_nm, source.bands.fwhm_nm))
+    columns: Mapping[str, tuple[NDArray[Any] | None, dict[str, Any]]] = {
+        "time": (source.lines.time_s, {"long_name": "since the first stamp of a frame", "units": "s"}),
+        "exposure_ms": (source.lines.exposure_ms, {"units": "ms"}),
+        "frame": (source.lines.frame, {"long_name": "number that the camera gave, -1 where not known", "units": "1"}),
+        "valid_line": (source.lines.valid, {"long_name": "line is whole in its file"}),
+    }
+    for name, (values, about) in columns.items():
+        if values is not None:
+            write_small(group, name, ("line",), np.asarray(values), about)
+            names.append(name)
+    _write_references(group, source)
+    return " ".join(names)
+
+
+def _write_references(group: zarr.Group, source: CubeSource) -> None:
+    frames: Mapping[str, tuple[NDArray[Any] | None, str]] = {
+        "dark": (source.dark, "dark reference frame"),
+        "white": (source.white, "white reference frame"),
+        "bad": (source.bad, "bad elements of the detector"),
+        "flat": (source.flat, "relative response left over by the white frame"),
+    }
+    for name, (frame, title) in frames.items():
+        if frame is not None:
+            write_small(group, name, ("sample", "band"), np.asarray(frame), {"long_name": title, "units": "1"})
+    if source.panel is not None:
+        write_small(group, "panel", ("band",), source.panel, {"long_name": "scene value of the white panel"})
+    if source.position is not None:
+        for name, axis in zip(("mirror_x", "mirror_y"), source.position.T, strict=True):
+            write_small(group, name, ("line",), np.ascontiguousarray(axis), {"long_name": "mirror position"})

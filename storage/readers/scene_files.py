@@ -18,14 +18,11 @@ from pipeline.errors import SceneError
 from pipeline.readings import MOST_STEPS, MOST_VALUE, beyond_range, find_beyond
 from pipeline.simulator.scenes.image_scene import BRIGHT_PERCENTILE
 from storage.archive.staging import file_hash
-from storage.readers.cube_sources import BLOCK_LINES, Raster, scene_lines
-from storage.readers.dataset_layouts import find_layout
-from storage.readers.declared_sizes import machine_bytes
-from storage.readers.labels import Labels, load_labels
+from storage.readers.cube_sources import BLOCK_LINES, Raster, machine_bytes, scene_lines
+from storage.readers.labels import Labels, find_layout, load_labels
 from storage.readers.raster_files import load_raster, split_variable
 from storage.readers.scan_files import is_scan, known_bands, open_cube_source
-from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings
-from storage.readers.wavelengths import settle_wavelengths
+from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings, settle_wavelengths
 
 _LOOKED_AT = 1 << 20  # values, evenly spread, by which the range of a scene is told
 
@@ -85,7 +82,7 @@ def load_scene_file(
     layout = find_layout(file, variable)
     raster = layout.raster if layout is not None else load_scan(path) if is_scan(path) else load_raster(path, dims=3)
     settings = find_scene_settings(file)
-    cube = _three_axes(raster.values, file)
+    cube = raster.three_axes(file)
     chosen = _chosen_bands(bands, settings, cube.shape[2], file)
     light = settle_wavelengths(
         file,
@@ -127,9 +124,7 @@ def load_scene_file(
 def load_scan(address: str | Path) -> Raster:
     """Read a cube that comes in lines as one array, over the white panel where dark and white frames are known.
 
-    Raises
-    ------
-    SceneError : the cube cannot be used, or this machine has not the memory for it.
+    Raises SceneError: the cube cannot be used, or this machine has not the memory for it.
     """
     source = open_cube_source(address)
     needed = 8 * math.prod(source.shape)  # as float32, and once more while the scene is made
@@ -161,13 +156,6 @@ def _content_hash(file: Path, raster: Raster) -> str:
     is_folder = file.is_dir()
     inside = [entry.relative_to(file).as_posix() if is_folder and entry.is_relative_to(file) else "" for entry in files]
     return _digest(*((name, file_hash(entry)) for name, entry in zip(inside, files, strict=True)))
-
-
-def _three_axes(values: NDArray[Any], path: Path) -> NDArray[Any]:
-    cube = values[..., None] if values.ndim == 2 else values
-    if cube.ndim != 3:
-        raise SceneError(f"{path} holds shape {values.shape}; expected (y, x, band), or (y, x) for one band")
-    return cube
 
 
 def _chosen_bands(bands: Sequence[int] | None, settings: SceneSettings, count: int, path: Path) -> list[int]:
@@ -247,8 +235,13 @@ def _labels(
 ) -> tuple[Labels | None, tuple[str, ...]]:
     address = stated
     if address is None and settings.labels is not None and settings.path is not None:
-        address = settings.path.parent / _fill_number(settings.labels, scene)
-        if "{number}" in settings.labels and not address.is_file():
+        numbered, number = "{number}" in settings.labels, scene_number(scene)
+        if numbered and number is None:
+            raise SceneError(
+                f"{scene} has no number in its name, which labels = {settings.labels!r} in scene.toml asks for"
+            )
+        address = settings.path.parent / settings.labels.replace("{number}", number or "")
+        if numbered and not address.is_file():
             return None, (f"no labels: there is no {address}",)
     if address is None:
         return None, ()
@@ -261,15 +254,6 @@ def scene_number(path: Path) -> str | None:
     """``059_image.png`` -> ``059``: the first digits of the file's name."""
     digits = re.search(r"\d+", path.stem)
     return None if digits is None else digits.group()
-
-
-def _fill_number(template: str, scene: Path) -> str:
-    if "{number}" not in template:
-        return template
-    number = scene_number(scene)
-    if number is None:
-        raise SceneError(f"{scene} has no number in its name, which labels = {template!r} in scene.toml asks for")
-    return template.replace("{number}", number)
 
 
 def _labelled_hash(

@@ -1,14 +1,19 @@
-"""``scene.toml``: what a scene file does not say about itself, read and checked."""
+"""``scene.toml``: what a scene file does not say about itself; and which wavelength each band has, and where from."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from pathlib import Path
+from types import UnionType
 from typing import Any
 
-from pipeline.errors import SceneError
-from storage.archive.toml_files import read_toml
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import SceneError, WavelengthError
+from storage.archive.staging import read_toml
 
 SETTINGS_NAME = "scene.toml"
 
@@ -37,9 +42,7 @@ KNOWN_KEYS = tuple(one.name for one in fields(SceneSettings) if one.name != "pat
 def find_scene_settings(scene: Path) -> SceneSettings:
     """Read the ``scene.toml`` beside a scene file, or above it where the file lies in a folder ``images``.
 
-    Raises
-    ------
-    SceneError : the file is no TOML, has a key that is not known, or a value of the wrong kind.
+    Raises SceneError: the file is no TOML, has a key that is not known, or a value of the wrong kind.
     """
     candidates = [scene.parent / SETTINGS_NAME]
     if scene.parent.name == "images":
@@ -59,50 +62,32 @@ def load_scene_settings(path: Path) -> SceneSettings:
         raise SceneError(f"{path} has the unknown key {', '.join(unknown)}; known are {', '.join(KNOWN_KEYS)}")
     if "wavelengths_nm" in content and "wavelengths_file" in content:
         raise SceneError(f"{path} has both wavelengths_nm and wavelengths_file; keep one")
-    file_name = _text(path, content, "wavelengths_file")
+    file_name = _value(path, content, "wavelengths_file", str, "a file name in quotes", many=False)
+    whole, number = "a list of whole numbers such as [0, 1]", "a number such as -9999 or 1e30"
+    listed = _value(path, content, "wavelengths_nm", int | float, "a list of numbers such as [660.0, 800.0]", many=True)
+    nodata = _value(path, content, "nodata", int | float, number, many=False)
     return SceneSettings(
         path=path,
-        bands=_whole_numbers(path, content, "bands"),
-        wavelengths_nm=_numbers(path, content, "wavelengths_nm"),
+        bands=_value(path, content, "bands", int, whole, many=True),
+        wavelengths_nm=None if listed is None else tuple(map(float, listed)),
         wavelengths_file=None if file_name is None else path.parent / file_name,
-        dropped_bands=_whole_numbers(path, content, "dropped_bands") or (),
-        nodata=_number(path, content, "nodata"),
-        labels=_text(path, content, "labels"),
+        dropped_bands=_value(path, content, "dropped_bands", int, whole, many=True) or (),
+        nodata=None if nodata is None else float(nodata),
+        labels=_value(path, content, "labels", str, "a file name in quotes", many=False),
         unlabelled=None if "unlabelled" not in content else _class_value(path, "unlabelled", content["unlabelled"]),
         classes=_classes(path, content.get("classes", {})),
     )
 
 
-def _text(path: Path, content: Mapping[str, Any], key: str) -> str | None:
+def _value(path: Path, content: Mapping[str, Any], key: str, of: type | UnionType, expected: str, *, many: bool) -> Any:
+    """A value of ``scene.toml``, or all of a list; None where it is not there."""
     value = content.get(key)
-    if value is not None and not isinstance(value, str):
-        raise SceneError(f"{path}: {key} must be a file name in quotes, got {value!r}")
-    return value
-
-
-def _numbers(path: Path, content: Mapping[str, Any], key: str) -> tuple[float, ...] | None:
-    value = content.get(key)
-    if value is None:
-        return None
-    if not isinstance(value, list) or any(isinstance(v, bool) or not isinstance(v, int | float) for v in value):
-        raise SceneError(f"{path}: {key} must be a list of numbers such as [660.0, 800.0], got {value!r}")
-    return tuple(float(v) for v in value)
-
-
-def _number(path: Path, content: Mapping[str, Any], key: str) -> float | None:
-    value = content.get(key)
-    if value is not None and (isinstance(value, bool) or not isinstance(value, int | float)):
-        raise SceneError(f"{path}: {key} must be a number such as -9999 or 1e30, got {value!r}")
-    return None if value is None else float(value)
-
-
-def _whole_numbers(path: Path, content: Mapping[str, Any], key: str) -> tuple[int, ...] | None:
-    value = content.get(key)
-    if value is None:
-        return None
-    if not isinstance(value, list) or any(isinstance(v, bool) or not isinstance(v, int) for v in value):
-        raise SceneError(f"{path}: {key} must be a list of whole numbers such as [0, 1], got {value!r}")
-    return tuple(value)
+    listed: Any = value if many else [value]
+    if value is not None and not (
+        isinstance(listed, list) and all(isinstance(one, of) and not isinstance(one, bool) for one in listed)
+    ):
+        raise SceneError(f"{path}: {key} must be {expected}, got {value!r}")
+    return tuple(listed) if many and value is not None else value
 
 
 def _class_value(path: Path, name: str, value: object) -> ClassValue:
@@ -124,3 +109,145 @@ def _classes(path: Path, value: object) -> dict[str, ClassValue]:
     if len(classes) > 255:
         raise SceneError(f"{path}: {len(classes)} classes, at most 255 fit a class map; merge some")
     return classes
+
+
+RANGE_NM = (200.0, 3000.0)
+MICROMETRES = (0.2, 5.0)
+
+
+@dataclass(frozen=True)
+class BandWavelengths:
+    """Centres and widths of the chosen bands [nm], and one sentence on their origin."""
+
+    centre_nm: NDArray[np.float64]
+    fwhm_nm: NDArray[np.float64] | None
+    origin: str
+
+
+def check_wavelengths(wavelengths: Sequence[float] | NDArray[np.float64], where: str) -> NDArray[np.float64]:
+    """Give the wavelengths as float64 [nm], any order.
+
+    Raises WavelengthError: they are not finite, look like micrometres, or lie outside 200-3000 nm.
+    """
+    values = np.asarray(wavelengths, np.float64)
+    if not np.isfinite(values).all():
+        raise WavelengthError(f"{where}: wavelengths must be numbers [nm], got {_listed(values)}")
+    low, high = MICROMETRES
+    if values.size and ((values >= low) & (values <= high)).all():
+        raise WavelengthError(
+            f"{where}: wavelengths {_listed(values)} look like micrometres; write them in nm: {_listed(values * 1000)}"
+        )
+    outside = values[(values < RANGE_NM[0]) | (values > RANGE_NM[1])]
+    if outside.size:
+        raise WavelengthError(
+            f"{where}: wavelengths {_listed(outside)} lie outside {RANGE_NM[0]:g}-{RANGE_NM[1]:g} nm; write nm"
+        )
+    return values
+
+
+def settle_wavelengths(
+    path: Path,
+    bands: Sequence[int],
+    file_bands: int,
+    *,
+    stated: Sequence[float] | None,
+    settings: SceneSettings,
+    assumed_nm: Sequence[float] | None,
+    known: BandWavelengths | None = None,
+) -> BandWavelengths:
+    """Wavelengths of the chosen bands: the flag first, then ``scene.toml``, then the file, then its colours.
+
+    Parameters
+    ----------
+    bands
+        Chosen bands, counted from 0, of ``file_bands``.
+    stated
+        From the flag: one for each chosen band, or one for each band of the file. [nm]
+    assumed_nm
+        One for each band of the file, or None where nothing can be assumed. [nm]
+    known
+        What the file itself says, of every band.
+
+    Raises
+    ------
+    WavelengthError : nothing says them, or their number, unit or range is wrong.
+    """
+    chosen = list(bands)
+    if stated is not None:
+        values = check_wavelengths(stated, "--wavelengths")
+        fitting = _fit(values, chosen, file_bands, chosen, f"--wavelengths for {path}")
+        return BandWavelengths(fitting, None, f"wavelengths stated: {_listed(fitting)} nm")
+    if settings.wavelengths_nm is not None:
+        values = check_wavelengths(settings.wavelengths_nm, f"{settings.path}: wavelengths_nm")
+        own = list(range(file_bands)) if settings.bands is None else list(settings.bands)
+        fitting = _fit(values, chosen, file_bands, own, f"{settings.path}: wavelengths_nm for {path}")
+        return BandWavelengths(fitting, None, f"wavelengths from {settings.path}")
+    if settings.wavelengths_file is not None:
+        return _from_file(settings.wavelengths_file, settings.dropped_bands, chosen, file_bands)
+    if known is not None and len(known.centre_nm) == file_bands:
+        centre = check_wavelengths(known.centre_nm, str(path))[chosen]
+        return BandWavelengths(centre, None if known.fwhm_nm is None else known.fwhm_nm[chosen], known.origin)
+    if assumed_nm is not None and len(assumed_nm) == file_bands:
+        centre = np.asarray(assumed_nm, np.float64)[chosen]
+        return BandWavelengths(centre, None, f"wavelengths assumed from the file's colours: {_listed(centre)} nm")
+    raise WavelengthError(
+        f"{path} has {file_bands} bands and nothing says their wavelengths; give --wavelengths in nm, or write "
+        f"wavelengths_nm or wavelengths_file into a scene.toml beside it (axes are y, x, band)"
+    )
+
+
+def _fit(
+    values: NDArray[np.float64], chosen: list[int], file_bands: int, own: list[int], where: str
+) -> NDArray[np.float64]:
+    """Pick the chosen bands out of wavelengths that belong to the bands ``own``, or to every band of the file."""
+    belongs = own if len(values) == len(own) else list(range(file_bands))
+    if len(values) != len(belongs):
+        ways = f"{len(own)} or {file_bands}" if len(own) != file_bands else f"{file_bands}"
+        raise WavelengthError(f"{where}: expected {ways} wavelengths, one a band, got {len(values)}; correct the list")
+    known = dict(zip(belongs, values.tolist(), strict=True))
+    missing = [band for band in chosen if band not in known]
+    if missing:
+        raise WavelengthError(f"{where}: nothing for band {missing[0]} (from 0); give --wavelengths with --bands")
+    return np.array([known[band] for band in chosen], np.float64)
+
+
+def _from_file(path: Path, dropped: Sequence[int], chosen: list[int], file_bands: int) -> BandWavelengths:
+    """Rows of nm and FWHM, less the dropped ones (counted from 1)."""
+    table = _table(path)
+    bad = [row for row in dropped if not 1 <= row <= len(table)]
+    if bad:
+        raise WavelengthError(f"dropped_bands has {bad[0]}, but {path} has rows 1..{len(table)}; correct the list")
+    kept = np.delete(table, [row - 1 for row in set(dropped)], axis=0)
+    if len(kept) != file_bands:
+        raise WavelengthError(
+            f"{path} has {len(table)} rows, {len(set(dropped))} of them dropped, which leaves {len(kept)} wavelengths "
+            f"for {file_bands} bands; correct dropped_bands in scene.toml"
+        )
+    centre = check_wavelengths(kept[:, 0], str(path))[chosen]
+    widths = kept[:, 1] if kept.shape[1] > 1 else None
+    known = widths is not None and bool((np.isfinite(widths) & (widths > 0)).all())
+    return BandWavelengths(centre, widths[chosen] if known and widths is not None else None, f"wavelengths from {path}")
+
+
+def _table(path: Path) -> NDArray[np.float64]:
+    """Rows of a text file that begin with a number; headings are passed over. (row, 1 or 2)"""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise WavelengthError(f"wavelengths_file {path} cannot be read: {error}; correct scene.toml") from error
+    rows: list[list[float]] = []
+    for line in lines:
+        row: list[float] = []
+        with suppress(ValueError):
+            for word in line.replace(",", " ").replace(";", " ").split():
+                row.append(float(word))
+        rows += [row] if row else []
+    if not rows:
+        raise WavelengthError(f"{path} has no row that begins with a number; expected columns of nm and FWHM")
+    columns = min(2, *(len(row) for row in rows)) if len(rows) > 1 else min(2, len(rows[0]))
+    return np.array([row[:columns] for row in rows], np.float64)
+
+
+def _listed(values: NDArray[np.float64]) -> str:
+    shown = ", ".join(f"{value:g}" for value in values[:6])
+    return shown + (f", ... ({values.size})" if values.size > 6 else "")

@@ -21,7 +21,7 @@ from typing import Any, BinaryIO
 import zarr
 
 from pipeline.errors import SceneError
-from storage.readers.declared_sizes import DEFLATE_RATIO, MOST_RATIO, check_memory
+from storage.readers.cube_sources import DEFLATE_RATIO, MOST_RATIO, check_memory
 
 METADATA = ("zarr.json", ".zarray", ".zgroup")
 LARGEST_METADATA = 1 << 24  # bytes
@@ -92,13 +92,6 @@ def check_size(array: zarr.Array[Any], path: Path, name: str) -> None:
         )
 
 
-def check_packing(array: zarr.Array[Any], path: Path, name: str) -> None:
-    """Refuse an array with chunks that would unpack to more than they may (SceneError)."""
-    folder = path / name
-    about = next(file for file in (folder / "zarr.json", folder / ".zarray") if file.is_file())
-    _check_chunks(folder, _read_json(about), array.chunks, array.dtype.itemsize)
-
-
 def check_blocks(array: zarr.Array[Any], path: Path, parts: Sequence[int]) -> None:
     """Refuse an array of which ``parts`` of each axis, in whole chunks, do not fit the memory (SceneError)."""
     numbers = 1
@@ -115,20 +108,13 @@ def open_options(path: Path) -> dict[str, Any]:
     return {"use_consolidated": False} if is_group else {}
 
 
-def _check_chunks(folder: Path, about: Mapping[str, Any], shape: Sequence[int], width: int) -> None:
-    """Refuse an array with a chunk that would unpack to more than a chunk's numbers (SceneError).
-
-    Parameters
-    ----------
-    about
-        The array's metadata, of version 2 or 3.
-    shape
-        Of one chunk; within shards of one of theirs.
-    width
-        Bytes a number.
-    """
-    allowed = math.prod(shape) * width + SLACK
-    codecs = _packers(about)
+def check_packing(array: zarr.Array[Any], path: Path, name: str) -> None:
+    """Refuse an array with a chunk that would unpack to more than a chunk's numbers (SceneError)."""
+    folder, shape = path / name, array.chunks
+    about = _read_json(next(file for file in (folder / "zarr.json", folder / ".zarray") if file.is_file()))
+    allowed = math.prod(shape) * array.dtype.itemsize + SLACK
+    of_v2 = [codec for codec in (*(about.get("filters") or []), about.get("compressor")) if codec]
+    codecs = about["codecs"] or [] if "codecs" in about else of_v2
     sharding = next((codec for codec in codecs if _name(codec) == "sharding_indexed"), None)
     inner = codecs if sharding is None else sharding.get("configuration", {}).get("codecs", [])
     packer = next((_name(codec) for codec in reversed(inner) if _name(codec) not in CHECKSUMS), "")
@@ -146,12 +132,6 @@ def _check_chunks(folder: Path, about: Mapping[str, Any], shape: Sequence[int], 
                         raise SceneError(
                             f"{file} would unpack to {said} bytes, a chunk has {allowed - SLACK}; it is damaged"
                         )
-
-
-def _packers(about: Mapping[str, Any]) -> list[Any]:
-    if "codecs" in about:
-        return list(about["codecs"] or [])
-    return [*(about.get("filters") or []), *([about["compressor"]] if about.get("compressor") else [])]
 
 
 def _name(codec: object) -> str:

@@ -9,7 +9,6 @@ import base64
 import struct
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -41,19 +40,6 @@ FRAMES = ("dark", "white", "panel", "bad", "flat")
 OF_LINES = ("mirror_x", "mirror_y", "valid_line", "time", "exposure_ms", "frame")
 
 
-@dataclass(frozen=True)
-class _Packing:
-    """How stored numbers become values: CF's fill, scale and offset."""
-
-    fill: float | None
-    scale: float
-    offset: float
-
-    @property
-    def plain(self) -> bool:
-        return self.scale == 1.0 and self.offset == 0.0
-
-
 def find_zarr_store(path: Path) -> Path | None:
     """The Zarr store at a path, or the ``cube.zarr`` in it; None where there is neither."""
     for folder in (path, path / "cube.zarr"):
@@ -67,11 +53,8 @@ def open_zarr_cube(path: Path, variable: str | None = None) -> CubeSource:
 
     Of this project: raw cubes (with their references), ingested cubes, mosaics. Of anyone's: the only array with three
     axes of numbers, or the one named; wavelengths come from a coordinate of that name, or of the band axis with a unit.
-
-    Raises
-    ------
-    SceneError : the store is damaged, holds no such array, has dims that are not known, a codec that is not allowed, or
-        claims to hold far more than lies on the disk.
+    Raises SceneError: the store is damaged, holds no such array, has dims that are not known, a codec that is not
+    allowed, or claims to hold far more than lies on the disk.
     """
     with _named(path):
         check_links(path)
@@ -147,91 +130,84 @@ def _source(
     attributes: dict[str, Any],
     notes: tuple[str, ...],
 ) -> CubeSource:
-    shape = tuple(array.shape[axis] for axis in order) + ((1,) if len(order) == 2 else ())
-    packing = _packing(array)
-    kind = np.dtype(np.float32) if not packing.plain else array.dtype.newbyteorder("=")
-    lines, samples, bands = shape
+    lines, samples, bands = tuple(array.shape[axis] for axis in order) + ((1,) if len(order) == 2 else ())
     own = "sweep" in attributes or attributes.get("kind") == "ingested cube"
+    known = arrays if own else {}
+    frame = (samples, bands)
+    bad, valid = _small(known, "bad", frame), _column(known, "valid_line", lines)
+    by_mirror = attributes.get("by_mirror") is True
+    x, y = (_small(arrays, f"mirror_{axis}", (lines,)) if by_mirror else None for axis in "xy")
+    position = None if x is None or y is None else np.stack([x, y], axis=-1).astype(np.float64)
+    read, kind, fill = _reader(path, array, order)
     void = attributes.get("nodata") if own else None
-    bad = _small(arrays, "bad", (samples, bands)) if own else None
     return CubeSource(
         name=path.name,
         shape=(lines, samples, bands),
-        dtype=np.dtype(kind),
-        read=_reader(path, array, order, packing),
+        dtype=kind,
+        read=read,
         files=tuple(sorted(file for file in path.rglob("*") if file.is_file())),
-        lines=_line_facts(arrays, lines, own=own),
+        lines=LineFacts(
+            np.ones(lines, np.bool_) if valid is None else valid.astype(np.bool_),
+            _column(known, "time", lines),
+            _column(known, "exposure_ms", lines),
+            _column(known, "frame", lines),
+        ),
         bands=_bands(arrays, array, order, bands),
-        dark=_small(arrays, "dark", (samples, bands)) if own else None,
-        white=_small(arrays, "white", (samples, bands)) if own else None,
-        panel=_small(arrays, "panel", (bands,)) if own else None,
+        dark=_small(known, "dark", frame),
+        white=_small(known, "white", frame),
+        panel=_small(known, "panel", (bands,)),
         bad=None if bad is None else bad.astype(np.bool_),
-        flat=_small(arrays, "flat", (samples, bands)) if own else None,
-        position=_position(arrays, lines) if attributes.get("by_mirror") is True else None,
-        nodata=void if void is not None else packing.fill if packing.plain else None,
+        flat=_small(known, "flat", frame),
+        position=position,
+        nodata=void if void is not None else fill,
         root=path,
         notes=notes,
     )
 
 
-def _packing(array: zarr.Array[Any]) -> _Packing:
-    scale, offset = _real(array.attrs.get("scale_factor")), _real(array.attrs.get("add_offset"))
-    return _Packing(_fill(array), 1.0 if scale is None else scale, 0.0 if offset is None else offset)
+def _reader(
+    path: Path, array: zarr.Array[Any], order: tuple[int, ...]
+) -> tuple[ReadLines, np.dtype[Any], float | None]:
+    """What reads lines, unpacked by CF's scale and offset, its type, and the number that stands for none yet."""
 
+    def real(value: object) -> float | None:
+        return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
 
-def _real(value: object) -> float | None:
-    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+    scale, offset = real(array.attrs.get("scale_factor")), real(array.attrs.get("add_offset"))
+    scale, offset = 1.0 if scale is None else scale, 0.0 if offset is None else offset
+    stated = array.attrs.get("_FillValue", array.attrs.get("missing_value"))  # wherever xarray has put it
+    fill = real(stated)
+    if isinstance(stated, str) and array.dtype.kind == "f":  # floats of v3 in base64
+        (fill,) = struct.unpack("<d", base64.standard_b64decode(stated))
+    elif stated is None and array.dtype.kind in "buif" and array.fill_value is not None:
+        fill = float(array.fill_value) if "_ARRAY_DIMENSIONS" in array.attrs else None  # all of v2
+    plain = scale == 1.0 and offset == 0.0
 
-
-def _fill(array: zarr.Array[Any]) -> float | None:
-    """The number that stands for none, wherever xarray has put it: floats of v3 in base64, all of v2 as fill value."""
-    stated = array.attrs.get("_FillValue", array.attrs.get("missing_value"))
-    if isinstance(stated, str) and array.dtype.kind == "f":
-        (number,) = struct.unpack("<d", base64.standard_b64decode(stated))
-        return float(number)
-    kept = array.dtype.kind in "buif" and array.fill_value is not None
-    if stated is None and kept and "_ARRAY_DIMENSIONS" in array.attrs:
-        return float(array.fill_value)
-    return _real(stated)
-
-
-def _reader(path: Path, array: zarr.Array[Any], order: tuple[int, ...], packing: _Packing) -> ReadLines:
     def read(start: int, stop: int) -> NDArray[Any]:
-        """Read lines start to stop, unpacked, NaN where there is none."""
         selection = tuple(slice(start, stop) if axis == order[0] else slice(None) for axis in range(array.ndim))
         with _named(path):
             block = np.transpose(np.asarray(array[selection]), order)
         native = np.ascontiguousarray(block, block.dtype.newbyteorder("="))
         if native.ndim == 2:
             native = native[..., None]
-        if packing.plain:
+        if plain:
             return native
-        values = (native * packing.scale + packing.offset).astype(np.float32)
-        if packing.fill is not None:
-            values[native == packing.fill] = np.nan
+        values = (native * scale + offset).astype(np.float32)
+        if fill is not None:
+            values[native == fill] = np.nan
         return values
 
-    return read
+    return read, np.dtype(array.dtype.newbyteorder("=") if plain else np.float32), fill if plain else None
+
+
+def _column(arrays: Mapping[str, Any], name: str, lines: int) -> NDArray[Any] | None:
+    return np.asarray(arrays[name][...]) if name in arrays and arrays[name].shape == (lines,) else None
 
 
 def _small(arrays: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> NDArray[np.float32] | None:
     if name not in arrays or arrays[name].shape != shape:
         return None
     return np.asarray(arrays[name][...], np.float32)
-
-
-def _position(arrays: Mapping[str, Any], lines: int) -> NDArray[np.float64] | None:
-    x, y = (_small(arrays, f"mirror_{axis}", (lines,)) for axis in "xy")
-    return None if x is None or y is None else np.stack([x, y], axis=-1).astype(np.float64)
-
-
-def _line_facts(arrays: Mapping[str, Any], lines: int, *, own: bool) -> LineFacts:
-    def column(name: str) -> NDArray[Any] | None:
-        return np.asarray(arrays[name][...]) if own and name in arrays and arrays[name].shape == (lines,) else None
-
-    valid = column("valid_line")
-    everything = np.ones(lines, np.bool_) if valid is None else valid.astype(np.bool_)
-    return LineFacts(everything, column("time"), column("exposure_ms"), column("frame"))
 
 
 def _bands(arrays: Mapping[str, Any], array: zarr.Array[Any], order: tuple[int, ...], count: int) -> Bands:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import logging
 import secrets
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
@@ -19,17 +19,14 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from pipeline.errors import ArchiveError
-from storage.archive.addresses import StageRef, in_text, store_at
 from storage.archive.archive import Archive
-from storage.archive.folder import open_folder
+from storage.archive.keys import StageRef, in_text, open_folder, store_at
 from storage.archive.manifests import check_files
 from storage.archive.run_folders import RunDraft
 from storage.archive.staging import refusals
-from storage.maintenance.verification import Finding, Progress, verify_growing
+from storage.remote.object_checks import Lease, find_leftovers, find_lost_runs, take_lease
 from storage.remote.object_copies import KNOWN, WorkingCopy
-from storage.remote.object_leases import Lease, take_lease
-from storage.remote.object_places import UnreachableError, connect, parse_place
-from storage.remote.object_stores import Objects
+from storage.remote.object_stores import Objects, UnreachableError, connect, parse_place
 from storage.remote.object_transfers import BEGUN
 
 MARK = "archive.json"  # at the prefix: here is an archive
@@ -70,9 +67,7 @@ class ObjectArchive(Archive):
     def find(self, stage: str, key: str) -> StageRef | None:
         """The published store, or None: here, or in the bucket. What waits here for its upload is uploaded.
 
-        Raises
-        ------
-        IncompleteStoreError : it is there, but its manifest is damaged, or a file that is nowhere else.
+        Raises IncompleteStoreError: it is there, but its manifest is damaged, or a file that is nowhere else.
         """
         ref = self.ref(stage, key)
         folder = self.root / ref.uri
@@ -118,9 +113,8 @@ class ObjectArchive(Archive):
     def in_use(self, *, alone: bool = False) -> Iterator[bool]:
         """Keep others, on other machines too, from clearing stores away while the block runs.
 
-        Raises
-        ------
-        UnreachableError : at the end, where the bucket stopped answering: all is kept here, and what to do is said.
+        Raises UnreachableError: at the end, where the bucket stopped answering: all is kept here, and what to do is
+        said.
         """
         with super().in_use(alone=alone) as free:
             lease = self._take_lease(alone=alone) if free and self.trouble is None else None
@@ -191,31 +185,19 @@ class ObjectArchive(Archive):
             run_id = f"{run_id}-{claim.decode()}"
         elif standing != claim:  # another machine began a run of this name
             return None
-        draft = super()._begin_run(run_id)
-        if draft is None:
-            return None
-        return self._sending(draft)
+        return self._sending(super()._begin_run(run_id))
 
     def extend_run(self, run_id: str, *, wait: bool = True) -> RunDraft | None:
         """Begin to add to a run that is published here or in the bucket; see `Archive.extend_run`."""
-        draft = super().extend_run(run_id, wait=wait)
-        return None if draft is None else self._sending(draft)
+        return self._sending(super().extend_run(run_id, wait=wait))
 
-    def _sending(self, draft: RunDraft) -> RunDraft:
-        run = RemoteRun(draft.id, draft.folder, self.root, draft.abandon, extends=draft.extends)
-        run.send = self._send_run
-        return run
-
-    def _send_run(self, uri: str) -> None:
-        self._while_answering(lambda: self.copy.send_run(uri), None)
+    def _sending(self, draft: RunDraft | None) -> RunDraft | None:
+        """Have a run uploaded once it is published in the working copy."""
+        if draft is not None:
+            draft.send = lambda uri: self._while_answering(lambda: self.copy.send_run(uri), None)
+        return draft
 
     # --- verification and clearing up ---------------------------------------------------------------------------------
-
-    def verify_all(self, progress: Progress | None = None) -> list[Finding]:
-        """Read every object of the archive again, and what grows here; findings are named as in a folder."""
-        from storage.remote.object_checks import verify_objects
-
-        return [*verify_objects(self.objects, progress), *verify_growing(self.root)]
 
     def size_of(self, uri: str) -> int:
         """Bytes of all objects of a store."""
@@ -223,15 +205,11 @@ class ObjectArchive(Archive):
 
     def lost_runs(self) -> list[str]:
         """Addresses of runs in the bucket of which there are files, but no manifest, neither there nor here."""
-        from storage.remote.object_checks import find_lost_runs
-
         here = {f"runs/{folder.name}" for folder in self.runs()}
         return [uri for uri in find_lost_runs(self.objects.listing("runs")) if uri not in here]
 
     def leftovers(self, keep_days: float) -> dict[str, int]:
         """What was broken off and has been in the bucket for ``keep_days``: address and bytes."""
-        from storage.remote.object_checks import find_leftovers
-
         return find_leftovers(self.objects, keep_days)
 
     def drop_leftover(self, uri: str) -> None:
@@ -242,13 +220,10 @@ class ObjectArchive(Archive):
 def open_object_archive(text: str | Path, *, create: bool = True, write: bool = True) -> ObjectArchive:
     """Open the archive at ``s3://bucket/prefix``, or begin it where ``create``.
 
-    Without ``create`` all manifests and receipts are brought, for verbs that read the whole of it.
-
-    Raises
-    ------
-    SettingsError : the address is none.
-    UnreachableError : the bucket refuses, or does not answer and there is no working copy to go on with.
-    ArchiveError : there is no archive, the store has no conditional puts, or the working copy cannot be written.
+    Without ``create`` all manifests and receipts are brought, for verbs that read the whole of it. Raises
+    SettingsError: the address is none. UnreachableError: the bucket refuses, or does not answer and there is no working
+    copy to go on with. ArchiveError: there is no archive, the store has no conditional puts, or the working copy cannot
+    be written.
     """
     place = parse_place(text)
     root, objects = place.working_copy(), Objects(place, connect(place))
@@ -317,15 +292,3 @@ class RemoteRef(StageRef):
 
     def __repr__(self) -> str:
         return f"RemoteRef({self.uri!r})"
-
-
-class RemoteRun(RunDraft):
-    """A run that is uploaded once it is published in the working copy."""
-
-    send: Callable[[str], None]
-
-    def publish(self, *, rests_on: Mapping[str, str] | None = None, **facts: Any) -> Path:
-        """Publish the run here and in the bucket; gives its folder here."""
-        folder = super().publish(rests_on=rests_on, **facts)
-        self.send(f"runs/{self.id}")
-        return folder

@@ -1,22 +1,109 @@
-"""An archive in a bucket read again to the last byte, and what broken-off uploads have left there."""
+"""Who uses an archive in a bucket, what of it is broken, and what broken-off uploads have left there.
+
+A lease is an object of each user's own, as locks reach no further than one machine. Whoever comes writes first and
+looks then, so that of one who wants to be alone and another at least one sees the other. Ages are told from the
+store's own dates alone: no two clocks are compared.
+"""
 
 from __future__ import annotations
 
 import re
-import tempfile
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+import secrets
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from datetime import datetime, timedelta
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
+from pipeline.errors import ArchiveError
 from storage.archive.manifests import try_manifest
 from storage.archive.records import RECEIPT
-from storage.archive.staging import MANIFEST_NAME, refusals
-from storage.maintenance.shard_names import name_damage
-from storage.maintenance.verification import Finding, Progress, verify_everything
-from storage.remote.object_leases import FOLDER as LEASES
+from storage.archive.staging import MANIFEST_NAME, refusals, take_lock
+from storage.maintenance.verification import Finding, Progress, name_damage, verify_everything
 from storage.remote.object_stores import Listed, Objects, some_at_a_time
 from storage.remote.object_transfers import ATTEMPT, BEGUN, WITHDRAWN, files_at, is_address
+
+FOLDER = ".in-use"
+LIFE_S = 86400.0  # after this, nobody is thought to be behind a lease that was not renewed
+RENEW_S = 3600.0
+WAIT_S = 60.0
+_PAUSE_S = 1.0
+
+
+class Lease:
+    """A lease that is held, and the local lock that tells this machine's next process whether somebody still is."""
+
+    def __init__(self, objects: Objects, name: str, unlock: Callable[[], None]) -> None:
+        self._objects, self._name, self._unlock, self._since = objects, name, unlock, time.monotonic()
+        self.taken: datetime | None = None  # by the store's clock, rounded up: it tells whole seconds
+
+    def renew(self) -> None:
+        """Write it again, now and then: called whenever something is published."""
+        if time.monotonic() - self._since > RENEW_S:
+            self._objects.write(self._name, b"renewed")
+            self._since = time.monotonic()
+
+    def end(self) -> None:
+        """Take it away."""
+        try:
+            self._objects.remove([self._name])
+        finally:
+            self._unlock()
+
+
+def take_lease(objects: Objects, root: Path, *, alone: bool) -> Lease | None:
+    """Say that an archive is in use; None, at once, where ``alone`` is asked and somebody else uses it.
+
+    Others wait for one who is alone. Raises ArchiveError: whoever is alone does not end.
+    """
+    end_dead_leases(objects, root)
+    name = f"{'alone' if alone else 'shared'}-{secrets.token_hex(8)}"
+    unlock = take_lock(
+        root / FOLDER / f"{name}.lock"
+    )  # waits, if for that of another who looks whether somebody is behind it
+    assert unlock is not None
+    lease, until = Lease(objects, f"{FOLDER}/{name}", unlock), time.monotonic() + WAIT_S
+    try:
+        objects.create(f"{FOLDER}/{name}", b"taken")
+        while others := _others(objects, lease, name, alone=alone):
+            if alone:
+                lease.end()
+                return None
+            if time.monotonic() > until:
+                raise ArchiveError(
+                    f"{objects.place.url} is being cleared up or repaired elsewhere ({others[0]}); run again when that "
+                    "has ended, or remove this object if it was killed"
+                )
+            time.sleep(_PAUSE_S)
+    except BaseException:
+        lease.end()
+        raise
+    return lease
+
+
+def _others(objects: Objects, lease: Lease, name: str, *, alone: bool) -> list[str]:
+    """Leases of others that stand against one's own."""
+    found = objects.listing(FOLDER)
+    own = found.pop(f"{FOLDER}/{name}", None)
+    if own is None:  # taken away as dead, while a clock jumped or this machine slept: not held any more
+        objects.create(f"{FOLDER}/{name}", b"taken again")
+        return [f"{FOLDER}/{name}"]
+    lease.taken = own.changed + timedelta(seconds=1)
+    fresh = [other for other, one in found.items() if (own.changed - one.changed).total_seconds() < LIFE_S]
+    return sorted(other for other in fresh if alone or other.startswith(f"{FOLDER}/alone-"))
+
+
+def end_dead_leases(objects: Objects, root: Path) -> None:
+    """Take away the leases of processes of this working copy that were killed."""
+    for path in sorted((root / FOLDER).glob("*.lock")):
+        unlock = take_lock(path, wait=False)
+        if unlock is not None:
+            try:
+                objects.remove([f"{FOLDER}/{path.stem}"])
+            finally:
+                unlock()
+
 
 DAY_S = 86400.0
 _BEGUN = re.compile(rf"(runs/[^/]+)/{BEGUN}")
@@ -28,9 +115,13 @@ def verify_objects(objects: Objects, progress: Progress | None = None) -> list[F
     Nothing is taken from a working copy: manifests and receipts are fetched again, into a folder that goes away.
     """
     there = objects.listing()
-    with _unpacked() as root:
+    with TemporaryDirectory(prefix="spectralzoom-verify-") as named, refusals(Path(named), "read manifests into"):
+        root = Path(named)
         (root / "stages").mkdir()
-        published = [path.removesuffix(f"/{MANIFEST_NAME}") for path in there if _is_manifest(path)]
+        depths = {"stages": 4, "runs": 3}
+        manifests = [path for path in there if path.endswith(f"/{MANIFEST_NAME}") and is_address(path)]
+        manifests = [path for path in manifests if depths.get(path.split("/")[0]) == path.count("/") + 1]
+        published = [path.removesuffix(f"/{MANIFEST_NAME}") for path in manifests]
         some_at_a_time(lambda uri: _lay_out(objects, root, uri), published)
 
         def problems(folder: Path) -> Iterator[str]:
@@ -43,29 +134,15 @@ def verify_objects(objects: Objects, progress: Progress | None = None) -> list[F
         return [*verify_everything(root, progress, problems), *_broken_off(objects, there)]
 
 
-@contextmanager
-def _unpacked() -> Iterator[Path]:
-    with (
-        tempfile.TemporaryDirectory(prefix="spectralzoom-verify-") as name,
-        refusals(Path(name), "read manifests into"),
-    ):
-        yield Path(name)
-
-
 def _broken_off(objects: Objects, there: Mapping[str, Listed]) -> Iterator[Finding]:
     """What a repair left withdrawn, and runs without a manifest, unless somebody may be about to upload it."""
     for path in there:
         if path.startswith(f"{WITHDRAWN}/"):
             yield Finding(path, "a repair was broken off; run verify --repair again", "stray")
-    if not any(path.startswith(f"{LEASES}/") for path in there):
+    if not any(path.startswith(f"{FOLDER}/") for path in there):
         for uri in find_lost_runs(there):
             if objects.read(f"{uri}/{MANIFEST_NAME}") is None:
                 yield Finding(uri, f"{MANIFEST_NAME} is missing, or its upload was broken off", "broken")
-
-
-def _is_manifest(path: str) -> bool:
-    parts = path.split("/")
-    return parts[-1] == MANIFEST_NAME and (len(parts), parts[0]) in ((4, "stages"), (3, "runs")) and is_address(path)
 
 
 def _lay_out(objects: Objects, root: Path, uri: str) -> None:

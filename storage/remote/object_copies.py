@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from pipeline.errors import ArchiveError, IncompleteStoreError
-from storage.archive.addresses import published_runs, published_stores
+from storage.archive.keys import published_runs, published_stores
 from storage.archive.lineage import Catalogue
 from storage.archive.manifests import (
     extended_from,
@@ -70,9 +70,7 @@ class WorkingCopy:
     def look_up(self, uri: str) -> bool:
         """Ask the bucket for a store that is not whole here; whether it stands there, and its manifest is here then.
 
-        Raises
-        ------
-        IncompleteStoreError : the manifest that stands in the bucket is damaged.
+        Raises IncompleteStoreError: the manifest that stands in the bucket is damaged.
         """
         dated = self.objects.read_dated(f"{uri}/{MANIFEST_NAME}")
         if dated is None:
@@ -85,9 +83,7 @@ class WorkingCopy:
     def send(self, uri: str) -> None:
         """Upload a store; where another came first, take that one.
 
-        Raises
-        ------
-        IncompleteStoreError : a file of it is not as it was published.
+        Raises IncompleteStoreError: a file of it is not as it was published.
         """
         with self._alone(uri):
             if self.is_known(uri):
@@ -101,9 +97,7 @@ class WorkingCopy:
     def fetch(self, uri: str) -> None:
         """Have a store or run here whole; of one of which nothing is known, a reader says what it finds.
 
-        Raises
-        ------
-        IncompleteStoreError : an object of it is missing or has changed, or all of it was removed since.
+        Raises IncompleteStoreError: an object of it is missing or has changed, or all of it was removed since.
         """
         folder = self.root / uri
         if not (folder / MANIFEST_NAME).is_file() or is_here(folder):
@@ -138,9 +132,7 @@ class WorkingCopy:
     def ensure(self, uris: Iterable[str]) -> None:
         """See that stores stand in the bucket as they are known here; those that do not are uploaded, or forgotten.
 
-        Raises
-        ------
-        IncompleteStoreError : one is neither in the bucket nor whole here.
+        Raises IncompleteStoreError: one is neither in the bucket nor whole here.
         """
         wanted = list(uris)
         standing = some_at_a_time(lambda uri: self.objects.read_dated(f"{uri}/{MANIFEST_NAME}"), wanted)
@@ -159,11 +151,7 @@ class WorkingCopy:
     def send_run(self, uri: str) -> None:
         """Upload a run, whose stores are in the bucket; where it stands there without what was added here, with that.
 
-        What another machine has added before is taken instead.
-
-        Raises
-        ------
-        ArchiveError : another run of this name is there.
+        What another machine has added before is taken instead. Raises ArchiveError: another run of this name is there.
         """
         folder = self.root / uri
         ours, standing = (folder / MANIFEST_NAME).read_bytes(), send_folder(self.objects, uri, folder)

@@ -1,35 +1,187 @@
-"""Objects below an archive's prefix: read, written, listed and removed, each of them as a whole.
+"""An archive's place in a bucket, and its objects: read, written, listed and removed, each of them as a whole.
 
-Files of a folder travel a few at a time. What was asked and moved is counted, so that a rerun can show that it was
-nothing.
+How the bucket is reached stands in the environment, as for any S3 client: AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY,
+AWS_REGION, AWS_ENDPOINT_URL. SPECTRALZOOM_WORK names the folder of working copies. What was asked and moved is counted,
+so that a rerun can show that it was nothing.
 """
 
 from __future__ import annotations
 
 import hashlib
+import os
+import re
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
+from urllib.parse import urlsplit
 
-import obstore
-from obstore.exceptions import AlreadyExistsError
-from obstore.store import S3Store
-
-from pipeline.errors import ArchiveError, IncompleteStoreError
+from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from storage.archive.staging import sync_path
-from storage.remote.object_places import ObjectPlace, answers_of
+
+if TYPE_CHECKING:
+    from obstore.store import BackoffConfig, ClientConfig, RetryConfig, S3Config, S3Store
 
 AT_ONCE = 8  # objects on their way
 PART_BYTES = 8 << 20  # of a large object's parts, and of what is held of it
 _TRIES = 3
+RETRIES = 6  # of one request, after waits that grow up to threefold: some ten seconds in all
+BACKOFF: BackoffConfig = {"init_backoff": timedelta(seconds=0.5), "max_backoff": timedelta(seconds=8), "base": 3}
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+_ADDRESS = re.compile(r"s3:/+([^/]*)/*(.*)")  # also as a path has it, which makes one slash of two
+_BUCKET = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")
+_PART = re.compile(r"[A-Za-z0-9_.=+-]+")
+_MEANINGS = {  # what a store's answer begins with or holds -> what it means and what to do
+    "NoSuchBucket": "there is no such bucket: create it, or check its name, AWS_REGION and AWS_ENDPOINT_URL",
+    "169.254.16": "there are no credentials: set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY",
+    "SignatureDoesNotMatch": "the credentials are refused: check AWS_SECRET_ACCESS_KEY",
+    "InvalidAccessKeyId": "the credentials are refused: check AWS_ACCESS_KEY_ID",
+    "ExpiredToken": "the credentials have expired: renew them, and AWS_SESSION_TOKEN",
+    "AuthorizationHeaderMalformed": "the bucket is in another region: set AWS_REGION",
+    "PermanentRedirect": "the bucket is in another region: set AWS_REGION",
+    "301 Moved": "the bucket is in another region: set AWS_REGION",
+    "redirect without LOCATION": "the bucket is in another region: set AWS_REGION",
+    "AccessDenied": "access is denied: check the credentials and the bucket's policy (get, put, list, delete)",
+    "403 Forbidden": "access is denied: check the credentials and the bucket's policy (get, put, list, delete)",
+    "401 Unauthorized": "access is denied: check the credentials",
+    "error sending request": "it cannot be reached: check the network and AWS_ENDPOINT_URL",
+    "timed out": "it does not answer in time: check the network and AWS_ENDPOINT_URL",
+    "response body error": "its answer was broken off: check the network",
+    "501 Not Implemented": "it lacks what an archive needs (conditional puts, listing): use another store",
+    "status code: 5": "it has trouble of its own, or is asked too much: run again later",
+}
+_PASSING = ("error sending request", "timed out", "response body error", "status code: 5")
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+
+
+class UnreachableError(ArchiveError):
+    """A bucket that refuses, or does not answer. ``passing``: it may answer later, with nothing changed here."""
+
+    def __init__(self, message: str, *, passing: bool = False) -> None:
+        super().__init__(message)
+        self.passing = passing
+
+
+@dataclass(frozen=True)
+class ObjectPlace:
+    """An archive's place in a bucket. ``endpoint`` is None for AWS itself."""
+
+    bucket: str
+    prefix: str
+    endpoint: str | None = None
+
+    @property
+    def url(self) -> str:
+        """The address that the user gives."""
+        return f"s3://{self.bucket}/{self.prefix}" if self.prefix else f"s3://{self.bucket}"
+
+    def working_copy(self) -> Path:
+        """Folder on this machine in which the archive is worked on; its last part is what the archive is called."""
+        base = os.environ.get("SPECTRALZOOM_WORK")
+        if base is None:
+            base = os.environ.get("XDG_DATA_HOME") or str(Path.home() / ".local" / "share")
+            base = f"{base}/spectralzoom/s3"
+        mark = hashlib.sha256(f"{self.endpoint or ''} {self.url}".encode()).hexdigest()[:12]
+        return Path(base).expanduser().absolute() / mark / (self.prefix.rpartition("/")[2] or self.bucket)
+
+
+def is_remote(root: str | Path) -> bool:
+    """Whether an archive's name is an address on S3, and no folder's (SettingsError: it is one of another kind)."""
+    found = _ADDRESS.fullmatch(str(root)) is not None
+    if "://" in str(root) and not found:
+        raise SettingsError(f"{str(root)!r} is no place for an archive; expected a folder, or s3://bucket/prefix")
+    return found
+
+
+def parse_place(text: str | Path) -> ObjectPlace:
+    """Read ``s3://bucket/prefix``; the endpoint comes from the environment.
+
+    Raises SettingsError: it is no such address, or the endpoint is none that can be used.
+    """
+    found = _ADDRESS.fullmatch(str(text))
+    bucket, prefix = ("", "") if found is None else (found[1], found[2].strip("/"))
+    parts = prefix.split("/") if prefix else []
+    if not _BUCKET.fullmatch(bucket) or not all(_PART.fullmatch(part) and part.strip(".") for part in parts):
+        raise SettingsError(
+            f"{str(text)!r} is no archive on S3; expected s3://bucket/prefix, the bucket in small letters, digits, '-' "
+            "and '.', the prefix in letters, digits and '_.=+-'"
+        )
+    if "stages" in parts:
+        raise SettingsError(f"{str(text)!r} lies in an archive's folder stages, where nothing else belongs")
+    return ObjectPlace(bucket, prefix, _endpoint())
+
+
+def _endpoint() -> str | None:
+    text = os.environ.get("AWS_ENDPOINT_URL_S3") or os.environ.get("AWS_ENDPOINT_URL")
+    if not text:
+        return None
+    try:
+        parts = urlsplit(text)
+        good = parts.scheme in ("http", "https") and bool(parts.hostname) and (parts.port or 1) > 0
+    except ValueError:
+        good = False
+    if not good:
+        raise SettingsError(f"AWS_ENDPOINT_URL={text!r} is no address; expected https://HOST, or http://127.0.0.1:PORT")
+    allowed = os.environ.get("AWS_ALLOW_HTTP", "").lower() in ("1", "true", "yes")
+    if parts.scheme == "http" and parts.hostname not in LOOPBACK and not allowed:
+        raise SettingsError(
+            f"AWS_ENDPOINT_URL={text}: over plain http anybody on the way can read and change the data; use https, or "
+            "set AWS_ALLOW_HTTP=true"
+        )
+    return text
+
+
+def connect(place: ObjectPlace) -> S3Store:
+    """Open a place as a store whose names begin there; nothing is asked of the network yet.
+
+    Raises ArchiveError: a setting of AWS in the environment is none, or obstore is not installed.
+    """
+    try:
+        from obstore.exceptions import BaseError  # an extra
+        from obstore.store import S3Store
+    except ImportError as error:
+        raise ArchiveError(
+            f"{place.url}: archives on S3 need obstore ({error}); pip install 'spectralzoom[s3]'"
+        ) from error
+    http = place.endpoint is not None and place.endpoint.startswith("http://")
+    client: ClientConfig = {"allow_http": http, "connect_timeout": "5s", "read_timeout": "30s", "timeout": "15min"}
+    retry: RetryConfig = {"max_retries": RETRIES, "retry_timeout": timedelta(minutes=2), "backoff": BACKOFF}
+    config: S3Config = {} if place.endpoint is None else {"endpoint": place.endpoint}
+    try:
+        return S3Store(
+            place.bucket, prefix=place.prefix or None, config=config, client_options=client, retry_config=retry
+        )
+    except BaseError as error:
+        raise ArchiveError(f"{place.url} cannot be used: {_first_line(error)}") from error
+
+
+@contextmanager
+def answers_of(place: ObjectPlace) -> Iterator[None]:
+    """Turn what a store answers, or that it does not answer, into an UnreachableError that says what to do."""
+    from obstore.exceptions import BaseError
+
+    try:
+        yield
+    except (BaseError, FileNotFoundError, PermissionError) as error:
+        if isinstance(error, FileNotFoundError) and "NoSuchBucket" not in str(error):
+            raise
+        text = str(error)
+        meaning = next((words for sign, words in _MEANINGS.items() if sign in text), _first_line(error))
+        if "invalid path" in text:
+            meaning += "; take it out of the bucket: nothing in an archive is called so"
+        at = "" if place.endpoint is None else f" at {place.endpoint}"
+        passing = any(sign in text for sign in _PASSING) and "501 Not" not in text
+        raise UnreachableError(f"{place.url}{at}: {meaning}", passing=passing) from error
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
 @dataclass(frozen=True)
@@ -67,7 +219,7 @@ class Objects:
         """Content of a small object and when it was written, by the store's clock."""
         with self._asking():
             try:
-                answer = obstore.get(self.store, name)
+                answer = self.store.get(name)
                 content = bytes(answer.bytes())
             except FileNotFoundError as error:
                 if "NoSuchBucket" in str(error):
@@ -78,9 +230,11 @@ class Objects:
 
     def create(self, name: str, content: bytes) -> bool:
         """Write an object unless there is one of this name (``If-None-Match: *``); tells whether it was written."""
+        from obstore.exceptions import AlreadyExistsError  # an extra
+
         with self._asking():
             try:
-                obstore.put(self.store, name, content, mode="create", use_multipart=False)
+                self.store.put(name, content, mode="create", use_multipart=False)
             except AlreadyExistsError:
                 return False
         self._count(sent=len(content))
@@ -102,13 +256,13 @@ class Objects:
     def write(self, name: str, source: Path | bytes) -> None:
         """Write an object from a file, whatever was there; nobody sees a part of it."""
         with self._asking():
-            obstore.put(self.store, name, source, chunk_size=PART_BYTES, max_concurrency=2)
+            self.store.put(name, source, chunk_size=PART_BYTES, max_concurrency=2)
         self._count(sent=source.stat().st_size if isinstance(source, Path) else len(source))
 
     def blocks(self, name: str) -> Iterator[memoryview]:
         """Content of an object, some MB at a time (FileNotFoundError: there is none)."""
         with self._asking():
-            for block in obstore.get(self.store, name).stream(PART_BYTES):
+            for block in self.store.get(name).stream(PART_BYTES):
                 self._count(received=len(block))
                 yield memoryview(block)
 
@@ -125,9 +279,7 @@ class Objects:
     def fetch(self, name: str, path: Path, sha256: str, aside: Path) -> None:
         """Bring an object to ``path``, by way of the file ``aside``, if every byte of it is as it was published.
 
-        Raises
-        ------
-        IncompleteStoreError : it is missing or has changed; nothing has come to ``path``.
+        Raises IncompleteStoreError: it is missing or has changed; nothing has come to ``path``.
         """
         advice = f"restore it from a copy, or run verify on {self.place.url}"
         try:
@@ -157,14 +309,14 @@ class Objects:
     def children(self, folder: str) -> list[str]:
         """Names of what lies in a folder and is one itself."""
         with self._asking():
-            found = obstore.list_with_delimiter(self.store, folder)
+            found = self.store.list_with_delimiter(folder)
         return sorted(prefix.rstrip("/").rpartition("/")[2] for prefix in found["common_prefixes"])
 
     def listing(self, folder: str | None = None) -> dict[str, Listed]:
         """Every object below a folder, or below the prefix, by its name."""
         found: dict[str, Listed] = {}
         with self._asking():
-            for batch in obstore.list(self.store, folder, chunk_size=1000):
+            for batch in self.store.list(folder, chunk_size=1000):
                 found |= {one["path"]: Listed(one["size"], one["last_modified"]) for one in batch}
         return found
 
@@ -173,7 +325,7 @@ class Objects:
         waiting = list(names)
         if waiting:
             with self._asking(), suppress(FileNotFoundError):
-                obstore.delete(self.store, waiting)
+                self.store.delete(waiting)
 
     @contextmanager
     def _asking(self) -> Iterator[None]:
@@ -190,14 +342,5 @@ class Objects:
 
 def some_at_a_time(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
     """Do work that waits for the network on a few items at a time; results in their order, the first error raised."""
-    waiting = list(items)
-    if len(waiting) < 2:
-        return [work(item) for item in waiting]
-    with ThreadPoolExecutor(min(AT_ONCE, len(waiting))) as pool:
-        futures = [pool.submit(work, item) for item in waiting]
-        try:
-            return [future.result() for future in futures]
-        except BaseException:
-            for future in futures:
-                future.cancel()
-            raise
+    with ThreadPoolExecutor(AT_ONCE) as pool:
+        return list(pool.map(work, items))  # which, after an error, cancels what has not begun

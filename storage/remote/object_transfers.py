@@ -63,12 +63,8 @@ def files_at(uri: str, manifest: bytes) -> str:
 def send_folder(objects: Objects, uri: str, folder: Path) -> bytes:
     """Upload a published folder, its manifest last; gives the manifest that stands, which is whoever's came first.
 
-    What is there of an upload that was broken off is not sent again.
-
-    Raises
-    ------
-    IncompleteStoreError : a file of the folder is not as published any more; nothing is published then.
-    UnreachableError : the bucket refuses or does not answer.
+    What is there of an upload that was broken off is not sent again. Raises IncompleteStoreError: a file of the folder
+    is not as published any more; nothing is published then. UnreachableError: the bucket refuses or does not answer.
     """
     text = (folder / MANIFEST_NAME).read_bytes()
     standing = objects.read(f"{uri}/{MANIFEST_NAME}")
@@ -81,12 +77,9 @@ def send_folder(objects: Objects, uri: str, folder: Path) -> bytes:
 def send_extension(objects: Objects, uri: str, folder: Path, standing: bytes) -> None:
     """Upload a run that something was added to in the place of the one that stands: its files, then its manifest.
 
-    The files of the one of which ``standing`` is the manifest go last; killed before, `gc` clears them away.
-
-    Raises
-    ------
-    IncompleteStoreError : a file of the folder is not as published any more; nothing is changed then.
-    UnreachableError : the bucket refuses or does not answer.
+    The files of the one of which ``standing`` is the manifest go last; killed before, `gc` clears them away. Raises
+    IncompleteStoreError: a file of the folder is not as published any more; nothing is changed then. UnreachableError:
+    the bucket refuses or does not answer.
     """
     text = (folder / MANIFEST_NAME).read_bytes()
     _send_files(objects, uri, folder, text)
@@ -105,9 +98,7 @@ def _send_files(objects: Objects, uri: str, folder: Path, text: bytes) -> None:
 def fetch_folder(objects: Objects, root: Path, uri: str, only: Iterable[str] | None = None) -> None:
     """Bring the files that a folder of the working copy lacks (of ``only`` these names), each checked by its hash.
 
-    Raises
-    ------
-    IncompleteStoreError : an object is missing or has changed; what was fetched before it is kept.
+    Raises IncompleteStoreError: an object is missing or has changed; what was fetched before it is kept.
     """
     folder = root / uri
     files = read_manifest(folder)["files"]
@@ -145,20 +136,17 @@ def lay_manifest(root: Path, uri: str, manifest: bytes, changed: datetime) -> No
         os.utime(made / MANIFEST_NAME, (changed.timestamp(), changed.timestamp()))
         sync_path(made / MANIFEST_NAME)
         sync_path(made)
-        if folder.exists() and _lists_the_same(folder, made):
+        try:
+            alike = folder.exists() and read_manifest(folder)["files"] == read_manifest(made)["files"]
+        except IncompleteStoreError:
+            alike = False
+        if alike:
             (made / MANIFEST_NAME).replace(folder / MANIFEST_NAME)
             sync_path(folder)
         else:
             retire(folder)
             made.rename(folder)
     sync_path(folder.parent)
-
-
-def _lists_the_same(one: Path, other: Path) -> bool:
-    try:
-        return bool(read_manifest(one)["files"] == read_manifest(other)["files"])
-    except IncompleteStoreError:
-        return False
 
 
 @contextmanager

@@ -23,8 +23,7 @@ from pipeline.rectify.placed import PixelGrid
 from pipeline.rectify.region import plan_tiles
 from storage.arrays.mosaics import MosaicWriter
 from storage.arrays.tile_work import MosaicRecipe, write_mosaic
-from storage.parallel.block_work import run_blocks
-from storage.parallel.crew import Crew
+from storage.parallel.crew import Crew, run_blocks
 
 SCENE, BANDS = SceneGrid(1024, 1280, 32, 4), 128
 LARGEST_PX, LARGEST_BANDS, MOST_TASKS = 10240, 270, 20_000

@@ -33,8 +33,7 @@ from pipeline.planning.selection import frame_seats
 from pipeline.simulator.scenes.farm.spectra import MATERIALS, spectral_library
 from storage.arrays.class_maps import ClassMap, ClassNames, create_class_map, load_class_map
 from storage.arrays.layout import SHARD_ROWS
-from storage.arrays.mosaics import MosaicWriter
-from storage.arrays.patches import PATCHES_A_SHARD, PatchWriter, open_patches
+from storage.arrays.mosaics import PATCHES_A_SHARD, MosaicWriter, PatchWriter, open_patches
 from storage.arrays.tile_work import RESERVED_BYTES
 from storage.parallel.crew import Crew
 

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 from storage.archive.archive import Archive
+from storage.remote.opening import verify_archive
 
 
 def main(root: Path, flips: int, seed: int = 0) -> int:
@@ -24,12 +25,12 @@ def main(root: Path, flips: int, seed: int = 0) -> int:
         place, bit = rng.randrange(len(whole)), rng.randrange(8)
         path.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << bit]) + whole[place + 1 :])
         try:
-            problems = [finding for finding in archive.verify_all() if finding.problem is not None]
+            problems = [finding for finding in verify_archive(archive) if finding.problem is not None]
         finally:
             path.write_bytes(whole)
         found += bool(problems)
         named += any(path.relative_to(root.absolute()).is_relative_to(finding.uri) for finding in problems)
-    left = sum(finding.problem is not None for finding in archive.verify_all())
+    left = sum(finding.problem is not None for finding in verify_archive(archive))
     print(f"{flips} bits flipped: {found} found, {named} with the address; {left} left after putting back")
     return int(found < flips or named < flips or left > 0)
 

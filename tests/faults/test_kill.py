@@ -13,6 +13,7 @@ import numpy as np
 
 from storage.archive.archive import Archive
 from storage.arrays.spool import Spool
+from storage.remote.opening import verify_archive
 
 ROOT = Path(__file__).parents[2]
 KILLS = 6
@@ -62,7 +63,7 @@ def test_killed_while_publishing(tmp_path: Path) -> None:
     for _ in range(KILLS):
         assert _run_and_kill(PUBLISH, tmp_path, delays.uniform(0.005, 0.06)) == "published one"
         archive = Archive.open(tmp_path, create=False)
-        findings = archive.verify_all()
+        findings = verify_archive(archive)
         assert [finding.problem for finding in findings if finding.problem] == []
         assert len(findings) > seen
         seen = len(findings)

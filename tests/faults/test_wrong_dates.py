@@ -13,6 +13,7 @@ from storage.archive import run_folders, staging
 from storage.archive.archive import Archive, StageRef
 from storage.archive.run_folders import date_of_store
 from storage.maintenance.garbage import plan_clearance
+from storage.remote.opening import verify_archive
 from tests.storage.small_archive import grow_old, small_survey
 
 
@@ -25,7 +26,7 @@ class Back(datetime):
 
 
 def _problems(archive: Archive) -> list[str]:
-    return [finding.problem for finding in archive.verify_all() if finding.problem]
+    return [finding.problem for finding in verify_archive(archive) if finding.problem]
 
 
 def test_a_store_made_anew_after_the_clock_was_set_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,6 +12,7 @@ from flows.schedule.ledger_state import ENDINGS, moment_words, read_moment
 from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 from storage.maintenance.garbage import clear_up
+from storage.remote.opening import verify_archive
 
 GONE = "process was gone"  # in the reason of a run that was killed and not begun again
 Line = Mapping[str, Any]
@@ -118,7 +119,7 @@ def clear(archive: Archive, failed: Iterable[Look], spools: Mapping[str, Look]) 
 
 def problems_of(archive: Archive) -> list[str]:
     """What `verify` finds."""
-    return [f"{found.uri}: {found.problem}" for found in archive.verify_all() if found.problem is not None]
+    return [f"{found.uri}: {found.problem}" for found in verify_archive(archive) if found.problem is not None]
 
 
 def _look_at_stores(archive: Archive, looks: set[Look], kept: Mapping[str, str], found: Leftovers) -> None:

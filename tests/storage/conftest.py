@@ -1,13 +1,23 @@
-"""Where real data lie, and small scenes on disk."""
+"""An archive that is empty yet, and a small cube."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+
+from storage.archive.archive import Archive
 
 
 @pytest.fixture
 def cube() -> NDArray[np.uint16]:
     """A small cube, (7, 9, 5) uint16."""
     return np.random.default_rng(3).integers(0, 4096, (7, 9, 5), dtype=np.uint16)
+
+
+@pytest.fixture
+def archive(tmp_path: Path) -> Archive:
+    """An archive in a folder, empty yet."""
+    return Archive.open(tmp_path)

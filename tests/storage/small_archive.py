@@ -15,12 +15,12 @@ DAY_S = 86400
 
 @dataclass(frozen=True)
 class Small:
-    """Stores of one survey: raw lines, a mosaic made of them, a map made of both, and the run that names the map."""
+    """Stores of one survey: raw lines, a mosaic made of them, a map made of both; the run that names it, if any."""
 
     raw: StageRef
     mosaic: StageRef
     map: StageRef
-    run: Path | None
+    run: Path = Path("no run")
 
 
 def settings(seed: int = 0, **more: Any) -> dict[str, Any]:
@@ -37,7 +37,7 @@ def small_survey(
     mosaic = _store(archive, "rectify", {"grid": {"height": 8, "width": 8}, "kernel": kernel}, [raw])
     drawn = _store(archive, "segment", {"weights": "w0"}, [mosaic, raw])
     if not named:
-        return Small(raw, mosaic, drawn, None)
+        return Small(raw, mosaic, drawn)
     receipt = {
         "survey": "farm",
         "settings": settings(seed, kernel=kernel, source="sim" if simulated else "rig"),

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from storage.archive.addresses import StageRef
 from storage.archive.archive import Archive
+from storage.archive.keys import StageRef
 from storage.remote.object_archive import ObjectArchive
+from storage.remote.opening import verify_archive
 
 Machine = Callable[..., ObjectArchive]  # of the fixture: opens the archive, by the name of a machine
 FIRST, SECOND = "first", "second"  # two machines, by the folder of their working copies
@@ -38,4 +39,4 @@ def object_of(archive: ObjectArchive, ref: StageRef, file: str) -> str:
 
 def problems(archive: Archive) -> list[str]:
     """What verify finds."""
-    return [f"{one.uri} {one.problem}" for one in archive.verify_all() if one.problem is not None]
+    return [f"{one.uri} {one.problem}" for one in verify_archive(archive) if one.problem is not None]

@@ -42,7 +42,7 @@ from pipeline.simulator.effects.pointing import CommonOffset, PointingErrors
 from pipeline.simulator.simulated import SimulatedSource
 from storage.archive.archive import StageRef
 from storage.archive.keys import array_digest
-from storage.archive.stored_tables import read_table
+from storage.archive.manifests import read_table
 from storage.archive.whole_files import to_json
 from storage.arrays.class_maps import load_class_map
 

@@ -17,8 +17,8 @@ from pipeline.geometry.scan import Sweep
 from pipeline.planning.fine_pass import FinePlan, plan_fine
 from storage.archive.archive import StageRef
 from storage.archive.keys import array_digest
-from storage.archive.stored_tables import read_table, write_table
-from storage.arrays.attention import Attention, write_attention
+from storage.archive.manifests import read_table, write_table
+from storage.arrays.mosaics import Attention, write_attention
 
 ATTENTION = Product("attend", version=7, by_weights=True)
 

@@ -17,7 +17,7 @@ from pipeline.geometry.scan import Sweep
 from pipeline.simulator.simulated import sweep_starts
 from pipeline.source import Line, Source
 from storage.archive.archive import StageRef, stage_key
-from storage.archive.stored_tables import write_table
+from storage.archive.manifests import write_table
 from storage.arrays.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_cube
 from storage.arrays.spool import Spool
 

@@ -16,9 +16,9 @@ from models.reading.inference import CoarseLook, Glance, read_glance
 from models.reading.regions import whole_field
 from storage.archive.archive import StageRef
 from storage.archive.keys import array_digest
-from storage.archive.stored_tables import read_table, write_table
+from storage.archive.manifests import read_table, write_table
 from storage.arrays.class_maps import ClassNames, clear_classes, create_class_map
-from storage.arrays.patches import open_patches
+from storage.arrays.mosaics import open_patches
 
 CLASS_MAP = Product("segment", version=5, by_weights=True)
 STRANGE = "strange.json"  # beside a map, where values were no readings

@@ -26,7 +26,7 @@ from pipeline.simulator.selection.survey_probe import probe_survey
 from pipeline.simulator.selection.verification import candidate_blocks, verify, worst_blocks
 from pipeline.simulator.simulated import SimulatedSource, sweep_block, sweep_starts
 from storage.archive.archive import StageRef
-from storage.archive.stored_tables import read_table
+from storage.archive.manifests import read_table
 from storage.archive.whole_files import to_json
 
 MANIFEST = Product("effects", version=2)

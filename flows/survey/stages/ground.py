@@ -13,8 +13,8 @@ from flows.survey.stage import Product, Wanted, stage
 from pipeline.ground.map_grid import GroundGrid, classes_at, ground_grid, image_at, map_blocks
 from pipeline.ground.view import GroundView
 from storage.archive.archive import StageRef
-from storage.arrays.class_maps import ClassMap, load_class_map
-from storage.arrays.ground_maps import BLOCK, ClassLegend, GroundMapWriter
+from storage.arrays.class_maps import ClassMap, ClassNames, load_class_map
+from storage.arrays.ground_maps import BLOCK, GroundMapWriter
 from storage.arrays.layout import SHARD_ROWS, open_group, read_array, read_bands
 from storage.arrays.quicklooks import choose_bands, develop, stretch
 
@@ -34,7 +34,7 @@ def ground(run: SurveyRun, class_map: StageRef, mosaic: StageRef) -> Wanted | No
         found = load_class_map(class_map.path / "class_map.zarr")
         colours = coarse_colours(mosaic)
         about = {"rig_pose": asdict(grid.frame.view.pose), "scene_pixels": grid.counts()}
-        writer = GroundMapWriter(path / STORE, grid.geobox, ClassLegend(found.names, found.colours), about=about)
+        writer = GroundMapWriter(path / STORE, grid.geobox, ClassNames(found.names, found.colours), about=about)
         for rows, columns in map_blocks(grid.shape, BLOCK):
             writer.write_block(rows, columns, *_draw_block(grid, found, colours, run.grid.factor, (rows, columns)))
             run.report(rows.stop / grid.shape[0])

@@ -11,9 +11,8 @@ from flows.survey.stage import Product, Wanted, stage
 from flows.survey.stages.attention import load_plan
 from pipeline.planning.orientation import compare_orientations, find_rows
 from storage.archive.archive import StageRef
-from storage.archive.stored_tables import read_table, write_table
-from storage.arrays.attention import load_attention
-from storage.arrays.mosaics import mosaic_brightness
+from storage.archive.manifests import read_table, write_table
+from storage.arrays.mosaics import load_attention, mosaic_brightness
 
 TURNED = Product("turned", version=1)
 FILE = "orientation.json"

@@ -22,11 +22,10 @@ from pipeline.rectify.region import read_seats
 from pipeline.rectify.tie_points import TieTable
 from pipeline.rectify.tracks import Track
 from storage.archive.archive import StageRef
-from storage.archive.stored_tables import read_table, write_table
+from storage.archive.manifests import read_table, write_table
 from storage.arrays.layout import read_array
 from storage.arrays.lookups import path_digest, write_lookup
-from storage.arrays.mosaics import MosaicWriter
-from storage.arrays.patches import PatchWriter, open_patches
+from storage.arrays.mosaics import MosaicWriter, PatchWriter, open_patches
 from storage.arrays.quicklooks import choose_bands, stretched
 from storage.arrays.tile_work import MosaicRecipe, Thumbnail, write_mosaic
 

@@ -22,9 +22,9 @@ from pipeline.rectify.registration.illumination import overlap_light, solve_ligh
 from pipeline.rectify.registration.overlaps import BroadSweep, broad_bands
 from pipeline.rectify.registration.seams import Anchor, Registration, SeamWindow, anchor_sweep, register_sweeps
 from storage.archive.archive import StageRef
-from storage.archive.stored_tables import read_table, write_table
-from storage.arrays.located_sweeps import Sighted, sight_sweeps
+from storage.archive.manifests import read_table, write_table
 from storage.arrays.mosaics import load_mosaic
+from storage.arrays.tile_work import Sighted, sight_sweeps
 
 POINTING = Product("register", version=2)
 RECORD = "registration.json"

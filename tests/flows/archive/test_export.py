@@ -25,6 +25,7 @@ from storage.archive.archive import Archive
 from storage.export.cog_files import cog_problems
 from storage.export.stac_items import stac_problems
 from storage.readers.envi_cubes import open_envi_cube
+from storage.remote.opening import verify_archive
 from tests.storage.export.stac_rules import extension_problems
 
 rasterio = pytest.importorskip("rasterio", reason="exports are written with rasterio, of the extra [geo]")
@@ -285,7 +286,7 @@ def test_places_that_cannot_be_written_are_refused(posed: Exported, tmp_path: Pa
         with pytest.raises(ArchiveError, match=r"cannot export to .*; choose another --out"):
             run_export(posed.archive, None, out, envi=False, console=QUIET)
     assert (tmp_path / "file").read_text() == "mine"
-    assert all(finding.problem is None for finding in Archive.open(posed.archive).verify_all())
+    assert all(finding.problem is None for finding in verify_archive(Archive.open(posed.archive)))
 
 
 def test_a_run_goes_by_the_names_that_other_verbs_give_it(posed: Exported, tmp_path: Path) -> None:

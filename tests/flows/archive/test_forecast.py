@@ -172,7 +172,7 @@ def test_a_field_beyond_this_machine_is_planned_without_drawing_it(
     monkeypatch.setattr("pipeline.simulator.scenes.farm.farm_scene._draw", refuse)
     monkeypatch.setattr("pipeline.simulator.scenes.farm.farm_scene.spectral_library", refuse)
     monkeypatch.setattr(
-        "storage.readers.declared_sizes.os.sysconf", lambda name: {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 2**21}[name]
+        "storage.readers.cube_sources.os.sysconf", lambda name: {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 2**21}[name]
     )
     asked = replace(settings, scene="farm", size=(10240, 10240), labels=None, weights=None, out=str(tmp_path / "a"))
     found = forecast(asked)

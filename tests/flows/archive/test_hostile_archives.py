@@ -46,7 +46,6 @@ def call_itself(small: Small, lead: str) -> None:
 
 def name_products(small: Small, lead: str) -> None:
     """A run's products, stages and what it rests on lie elsewhere."""
-    assert small.run is not None
     receipt = json.loads((small.run / "receipt.json").read_text())
     receipt["products"] = {"class_map": lead, "mosaic": f"stages/rectify/{lead}"}
     receipt["stages"] = [{"name": lead, "key": lead, "state": "ran", "manifest_sha256": "0" * 64}]

@@ -27,6 +27,7 @@ from storage.archive.archive import Archive
 from storage.readers.cube_sources import CubeSource
 from storage.readers.scan_files import open_cube_source
 from storage.readers.scene_files import load_scene_file
+from storage.remote.opening import verify_archive
 
 NM = "wavelength units = um\nwavelength = {0.45, 0.55, 0.65}\nfwhm = {0.01, 0.01, 0.02}\n"
 KINDS = {"u1": 1, "i2": 2, "i4": 3, "f4": 4, "f8": 5, "u2": 12}
@@ -87,7 +88,7 @@ def test_all_that_is_known_is_stored(tmp_path: Path, raw: NDArray[np.uint16]) ->
     assert str(tmp_path) not in json.dumps(about)
     with Image.open(Path(record["path"]) / "quicklook.png") as picture:
         assert picture.size == (40, 150)
-    assert Archive.open(tmp_path / "archive").verify_all()[0].problem is None
+    assert verify_archive(Archive.open(tmp_path / "archive"))[0].problem is None
 
 
 @pytest.mark.parametrize(
@@ -274,7 +275,7 @@ def test_killed_it_leaves_nothing_half_made(tmp_path: Path, wait_s: float) -> No
         time.sleep(wait_s)
         process.send_signal(signal.SIGKILL)
     archive = Archive.open(tmp_path / "archive")
-    assert all(finding.problem is None for finding in archive.verify_all())
+    assert all(finding.problem is None for finding in verify_archive(archive))
     record, undisturbed = ingest(header, tmp_path / "archive"), ingest(header, tmp_path / "other")
     assert record["key"] == undisturbed["key"]
     xr.testing.assert_identical(opened(record), opened(undisturbed))

@@ -21,6 +21,7 @@ from flows.publish.receipt import check_receipt, comparable, is_pending
 from flows.survey.stages import accuracy as evaluation
 from flows.survey.survey import STAGES
 from storage.archive.archive import Archive
+from storage.remote.opening import verify_archive
 from tests.conftest import WeightsMaker
 from tests.flows.conftest import CommandLine
 from tests.flows.stage_doubles import act_instead, be_version
@@ -38,7 +39,7 @@ def tells(pattern: str, lines: list[str]) -> bool:
 
 def problems(out: Path) -> list[str]:
     """What verify finds."""
-    return [f"{one.uri} {one.problem}" for one in Archive.open(out).verify_all() if one.problem]
+    return [f"{one.uri} {one.problem}" for one in verify_archive(Archive.open(out)) if one.problem]
 
 
 def receipts(out: Path) -> list[Any]:

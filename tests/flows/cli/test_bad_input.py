@@ -22,6 +22,7 @@ from PIL import Image
 from flows.survey.survey import STAGES
 from storage.archive.archive import Archive
 from storage.arrays.class_maps import load_class_map
+from storage.remote.opening import verify_archive
 from tests.flows.stage_doubles import act_instead
 
 ROOT = Path(__file__).parents[3]
@@ -167,7 +168,7 @@ def test_unusual_input_works(
     assert (ended.code, ended.errors) == (0, [])
     assert says in " ".join(ended.err.split())
     archive = Archive.open(tmp_path / "archive", create=False)
-    assert [finding.problem for finding in archive.verify_all() if finding.problem] == []
+    assert [finding.problem for finding in verify_archive(archive) if finding.problem] == []
     drawn = class_map(archive)
     assert np.count_nonzero(drawn == 255) == (90 if case == "NaN pixels" else 0)
     assert set(np.unique(drawn)) <= {0, 1, 2, 255}
@@ -337,7 +338,7 @@ def test_full_disk_anywhere_in_a_survey(
     assert "Traceback" not in ended.err
     archive = Archive.open(out)
     published = {ref.uri: contents(ref.path) for ref in archive.refs()}
-    assert [finding.problem for finding in archive.verify_all() if finding.problem] == []
+    assert [finding.problem for finding in verify_archive(archive) if finding.problem] == []
     assert not [path for path in out.rglob("*.part") if "spool" not in path.parts]
     assert command_line(*survey_words(FULL_WORDS, str(out))).code == 0
     assert {uri: contents(out / uri) for uri in published} == published

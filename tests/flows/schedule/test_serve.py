@@ -29,6 +29,7 @@ from flows.settings.survey_settings import Settings
 from pipeline.errors import ArchiveError
 from storage.archive.archive import Archive
 from storage.archive.ledger import Ledger
+from storage.remote.opening import verify_archive
 from tests.flows.schedule.schedule_days import NOON, HandClock
 
 EVERY = parse_timetable(None, "20m", "UTC")
@@ -223,7 +224,7 @@ def test_plain_serving_surveys_fields_in_turn_and_each_visit_anew(
     assert (
         len({receipt["products"]["raw_coarse"] for receipt in receipts}) == 2
     )  # one for each visit: here both fields are one scene
-    assert [finding for finding in archive.verify_all() if finding.problem] == []
+    assert [finding for finding in verify_archive(archive) if finding.problem] == []
 
 
 def test_the_picture_of_an_artifact_is_small(survey_png: Any, tmp_path: Path) -> None:

@@ -17,8 +17,8 @@ from flows.survey.run import SurveyRun, open_run
 from models.reading.regions import Region, plan_regions
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
-from storage.arrays.attention import load_attention
 from storage.arrays.class_maps import ClassNames, create_class_map, load_class_map
+from storage.arrays.mosaics import load_attention
 from storage.parallel.crew import Crew
 
 Survey = Callable[..., object]

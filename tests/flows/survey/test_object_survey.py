@@ -173,7 +173,7 @@ def test_a_bucket_that_cannot_be_reached_is_one_error(
     missing = command_line("survey", "--out", "s3://no-such-bucket/x", *SMALL)
     assert missing.code == 1
     assert "there is no such bucket: create it" in missing.errors[0]
-    monkeypatch.setattr("storage.remote.object_places.RETRIES", 0)
+    monkeypatch.setattr("storage.remote.object_stores.RETRIES", 0)
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
     silent = command_line("ls", bucket)
     assert silent.code == 1

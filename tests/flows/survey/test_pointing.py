@@ -21,7 +21,7 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.simulator.effects.pointing import PointingErrors
 from storage.archive.archive import StageRef
 from storage.arrays.layout import open_group, read_array
-from storage.arrays.patches import PatchWriter
+from storage.arrays.mosaics import PatchWriter
 
 OFF_PX, SEED = 6.0, 0
 BANDS = ",".join(str(band) for band in range(4, 270, 9))  # the fewest that reach all the weights' columns

@@ -29,6 +29,7 @@ from pipeline.errors import ArchiveError, RigError
 from storage.archive.archive import Archive
 from storage.archive.ledger import Ledger
 from storage.arrays.class_maps import load_class_map
+from storage.remote.opening import verify_archive
 from tests.flows.conftest import Ended
 
 CAPTURES = ("capture_coarse", "capture_fine")
@@ -62,7 +63,7 @@ def failing(stage: str, error: Exception, tried: Callable[[], None] = lambda: No
 
 def problems(out: Path) -> list[Any]:
     """What a full verification of an archive finds."""
-    return [finding for finding in Archive.open(out).verify_all() if finding.problem]
+    return [finding for finding in verify_archive(Archive.open(out)) if finding.problem]
 
 
 def class_map(out: Path) -> np.ndarray:

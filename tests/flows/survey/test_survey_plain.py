@@ -28,6 +28,7 @@ from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.planning.coverage import on_scene
 from pipeline.simulator.effects.registry import BY_NAME
 from storage.archive.archive import Archive
+from storage.remote.opening import verify_archive
 
 STAGES = [
     "choose_effects",
@@ -182,7 +183,7 @@ def test_second_run_is_read_from_the_archive(survey_png: Any, tmp_path: Path) ->
     assert comparable(first) == comparable(second)
     archive = Archive.open(tmp_path)
     assert len(archive.runs()) == 2
-    assert [finding.problem for finding in archive.verify_all()] == [None] * (len(STAGES) + 2)
+    assert [finding.problem for finding in verify_archive(archive)] == [None] * (len(STAGES) + 2)
     assert not list(tmp_path.glob("spool/*"))
 
 

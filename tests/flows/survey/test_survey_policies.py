@@ -20,7 +20,7 @@ from models.policies.policies import IMAGE_POLICIES, NETWORK_POLICIES, POLICIES,
 from models.reading.regions import plan_regions
 from pipeline.errors import SettingsError
 from storage.archive.archive import StageRef
-from storage.arrays.attention import load_attention
+from storage.arrays.mosaics import load_attention
 
 FREE = [policy for policy in POLICIES if policy not in ("mask", *NETWORK_POLICIES)]
 

@@ -19,6 +19,7 @@ from flows.survey.survey import STAGES
 from flows.terminal.termination import Terminated
 from pipeline.errors import RigError, SceneError
 from storage.archive.archive import Archive
+from storage.remote.opening import verify_archive
 from tests.flows.conftest import CommandLine
 from tests.flows.stage_doubles import act_instead
 
@@ -133,7 +134,7 @@ def test_the_run_is_published_before_its_map_is_judged(
     published = survey_png(tmp_path, engine="prefect")
     assert published.folder == run
     assert published.receipt["accuracy_is"] == "judged"
-    assert [finding.problem for finding in Archive.open(tmp_path).verify_all() if finding.problem] == []
+    assert [finding.problem for finding in verify_archive(Archive.open(tmp_path)) if finding.problem] == []
 
 
 def test_sigterm_in_a_stage(

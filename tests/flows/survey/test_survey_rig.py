@@ -50,6 +50,7 @@ from pipeline.source import References
 from storage.archive.archive import Archive
 from storage.arrays.class_maps import load_class_map
 from storage.arrays.cubes import open_raw_cube
+from storage.remote.opening import verify_archive
 from tests.conftest import patchy_scene
 from tests.flows.conftest import CommandLine
 
@@ -213,7 +214,7 @@ def test_pulses_of_frames_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     truth = run_survey(small_settings(tmp_path / "sim", effects="none"), QUIET)
     alike = class_map_of(published, tmp_path) == class_map_of(truth, tmp_path / "sim")
     assert alike.mean() > 0.9
-    assert {finding.kind for finding in Archive.open(tmp_path).verify_all()} == {"whole"}
+    assert {finding.kind for finding in verify_archive(Archive.open(tmp_path))} == {"whole"}
 
 
 def test_log_beside_pulses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -226,7 +227,7 @@ def test_log_beside_pulses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assert record["rig"]["log_pulses"]
     assert [one["method"] for one in record["captures"]] == ["log"]
     assert all(one["drift_ppm"] is not None and one["residual_px"] < 2 for one in record["captures"])
-    assert {finding.kind for finding in Archive.open(tmp_path).verify_all()} == {"whole"}
+    assert {finding.kind for finding in verify_archive(Archive.open(tmp_path))} == {"whole"}
 
 
 def test_what_the_rig_is_at_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -264,7 +265,7 @@ def test_visits_are_captured_and_broken_ones_gone_on_with(tmp_path: Path, monkey
         assert not list((tmp_path / "spool").iterdir())
         run_survey(replace(settings, visit="second"), QUIET)
         assert coarse_captures(rig) == 2
-    assert {finding.kind for finding in Archive.open(tmp_path).verify_all()} == {"whole"}
+    assert {finding.kind for finding in verify_archive(Archive.open(tmp_path))} == {"whole"}
 
 
 def test_fields_that_differ_in_name_alone_are_captured_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import json
 import os
 import threading
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
+import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from pipeline.errors import ArchiveError, IncompleteStoreError
-from storage.archive.archive import Archive, stage_key
+from pipeline.geometry.scan import Sweep
+from storage.archive import manifests, staging
+from storage.archive.archive import Archive
+from storage.archive.keys import canonical_json, stage_key
+from storage.archive.manifests import read_table
 from storage.archive.staging import take_lock
+from storage.remote.opening import verify_archive
 
 
 def _publish(archive: Archive, key: str = "abc", text: str = "content") -> Path:
@@ -42,9 +52,8 @@ def test_a_store_is_found_with_its_manifest(tmp_path: Path) -> None:
     assert archive.refs() == [ref]
 
 
-def test_a_failed_stage_leaves_nothing(tmp_path: Path) -> None:
+def test_a_failed_stage_leaves_nothing(tmp_path: Path, archive: Archive) -> None:
     """The error passes, the staged folder goes, the key stays free."""
-    archive = Archive.open(tmp_path)
 
     def fail(path: Path) -> None:
         (path / "a").write_text("half")
@@ -57,9 +66,8 @@ def test_a_failed_stage_leaves_nothing(tmp_path: Path) -> None:
     assert list((tmp_path / ".locks").iterdir()) == []
 
 
-def test_a_dead_runs_rest_is_reclaimed(tmp_path: Path) -> None:
+def test_a_dead_runs_rest_is_reclaimed(tmp_path: Path, archive: Archive) -> None:
     """A .part folder of a dead process is not seen, and is gone after the next publication or reclaim."""
-    archive = Archive.open(tmp_path)
     for key in ("abc", "def"):
         (tmp_path / "stages" / "mosaic" / f"{key}.part").mkdir(parents=True)
         (tmp_path / "stages" / "mosaic" / f"{key}.part" / "old").write_text("x")
@@ -70,9 +78,8 @@ def test_a_dead_runs_rest_is_reclaimed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("victim", ["b.bin", "inner/a.txt"])
-def test_one_changed_byte_is_named(tmp_path: Path, victim: str) -> None:
+def test_one_changed_byte_is_named(archive: Archive, victim: str) -> None:
     """Verification names the file; so does it for a missing, a grown and an extra one."""
-    archive = Archive.open(tmp_path)
     path = _publish(archive)
     content = bytearray((path / victim).read_bytes())
     content[len(content) // 2] ^= 4
@@ -81,12 +88,11 @@ def test_one_changed_byte_is_named(tmp_path: Path, victim: str) -> None:
     assert ref is not None
     with pytest.raises(IncompleteStoreError, match=rf"{victim} has changed since it was published"):
         archive.verify(ref)
-    assert [finding.problem is None for finding in archive.verify_all() if finding.uri == ref.uri] == [False]
+    assert [finding.problem is None for finding in verify_archive(archive) if finding.uri == ref.uri] == [False]
 
 
-def test_missing_short_and_extra_files_are_named(tmp_path: Path) -> None:
+def test_missing_short_and_extra_files_are_named(archive: Archive) -> None:
     """find sees files that are missing or short; verify also those that are too many."""
-    archive = Archive.open(tmp_path)
     path = _publish(archive)
     ref = archive.refs()[0]
     (path / "extra").write_text("x")
@@ -102,17 +108,42 @@ def test_missing_short_and_extra_files_are_named(tmp_path: Path) -> None:
     assert archive.find("mosaic", "abc") is None
 
 
-def test_a_torn_manifest_is_an_incomplete_store(tmp_path: Path) -> None:
+def test_a_torn_manifest_is_an_incomplete_store(archive: Archive) -> None:
     """A manifest that is no JSON is said to be invalid."""
-    archive = Archive.open(tmp_path)
     (_publish(archive) / "manifest.json").write_text('{"files": ')
     with pytest.raises(IncompleteStoreError, match=r"no valid manifest\.json"):
         archive.find("mosaic", "abc")
 
 
-def test_two_same_runs_make_one_store(tmp_path: Path) -> None:
+@pytest.mark.parametrize("change", [lambda text: text + " ", lambda text: text.replace(": ", ":  ", 1)])
+def test_every_byte_of_a_manifest_counts(archive: Archive, change: Callable[[str], str]) -> None:
+    """Also one that means nothing to JSON."""
+    path = _publish(archive) / "manifest.json"
+    path.write_text(change(path.read_text()))
+    with pytest.raises(IncompleteStoreError, match="its seal does not fit"):
+        archive.find("mosaic", "abc")
+
+
+def test_a_store_is_on_the_disk_before_and_after_it_gets_its_name(
+    archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Files, manifest and folders first, then the name, then the folder that holds the name."""
+    told, rename = list[str](), Path.rename
+
+    def renamed(self: Path, to: Path) -> Path:
+        told.append(f"rename {self.name}")
+        return rename(self, to)
+
+    monkeypatch.setattr(Path, "rename", renamed)
+    for module in (staging, manifests):
+        monkeypatch.setattr(module, "sync_path", lambda path: told.append(path.name))
+    _publish(archive)
+    assert told[:3] == ["b.bin", "a.txt", "manifest.json"]
+    assert told[3:] == ["inner", "abc.part", "stages", "rename abc.part", "mosaic"]
+
+
+def test_two_same_runs_make_one_store(tmp_path: Path, archive: Archive) -> None:
     """Eight threads ask for one key; one builds, seven find it."""
-    archive = Archive.open(tmp_path)
     built: list[Path] = []
     answers: list[bool] = []
 
@@ -133,9 +164,8 @@ def test_two_same_runs_make_one_store(tmp_path: Path) -> None:
     assert archive.find("mosaic", stage_key("mosaic", 1, {"a": 1}, [])) is not None
 
 
-def test_who_ignores_done_harms_nothing(tmp_path: Path) -> None:
+def test_who_ignores_done_harms_nothing(archive: Archive) -> None:
     """Publishing a key again leaves the first store as it was."""
-    archive = Archive.open(tmp_path)
     path = _publish(archive, text="first")
     _publish(archive, text="second")
     assert (path / "inner" / "a.txt").read_text() == "first"
@@ -174,9 +204,10 @@ def test_a_refusing_disk_is_told_at_once(
 
 
 @pytest.mark.parametrize("where", ["fsync", "rename", "body"])
-def test_a_full_disk_leaves_the_archive_as_it_was(tmp_path: Path, where: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_leaves_the_archive_as_it_was(
+    tmp_path: Path, archive: Archive, where: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Refused while writing, syncing or renaming: one message, no new store, the old one whole."""
-    archive = Archive.open(tmp_path)
     _publish(archive, key="old")
 
     def refuse(*_: Any) -> None:
@@ -213,9 +244,8 @@ def test_names_that_are_no_names(tmp_path: Path, name: str) -> None:
         Archive.open(tmp_path).find("mosaic", name)
 
 
-def test_a_run_appears_as_a_whole(tmp_path: Path) -> None:
+def test_a_run_appears_as_a_whole(archive: Archive) -> None:
     """Nothing under runs before publication; afterwards every file, verified."""
-    archive = Archive.open(tmp_path)
     with archive.new_run("field 7 / north") as run:
         run.write_file("receipt.json", json.dumps({"survey": "north"}))
         run.write_file("quicklook.png", b"\x89PNG")
@@ -224,12 +254,11 @@ def test_a_run_appears_as_a_whole(tmp_path: Path) -> None:
     assert folder.name == run.id
     assert "field-7-north" in run.id
     assert json.loads((folder / "receipt.json").read_text()) == {"survey": "north"}
-    assert [(finding.uri, finding.problem) for finding in archive.verify_all()] == [(f"runs/{run.id}", None)]
+    assert [(finding.uri, finding.problem) for finding in verify_archive(archive)] == [(f"runs/{run.id}", None)]
 
 
-def test_a_broken_run_leaves_nothing_and_a_live_one_is_not_reclaimed(tmp_path: Path) -> None:
+def test_a_broken_run_leaves_nothing_and_a_live_one_is_not_reclaimed(tmp_path: Path, archive: Archive) -> None:
     """reclaim keeps its hands off what a living process writes."""
-    archive = Archive.open(tmp_path)
 
     def break_off() -> None:
         with archive.new_run("a") as run:
@@ -274,18 +303,16 @@ def test_a_run_begins_in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.Mon
     assert list((tmp_path / ".locks").iterdir()) == []
 
 
-def test_spools_outlive_processes_until_dropped(tmp_path: Path) -> None:
+def test_spools_outlive_processes_until_dropped(tmp_path: Path, archive: Archive) -> None:
     """A spool folder is the same each time it is asked for, and goes when dropped."""
-    archive = Archive.open(tmp_path)
     (archive.spool_folder("k1") / "lines.bil").write_bytes(b"x")
     assert (archive.spool_folder("k1") / "lines.bil").exists()
     archive.drop_spool("k1")
     assert list((tmp_path / "spool").iterdir()) == []
 
 
-def test_runs_of_one_second_are_listed_as_they_were_written(tmp_path: Path) -> None:
+def test_runs_of_one_second_are_listed_as_they_were_written(tmp_path: Path, archive: Archive) -> None:
     """Names in the order of the alphabet would put a later run before an earlier one."""
-    archive = Archive.open(tmp_path)
     names = []
     for name in ("zebra", "apple", "mango"):
         with archive.new_run(name) as draft:
@@ -295,3 +322,91 @@ def test_runs_of_one_second_are_listed_as_they_were_written(tmp_path: Path) -> N
         (tmp_path / "runs" / name).rename(tmp_path / "runs" / same)
         os.utime(tmp_path / "runs" / same / "manifest.json", ns=(number, number))
     assert [path.name.rpartition("-")[2] for path in archive.runs()] == ["zebra", "apple", "mango"]
+
+
+@pytest.fixture
+def table(tmp_path: Path) -> Path:
+    """A table in a store."""
+
+    def build(path: Path) -> None:
+        (path / "plan.json").write_text('{"seats": [1, 2], "share": 0.25}')
+
+    return Archive.open(tmp_path).produce("attend", build, version=1, params={})[0].path / "plan.json"
+
+
+def test_a_table_comes_back(table: Path) -> None:
+    """As it was written."""
+    assert read_table(table) == {"seats": [1, 2], "share": 0.25}
+
+
+@pytest.mark.parametrize("content", ['{"seats": [1, 3], "share": 0.25}', '{"seats": [1, 2], "share": 0.25', ""])
+def test_a_changed_table_is_not_read(table: Path, content: str) -> None:
+    """One other digit is as bad as what is no JSON."""
+    table.write_text(content)
+    with pytest.raises(IncompleteStoreError, match=r"plan\.json has .*verify --repair"):
+        read_table(table)
+
+
+def test_a_missing_or_foreign_table_is_not_read(table: Path) -> None:
+    """Neither what is gone, nor what somebody put there."""
+    (table.parent / "other.json").write_text("{}")
+    with pytest.raises(IncompleteStoreError, match=r"other\.json is in no manifest"):
+        read_table(table.parent / "other.json")
+    table.unlink()
+    with pytest.raises(IncompleteStoreError, match=r"plan\.json cannot be read: it is missing"):
+        read_table(table)
+
+
+PLAIN = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=4), inner, max_size=3),
+    max_leaves=8,
+)
+
+
+@given(st.dictionaries(st.text(max_size=4), PLAIN, max_size=5))
+@settings(max_examples=60, deadline=None)
+def test_order_of_parameters_does_not_count(params: dict[str, object]) -> None:
+    """The same table in another order has the same key."""
+    turned = dict(reversed(params.items()))
+    assert stage_key("mosaic", 1, params, ["a"]) == stage_key("mosaic", 1, turned, ["a"])
+
+
+@given(st.floats(1e-6, 1e6))
+@settings(max_examples=60, deadline=None)
+def test_rounding_noise_does_not_count(value: float) -> None:
+    """A float and the float that its 12 digits give are one parameter; a change in the ninth digit is another."""
+    key = stage_key("plan", 1, {"a": value}, [])
+    assert key == stage_key("plan", 1, {"a": float(f"{value:.12g}")}, [])
+    assert key != stage_key("plan", 1, {"a": value * (1 + 1e-8)}, [])
+
+
+def test_every_part_counts() -> None:
+    """Stage, version, parameters, inputs and their order each change the key."""
+    keys = {
+        stage_key("a", 1, {"p": 1}, ["x", "y"]),
+        stage_key("b", 1, {"p": 1}, ["x", "y"]),
+        stage_key("a", 2, {"p": 1}, ["x", "y"]),
+        stage_key("a", 1, {"p": 2}, ["x", "y"]),
+        stage_key("a", 1, {"p": 1}, ["y", "x"]),
+        stage_key("a", 1, {"p": "1"}, ["x", "y"]),
+    }
+    assert len(keys) == 6
+    assert all(len(key) == 20 and set(key) <= set("0123456789abcdef") for key in keys)
+
+
+def test_kinds_of_the_same_meaning_agree() -> None:
+    """2 and 2.0, lists and tuples, numpy numbers and plain ones, paths and dataclasses."""
+    sweep = Sweep("a", "fine", "x", 0.0, -3.5, 10)
+    assert canonical_json({"a": (1, 2.0, -0.0)}) == canonical_json({"a": [np.int64(1), np.float64(2), 0]})
+    assert canonical_json(sweep) == canonical_json(dataclasses.asdict(sweep))
+    assert canonical_json([Path("a/b"), {3, 1}]) == '["a/b",[1,3]]'
+    assert canonical_json(float("nan")) == '"nan"'
+    assert canonical_json(np.ones(3)) != canonical_json(np.ones(3, np.float32))
+
+
+def test_what_has_no_lasting_text_is_refused() -> None:
+    """A function or a bare object cannot be part of a key."""
+    for value in (test_every_part_counts, object(), np.array([None])):
+        with pytest.raises(ArchiveError, match="cannot be part of a key"):
+            stage_key("a", 1, {"p": value}, [])

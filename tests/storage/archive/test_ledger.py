@@ -11,6 +11,7 @@ import pytest
 from pipeline.errors import ArchiveError
 from storage.archive.archive import Archive
 from storage.archive.ledger import Ledger, ledgers
+from storage.remote.opening import verify_archive
 
 
 def test_lines_come_back_in_order(tmp_path: Path) -> None:
@@ -37,30 +38,28 @@ def test_a_torn_line_loses_nothing_else(tmp_path: Path, torn: bytes) -> None:
     assert numbers[-1] == 2
 
 
-def test_a_line_that_has_changed_is_told_by_its_number(tmp_path: Path) -> None:
+def test_a_line_that_has_changed_is_told_by_its_number(archive: Archive) -> None:
     """The others are read, and so is what follows; a last line that is torn is no change."""
-    archive = Archive.open(tmp_path)
     ledger = Ledger(archive.root, "north")
     for number in range(3):
         ledger.append({"number": number})
     whole = ledger.path.read_bytes()
     ledger.path.write_bytes(whole.replace(b'"number": 1', b'"number": 9') + b'{"number": 3, "wo')
     assert [line["number"] for line in ledger.lines()] == [0, 2]
-    found = [one for one in archive.verify_all() if one.problem is not None]
+    found = [one for one in verify_archive(archive) if one.problem is not None]
     told = "line 2 has changed since it was written; the other lines are read"
     assert [(one.uri, one.problem, one.kind) for one in found] == [("schedule/north.jsonl", told, "growing")]
 
 
-def test_a_ledger_without_checksums_is_read(tmp_path: Path) -> None:
+def test_a_ledger_without_checksums_is_read(archive: Archive) -> None:
     """As an earlier version wrote it; lines that are added have them."""
-    archive = Archive.open(tmp_path)
     ledger = Ledger(archive.root, "north")
     ledger.path.parent.mkdir()
     ledger.path.write_bytes(b'{"number": 0}\n{"number": 1}\n')
     ledger.append({"number": 2})
     assert [line["number"] for line in ledger.lines()] == [0, 1, 2]
     assert ledger.path.read_bytes().count(b'"check"') == 1
-    assert not any(one.problem for one in archive.verify_all())
+    assert not any(one.problem for one in verify_archive(archive))
 
 
 @pytest.mark.parametrize("kind", ["link", "pipe"])
@@ -75,7 +74,7 @@ def test_a_link_or_a_pipe_is_no_ledger(tmp_path: Path, kind: str) -> None:
         with pytest.raises(ArchiveError, match=f"it is a {kind}, expected a file"):
             use()
     assert away.read_bytes() == b""
-    (found,) = (one for one in archive.verify_all() if one.problem is not None)
+    (found,) = (one for one in verify_archive(archive) if one.problem is not None)
     assert (found.uri, found.kind) == ("schedule/north.jsonl", "stray")
     assert f"is a {kind}, expected a file" in str(found.problem)
 

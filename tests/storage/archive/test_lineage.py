@@ -10,30 +10,35 @@ import pytest
 
 from pipeline.errors import ArchiveError
 from storage.archive.archive import Archive
-from storage.archive.changes import ABSENT, Change, changes_between, flatten, version_before
-from storage.archive.lineage import Catalogue, rests_on
-from storage.archive.product_names import find_product
+from storage.archive.lineage import (
+    ABSENT,
+    Catalogue,
+    Change,
+    changes_between,
+    find_product,
+    flatten,
+    rests_on,
+    version_before,
+)
 from storage.archive.records import Run
+from storage.remote.opening import verify_archive
 from tests.storage.small_archive import flip, small_survey
 
 
-def test_inputs_and_dependents_are_followed_all_the_way(tmp_path: Path) -> None:
+def test_inputs_and_dependents_are_followed_all_the_way(tmp_path: Path, archive: Archive) -> None:
     """A map rests on its mosaic and, through it and directly, on the raw lines."""
-    archive = Archive.open(tmp_path)
     small = small_survey(archive)
     catalogue = Catalogue.read(tmp_path)
     assert catalogue.ancestors([small.map.uri]) == {small.mosaic.uri, small.raw.uri}
     assert catalogue.dependents([small.raw.uri]) == {small.mosaic.uri, small.map.uri}
     assert catalogue.inputs_first(catalogue.stores) == [small.raw.uri, small.mosaic.uri, small.map.uri]
     assert [ref.uri for ref in rests_on(tmp_path, [small.mosaic])] == [small.raw.uri, small.mosaic.uri]
-    assert small.run is not None
     assert [run.folder for run in catalogue.named_by(small.raw.uri)] == [small.run]
     assert catalogue.roles(small.raw.uri) == {"capture_coarse"}
 
 
-def test_a_store_tells_what_its_making_took(tmp_path: Path) -> None:
+def test_a_store_tells_what_its_making_took(archive: Archive) -> None:
     """Seconds, work and bytes; none of a manifest of before."""
-    archive = Archive.open(tmp_path)
     small = small_survey(archive)
     cost = archive.cost(small.map)
     assert cost is not None
@@ -46,9 +51,8 @@ def test_a_store_tells_what_its_making_took(tmp_path: Path) -> None:
     assert archive.find("segment", small.map.key) == small.map
 
 
-def test_work_that_is_no_amount_is_refused(tmp_path: Path) -> None:
+def test_work_that_is_no_amount_is_refused(archive: Archive) -> None:
     """It would spoil every estimate made of it."""
-    archive = Archive.open(tmp_path)
     with pytest.raises(ArchiveError, match="work is nan"), archive.publish("segment", "key", work=float("nan")):
         pass
     assert archive.refs() == []
@@ -68,9 +72,8 @@ def test_work_that_is_no_amount_is_refused(tmp_path: Path) -> None:
         '{"files": {}, "format": 2}',
     ],
 )
-def test_any_manifest_can_be_read_or_is_told_damaged(tmp_path: Path, content: str) -> None:
+def test_any_manifest_can_be_read_or_is_told_damaged(tmp_path: Path, archive: Archive, content: str) -> None:
     """Nothing a manifest says ends in a traceback, or in reading a file elsewhere."""
-    archive = Archive.open(tmp_path)
     small = small_survey(archive)
     (small.mosaic.path / "manifest.json").write_text(content)
     catalogue = Catalogue.read(tmp_path)
@@ -78,14 +81,13 @@ def test_any_manifest_can_be_read_or_is_told_damaged(tmp_path: Path, content: st
     assert problem is not None
     assert problem.startswith("manifest.json cannot be believed")
     assert catalogue.inputs_of(small.mosaic.uri) == []
-    broken = [one.uri for one in archive.verify_all() if one.problem is not None]
+    broken = [one.uri for one in verify_archive(archive) if one.problem is not None]
     assert broken == [small.mosaic.uri]
 
 
 @pytest.mark.parametrize("inputs", [7, "abc", [3, None], {"a": 5}, ["nowhere", "stages/rectify/nowhere"]])
-def test_odd_inputs_are_borne(tmp_path: Path, inputs: object) -> None:
+def test_odd_inputs_are_borne(tmp_path: Path, archive: Archive, inputs: object) -> None:
     """Of a manifest of before, which has no seal, anything may be found."""
-    archive = Archive.open(tmp_path)
     small = small_survey(archive)
     path = small.map.path / "manifest.json"
     content = json.loads(path.read_text())
@@ -97,12 +99,11 @@ def test_odd_inputs_are_borne(tmp_path: Path, inputs: object) -> None:
     catalogue = Catalogue.read(tmp_path)
     assert catalogue.dependents([small.map.uri]) == set()
     assert version_before(catalogue, small.map.uri) is None
-    assert all(isinstance(one.uri, str) for one in archive.verify_all())
+    assert all(isinstance(one.uri, str) for one in verify_archive(archive))
 
 
-def test_what_changed_is_followed_to_where_it_began(tmp_path: Path) -> None:
+def test_what_changed_is_followed_to_where_it_began(tmp_path: Path, archive: Archive) -> None:
     """The map has another mosaic, which has another kernel; the version before is that of the same scene and part."""
-    archive = Archive.open(tmp_path)
     first, _, second = (small_survey(archive, kernel=kernel) for kernel in ("bilinear", "nearest", "catmull-rom"))
     catalogue = Catalogue.read(tmp_path)
     before = version_before(catalogue, second.map.uri)
@@ -116,9 +117,8 @@ def test_what_changed_is_followed_to_where_it_began(tmp_path: Path) -> None:
     assert version_before(catalogue, first.map.uri) is None
 
 
-def test_versions_and_libraries_count_as_changes(tmp_path: Path) -> None:
+def test_versions_and_libraries_count_as_changes(tmp_path: Path, archive: Archive) -> None:
     """A stage that got a new version, and parameters that came and went."""
-    archive = Archive.open(tmp_path)
     for key, version, params in (("one", 1, {"a": {"b": 1}, "c": 2}), ("two", 2, {"a": {"b": 3}, "d": [1, 2]})):
         with archive.publish("segment", key, version=version, params=params):
             pass
@@ -133,9 +133,10 @@ def test_versions_and_libraries_count_as_changes(tmp_path: Path) -> None:
     ]
 
 
-def test_raw_lines_of_which_nobody_says_where_they_come_from_are_the_only_copy(tmp_path: Path) -> None:
+def test_raw_lines_of_which_nobody_says_where_they_come_from_are_the_only_copy(
+    tmp_path: Path, archive: Archive
+) -> None:
     """The simulator's say so, by a run or by their own parameters; one run of a rig is enough against all others."""
-    archive = Archive.open(tmp_path)
     for key, params in (("bare", {}), ("light", {"effects": []}), ("rig", {"effects": [], "source": "rig"})):
         with archive.publish("capture", key, params=params):
             pass
@@ -164,11 +165,9 @@ def test_nested_parameters_have_dotted_names() -> None:
     }
 
 
-def test_products_go_by_many_names(tmp_path: Path) -> None:
+def test_products_go_by_many_names(tmp_path: Path, archive: Archive) -> None:
     """Address, address of a file in it, stage and key, beginning of a key, run, and name in the newest run."""
-    archive = Archive.open(tmp_path)
     small = small_survey(archive)
-    assert small.run is not None
     catalogue = Catalogue.read(tmp_path)
     key = small.map.key
     for text in (small.map.uri, f"{small.map.uri}/class_map.zarr/", f"segment/{key}", key, key[:8], "class_map"):
@@ -179,9 +178,8 @@ def test_products_go_by_many_names(tmp_path: Path) -> None:
         assert found.folder == small.run
 
 
-def test_the_latest_run_goes_by_that_name(tmp_path: Path) -> None:
+def test_the_latest_run_goes_by_that_name(tmp_path: Path, archive: Archive) -> None:
     """As export and compare have it."""
-    archive = Archive.open(tmp_path)
     small_survey(archive)
     second = small_survey(archive).run
     found = find_product(Catalogue.read(tmp_path), "latest")
@@ -197,9 +195,8 @@ def test_without_a_run_stores_are_offered(tmp_path: Path) -> None:
         find_product(Catalogue.read(tmp_path), "mosaic")
 
 
-def test_a_stage_narrows_the_beginning_of_a_key(tmp_path: Path) -> None:
+def test_a_stage_narrows_the_beginning_of_a_key(tmp_path: Path, archive: Archive) -> None:
     """With and without the word stages; what is still two keys is refused with both."""
-    archive = Archive.open(tmp_path)
     for stage, key in (("rectify", "abcd1"), ("segment", "abcd1"), ("segment", "abcd2"), ("segment", "abce3")):
         with archive.publish(stage, key):
             pass
@@ -218,19 +215,16 @@ def test_a_stage_narrows_the_beginning_of_a_key(tmp_path: Path) -> None:
         find_product(Catalogue.read(tmp_path), "abc")
 
 
-def test_a_products_name_is_of_the_newest_run_that_can_be_read(tmp_path: Path) -> None:
+def test_a_products_name_is_of_the_newest_run_that_can_be_read(tmp_path: Path, archive: Archive) -> None:
     """A damaged one after it does not hide it."""
-    archive = Archive.open(tmp_path)
     made = [small_survey(archive, seed=seed) for seed in range(3)]
     assert find_product(Catalogue.read(tmp_path), "class_map") == made[2].map.uri
-    assert made[2].run is not None
     flip(made[2].run / "receipt.json")
     assert find_product(Catalogue.read(tmp_path), "class_map") == made[1].map.uri
 
 
-def test_a_version_before_is_of_the_same_scene_and_can_be_read(tmp_path: Path) -> None:
+def test_a_version_before_is_of_the_same_scene_and_can_be_read(tmp_path: Path, archive: Archive) -> None:
     """The newest of those; a store that says no scene may be of any."""
-    archive = Archive.open(tmp_path)
     for key, params in (
         ("old1", {}),
         ("old2", {"scene": "a"}),
@@ -268,11 +262,9 @@ def test_what_is_no_product_is_refused(tmp_path: Path, text: str, words: str) ->
         find_product(Catalogue.read(tmp_path), text)
 
 
-def test_a_damaged_receipt_names_what_its_manifest_recorded(tmp_path: Path) -> None:
+def test_a_damaged_receipt_names_what_its_manifest_recorded(tmp_path: Path, archive: Archive) -> None:
     """The receipt's own words do not count any more."""
-    archive = Archive.open(tmp_path)
     small = small_survey(archive)
-    assert small.run is not None
     flip(small.run / "receipt.json")
     (run,) = Catalogue.read(tmp_path).runs
     assert run.receipt == {}
@@ -283,7 +275,6 @@ def test_a_damaged_receipt_names_what_its_manifest_recorded(tmp_path: Path) -> N
 def test_a_receipt_that_reads_well_but_has_changed_is_not_believed(tmp_path: Path) -> None:
     """One digit of it is another."""
     small = small_survey(Archive.open(tmp_path))
-    assert small.run is not None
     receipt = small.run / "receipt.json"
     receipt.write_text(receipt.read_text().replace('"seed": 0', '"seed": 7'))
     (run,) = Catalogue.read(tmp_path).runs
@@ -291,9 +282,8 @@ def test_a_receipt_that_reads_well_but_has_changed_is_not_believed(tmp_path: Pat
     assert "receipt.json has changed since it was published" in str(run.problem)
 
 
-def test_a_run_names_the_stores_of_its_stages(tmp_path: Path) -> None:
+def test_a_run_names_the_stores_of_its_stages(tmp_path: Path, archive: Archive) -> None:
     """Receipts of before name some by their keys alone."""
-    archive = Archive.open(tmp_path)
     small = small_survey(archive, named=False)
     with archive.new_run("farm") as draft:
         draft.write_file("receipt.json", json.dumps({"stages": [{"name": "draw_map", "key": small.map.key}]}))
@@ -302,9 +292,8 @@ def test_a_run_names_the_stores_of_its_stages(tmp_path: Path) -> None:
     assert [run.uri for run in catalogue.named_by(small.raw.uri)] == [catalogue.runs[0].uri]
 
 
-def test_settings_are_those_of_the_manifest_where_it_has_any(tmp_path: Path) -> None:
+def test_settings_are_those_of_the_manifest_where_it_has_any(tmp_path: Path, archive: Archive) -> None:
     """They are there even where the receipt is damaged."""
-    archive = Archive.open(tmp_path)
     with archive.new_run("farm") as draft:
         draft.write_file("receipt.json", json.dumps({"settings": {"seed": 1}}))
         draft.publish(settings={"seed": 2})
@@ -313,9 +302,8 @@ def test_settings_are_those_of_the_manifest_where_it_has_any(tmp_path: Path) -> 
     assert Catalogue.read(tmp_path).runs[0].settings == {"seed": 2}
 
 
-def test_a_run_that_is_no_table_is_borne(tmp_path: Path) -> None:
+def test_a_run_that_is_no_table_is_borne(tmp_path: Path, archive: Archive) -> None:
     """Receipts of any shape are read."""
-    archive = Archive.open(tmp_path)
     for receipt in ("[1, 2]", '{"stages": [3, {"key": 4}], "products": 5, "settings": null}', '"text"'):
         with archive.new_run("odd") as draft:
             draft.write_file("receipt.json", receipt)

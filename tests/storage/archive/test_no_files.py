@@ -13,6 +13,7 @@ from pipeline.errors import ArchiveError, IncompleteStoreError
 from storage.archive.archive import Archive
 from storage.archive.records import read_run
 from storage.maintenance.garbage import clear_up
+from storage.remote.opening import verify_archive
 from tests.storage.small_archive import Small, small_survey
 
 ELSEWHERE = "elsewhere"  # beside the archive
@@ -81,7 +82,6 @@ def pipe_store(small: Small) -> str:
 
 def pipe_receipt(small: Small) -> str:
     """A pipe in place of a run's receipt."""
-    assert small.run is not None
     (small.run / "receipt.json").unlink()
     os.mkfifo(small.run / "receipt.json")
     return f"runs/{small.run.name}"
@@ -89,14 +89,12 @@ def pipe_receipt(small: Small) -> str:
 
 def link_run(small: Small) -> str:
     """A run replaced by a link to itself, outside."""
-    assert small.run is not None
     small.run.symlink_to(away(small.run))
     return f"runs/{small.run.name}"
 
 
 def link_run_manifest(small: Small) -> str:
     """A run's manifest replaced by a link that leads nowhere."""
-    assert small.run is not None
     (small.run / "manifest.json").unlink()
     (small.run / "manifest.json").symlink_to("nowhere")
     return f"runs/{small.run.name}"
@@ -133,7 +131,7 @@ def test_verify_tells_it_by_name(case: Case, tmp_path: Path) -> None:
     archive = Archive.open(tmp_path / "archive")
     small = small_survey(archive)
     uri = case(small)
-    told = [(one.uri, str(one.problem)) for one in archive.verify_all() if one.problem is not None]
+    told = [(one.uri, str(one.problem)) for one in verify_archive(archive) if one.problem is not None]
     kind = case.__name__.partition("_")[0]
     assert any(f"is a {kind}" in problem for _, problem in told), told
     assert {place for place, _ in told} == {uri}
@@ -159,19 +157,17 @@ def test_readers_end(case: Case, tmp_path: Path) -> None:
     assert (sorted(path.name for path in outside.rglob("*")) if outside.is_dir() else outside.exists()) == before
 
 
-def test_a_copied_run_is_told(tmp_path: Path) -> None:
+def test_a_copied_run_is_told(archive: Archive) -> None:
     """By the name of the copy, and which run it is of; a run under another name as well."""
-    archive = Archive.open(tmp_path)
     small = small_survey(archive)
-    assert small.run is not None
     copy = shutil.copytree(small.run, small.run.with_name(f"{small.run.name}-copy"))
-    (found,) = (one for one in archive.verify_all() if one.problem is not None)
+    (found,) = (one for one in verify_archive(archive) if one.problem is not None)
     assert (found.uri, found.kind) == (f"runs/{copy.name}", "stray")
     assert (
         found.problem == f"its manifest.json is that of runs/{small.run.name}; it is a copy: take it out of the archive"
     )
     shutil.rmtree(small.run)
-    (found,) = (one for one in archive.verify_all() if one.problem is not None)
+    (found,) = (one for one in verify_archive(archive) if one.problem is not None)
     assert str(found.problem).endswith(f"is that of runs/{small.run.name}; give it its name back")
 
 

@@ -21,6 +21,7 @@ from storage.archive.archive import Archive, StageRef
 from storage.archive.manifests import listed_bytes, manifest_sha256, read_manifest, write_manifest
 from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
 from storage.readers.scan_files import open_cube_source
+from storage.remote.opening import verify_archive
 from tests.storage.small_archive import flip
 
 LINES = np.random.default_rng(1).poisson(400, (37, 40, 6)).astype(np.uint16)
@@ -100,7 +101,7 @@ def test_packed_lines_are_read_where_pcodec_is_installed(archive: Archive) -> No
     """The numbers are those of before; neither verify nor the run that knew the old manifest finds anything wrong."""
     np.testing.assert_array_equal(open_raw_cube(_cube(archive)).read(), LINES)
     np.testing.assert_array_equal(open_cube_source(str(_cube(archive))).read(0, 37), LINES)
-    assert [one.problem for one in archive.verify_all()] == [None, None]
+    assert [one.problem for one in verify_archive(archive)] == [None, None]
     (ref,) = archive.refs()
     manifest = archive.manifest(ref)
     assert archive.stored_bytes(ref) == manifest["packed"]["bytes_before"] != listed_bytes(manifest)
@@ -118,7 +119,7 @@ def test_without_pcodec_reading_says_what_is_missing(archive: Archive) -> None:
 @pytest.mark.usefixtures("without_pcodec")
 def test_verify_tells_of_what_cannot_be_read(archive: Archive, capsys: pytest.CaptureFixture[str]) -> None:
     """Such a store is whole, but named; the rest of the archive is read, and a repair leaves it as it is."""
-    found = {one.uri.split("/")[0]: one for one in archive.verify_all()}
+    found = {one.uri.split("/")[0]: one for one in verify_archive(archive)}
     assert (found["runs"].kind, found["stages"].kind) == ("whole", "unreadable")
     before = read_manifest(_cube(archive).parent)
     assert run_verify(archive.root, Console(quiet=True)) == 1
@@ -130,8 +131,8 @@ def test_verify_tells_of_what_cannot_be_read(archive: Archive, capsys: pytest.Ca
 def test_damage_is_named_with_and_without_pcodec(archive: Archive, request: pytest.FixtureRequest) -> None:
     """A flipped bit is found by the file's hash; where no codec is, nothing is said of the chunks."""
     flip(_cube(archive) / "dn/c/0/0/0", 500)
-    (problem,) = [one.problem for one in archive.verify_all() if one.problem is not None]
+    (problem,) = [one.problem for one in verify_archive(archive) if one.problem is not None]
     assert "unreadable: lines 0 to 31, samples 0 to 31" in problem
     request.getfixturevalue("without_pcodec")
-    (problem,) = [one.problem for one in archive.verify_all() if one.problem is not None]
+    (problem,) = [one.problem for one in verify_archive(archive) if one.problem is not None]
     assert problem.endswith("dn/c/0/0/0 has changed since it was published (its SHA-256 differs)")

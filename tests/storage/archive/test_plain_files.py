@@ -8,7 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from storage.archive.plain_files import NotPlainError, kind_of, open_plain, plain_size, read_plain
+from pipeline.errors import SceneError
+from storage.archive.staging import MOST_BYTES, NotPlainError, kind_of, open_plain, plain_size, read_plain, read_toml
+from storage.readers.scene_toml import load_scene_settings
 
 
 def make(kind: str, path: Path) -> None:
@@ -56,3 +58,40 @@ def test_a_file_is_read(tmp_path: Path) -> None:
     assert plain_size(tmp_path / "linked" / "x") == 7
     assert kind_of(tmp_path / "linked") == "a link"
     assert kind_of(tmp_path / "nothing") is None
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        (b"seed = " + b"9" * 5000, "a number of more than 4300 digits"),
+        (b"seed = " + b"[" * 10_000 + b"]" * 10_000, "nested too deeply"),
+        (b"seed = ", "Invalid value"),
+        (b"name = '\xff'", "can't decode byte 0xff"),
+        (b"#" * (MOST_BYTES + 1), "settings have a few thousand"),
+        (None, "no plain file"),
+    ],
+)
+def test_what_cannot_be_read_is_said_in_a_sentence(tmp_path: Path, content: bytes | None, why: str) -> None:
+    """Endless digits, nesting without end, a pipe that nobody writes to: none hangs, none is another error."""
+    path = tmp_path / "scene.toml"
+    if content is None:
+        os.mkfifo(path)
+    else:
+        path.write_bytes(content)
+    with pytest.raises(ValueError, match=why):
+        read_toml(path)
+    with pytest.raises(SceneError, match="cannot be read as TOML"):
+        load_scene_settings(path)
+
+
+def test_a_byte_order_mark_is_passed_over(tmp_path: Path) -> None:
+    """Some editors write one."""
+    path = tmp_path / "survey.toml"
+    path.write_bytes(b"\xef\xbb\xbfseed = 1\r\n")
+    assert read_toml(path) == {"seed": 1}
+
+
+def test_a_device_is_no_file() -> None:
+    """It would never end."""
+    with pytest.raises(ValueError, match="no plain file"):
+        read_toml(Path("/dev/zero"))

@@ -19,9 +19,10 @@ from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 from storage.archive.manifests import read_manifest, write_manifest
 from storage.archive.records import read_run
+from storage.archive.run_folders import try_exchange
 from storage.archive.staging import PART_SUFFIX
 from storage.maintenance.garbage import clear_up
-from tests.storage.small_archive import Small, small_survey
+from tests.storage.small_archive import small_survey
 from tests.storage.small_bucket import FIRST, SECOND, Machine, problems
 
 ROOT = Path(__file__).parents[3]
@@ -247,16 +248,10 @@ def test_verify_under_way_takes_an_extension_for_no_damage(archive: Archive, mon
 # --- in a bucket ------------------------------------------------------------------------------------------------------
 
 
-def _survey(archive: Archive) -> Small:
-    made = small_survey(archive)
-    assert made.run is not None
-    return made
-
-
 def test_an_extension_reaches_other_machines(machine: Machine) -> None:
     """One that has the run already brings what was added; nothing of before is left, and all verifies."""
     archive = machine(FIRST)
-    _survey(archive)
+    small_survey(archive)
     other = machine(SECOND, create=False)
     assert figure_of(other) is None
     extend(archive, run_id(archive))
@@ -269,7 +264,7 @@ def test_an_extension_reaches_other_machines(machine: Machine) -> None:
 def test_killed_before_the_files_of_before_go(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
     """Other machines have what was added, and gc clears those files away."""
     archive = machine(FIRST)
-    _survey(archive)
+    small_survey(archive)
     machine(SECOND, create=False)
 
     def kill(*given: Any) -> None:
@@ -289,7 +284,7 @@ def test_killed_before_the_files_of_before_go(machine: Machine, monkeypatch: pyt
 def test_an_extension_that_could_not_be_uploaded_is_later(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
     """Killed before its manifest is put the bucket has the run as it was; the next time this machine sends the rest."""
     archive = machine(FIRST)
-    _survey(archive)
+    small_survey(archive)
 
     def kill(*given: Any) -> None:
         raise KeyboardInterrupt
@@ -308,7 +303,7 @@ def test_an_extension_that_could_not_be_uploaded_is_later(machine: Machine, monk
 def test_of_two_machines_that_extend_one_run_the_first_stands(machine: Machine) -> None:
     """The other takes it, and both end with the same run."""
     archive = machine(FIRST)
-    _survey(archive)
+    small_survey(archive)
     other = machine(SECOND, create=False)
     extend(archive, run_id(archive), 0.75)
     folder = extend(other, run_id(other), 0.5)
@@ -320,7 +315,7 @@ def test_of_two_machines_that_extend_one_run_the_first_stands(machine: Machine) 
 def test_a_damaged_manifest_in_the_bucket_does_not_reach_the_copy(machine: Machine) -> None:
     """Where a run was extended its manifest is asked for again: what has rotted is not taken."""
     archive = machine(FIRST)
-    _survey(archive)
+    small_survey(archive)
     extend(archive, run_id(archive))
     name = f"runs/{run_id(archive)}/manifest.json"
     archive.objects.write(f"runs/{run_id(archive)}/{'0' * 16}/receipt.json", b"of before, and not cleared away yet")
@@ -329,3 +324,43 @@ def test_a_damaged_manifest_in_the_bucket_does_not_reach_the_copy(machine: Machi
     again = machine(FIRST, create=False)
     assert figure_of(again) == 0.75
     assert any("its seal does not fit" in one for one in problems(again))
+
+
+@pytest.mark.parametrize("name", ["../receipt.json", "/tmp/receipt.json", "a/b", "", ".", "x.part"])
+def test_files_of_a_run_stay_in_it(tmp_path: Path, name: str) -> None:
+    """What could lie elsewhere is refused, and the run is as before."""
+    with Archive.open(tmp_path / "archive").new_run("farm") as draft:
+        with pytest.raises(ArchiveError, match="cannot be a name"):
+            draft.write_file(name, "x")
+        assert list(draft.folder.iterdir()) == []
+    assert [path.name for path in tmp_path.iterdir()] == ["archive"]
+
+
+def test_a_published_run_holds_nothing(tmp_path: Path) -> None:
+    """Also where nobody leaves a block; to abandon it then does nothing."""
+    draft = Archive.open(tmp_path).new_run("farm")
+    draft.write_file("receipt.json", "{}")
+    folder = draft.publish()
+    assert list((tmp_path / ".locks").iterdir()) == []
+    draft.abandon()
+    assert (folder / "receipt.json").read_text() == "{}"
+
+
+def test_a_block_that_fails_publishes_nothing(tmp_path: Path) -> None:
+    """And leaves no folder."""
+    archive = Archive.open(tmp_path)
+    with pytest.raises(TypeError), archive.new_run("farm") as draft:
+        draft.write_file("receipt.json", "{}")["no"]  # type: ignore[index]
+    assert archive.runs() == []
+    assert list((tmp_path / "runs").iterdir()) == []
+
+
+def test_folders_exchange_their_names(tmp_path: Path) -> None:
+    """Each has what the other had; a name that leads nowhere is the system's own error."""
+    for name in "ab":
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "who").write_text(name)
+    assert try_exchange(tmp_path / "a", tmp_path / "b")
+    assert [(tmp_path / name / "who").read_text() for name in "ab"] == ["b", "a"]
+    with pytest.raises(FileNotFoundError):
+        try_exchange(tmp_path / "a", tmp_path / "c")

@@ -6,10 +6,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from numpy.typing import NDArray
 
-from pipeline.errors import ChunkError, ShapeError
-from storage.arrays.layout import round_bits
-from storage.arrays.mosaics import MosaicWriter, load_mosaic
+from pipeline.errors import ChunkError, IncompleteStoreError, SettingsError, ShapeError
+from storage.arrays.layout import CODECS, round_bits, store_in_memory
+from storage.arrays.mosaics import (
+    MosaicWriter,
+    PatchWriter,
+    load_mosaic,
+    mosaic_brightness,
+    mosaic_strips,
+    mosaic_wavelengths,
+    open_patches,
+)
 
 SHAPE = (100, 1300)
 
@@ -78,3 +90,110 @@ def test_a_tile_that_does_not_fit_is_refused(tmp_path: Path) -> None:
     ):
         with pytest.raises(ShapeError, match="the mosaic is"):
             mosaic.write_tile(*at, np.zeros(shape, np.float32), np.zeros(coverage))
+
+
+NM = np.linspace(400, 1000, 17)
+
+
+@pytest.fixture(scope="module")
+def mosaic(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A stored mosaic of 150 x 90 px, a part of it not seen."""
+    path = tmp_path_factory.mktemp("mosaic") / "mosaic.zarr"
+    values = np.random.default_rng(0).random((150, 90, len(NM)), np.float32)
+    values[:20, :30] = np.nan
+    MosaicWriter(path, (150, 90), NM).write_rows(0, values, np.ones((150, 90), np.float32))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns", "heights"),
+    [
+        (slice(None), slice(None), [64, 64, 22]),
+        (slice(10, 130), slice(5, 60), [54, 64, 2]),
+        (slice(70, 71), slice(0, 1), [1]),
+    ],
+)
+def test_strips_make_the_window(mosaic: Path, rows: slice, columns: slice, heights: list[int]) -> None:
+    """They end where shards do, and together are what is stored there."""
+    strips = list(mosaic_strips(mosaic, rows, columns))
+    assert [len(strip) for strip in strips] == heights
+    np.testing.assert_array_equal(np.concatenate(strips), load_mosaic(mosaic).values[rows, columns])
+
+
+def test_brightness_is_the_mean_over_bands(mosaic: Path) -> None:
+    """To the last bit that of the mosaic in memory; NaN where nothing was seen."""
+    np.testing.assert_array_equal(mosaic_brightness(mosaic), load_mosaic(mosaic).values.mean(axis=-1))
+    assert (mosaic_wavelengths(mosaic) == NM).all()
+
+
+def test_a_mosaic_that_is_not_there_is_told(tmp_path: Path) -> None:
+    """Reading begins when the first strip is asked for, and says what is missing."""
+    with pytest.raises(IncompleteStoreError, match="no readable Zarr store"):
+        next(mosaic_strips(tmp_path / "none.zarr"))
+
+
+@pytest.mark.parametrize("entries", [[], [0], [3, 4, 5], [0, 2, 3, 9], list(range(10))])
+def test_patches_are_picked_by_their_numbers(tmp_path: Path, entries: list[int]) -> None:
+    """Runs and single ones come in the order asked for."""
+    values = np.random.default_rng(1).random((10, 4, 4, 2)).astype(np.float16).astype(np.float32)
+    writer = PatchWriter(tmp_path / "p.zarr", np.arange(10), np.zeros((10, 2), int), 4, NM[:2])
+    writer.write(0, values, np.ones((10, 4, 4), np.bool_))
+    store = open_patches(tmp_path / "p.zarr")
+    np.testing.assert_allclose(store.pick(np.array(entries, np.int64)), values[entries], rtol=3e-4)
+    assert (store.wavelength_nm == NM[:2]).all()
+
+
+FLOATS = hnp.arrays(np.float32, st.integers(1, 20), elements=st.floats(width=32))
+
+
+@given(FLOATS)
+@settings(max_examples=100, deadline=None)
+def test_rounding_again_changes_nothing(values: NDArray[np.float32]) -> None:
+    """round(round(x)) is round(x), NaN and infinities and signs included."""
+    once = round_bits(values)
+    np.testing.assert_array_equal(round_bits(once), once)
+    np.testing.assert_array_equal(np.isnan(once), np.isnan(values))
+    np.testing.assert_array_equal(np.isinf(once), np.isinf(values))
+
+
+@given(hnp.arrays(np.float32, 16, elements=st.floats(2.0**-100, 2.0**100, width=32)))
+@settings(max_examples=100, deadline=None)
+def test_error_is_below_half_a_step(values: NDArray[np.float32]) -> None:
+    """The relative error is at most 2^-12, and the last 12 bits of the mantissa are zero."""
+    rounded = round_bits(values)
+    assert (np.abs(rounded.astype(float) - values) <= 2.0**-12 * np.abs(values.astype(float))).all()
+    assert not (rounded.view(np.uint32) & 0xFFF).any()
+
+
+def test_halves_are_rounded_to_even() -> None:
+    """1 + 2^-12 lies in the middle between two numbers of 11 bits, as 1 + 3 * 2^-12 does."""
+    halves = np.array([1 + 2.0**-12, 1 + 3 * 2.0**-12, -1 - 2.0**-12], np.float32)
+    assert round_bits(halves).tolist() == [1.0, 1 + 2.0**-10, -1.0]
+
+
+LINES = np.random.default_rng(0).poisson(300, (40, 70, 9)).astype(np.uint16)
+
+
+@pytest.mark.parametrize("codec", CODECS)
+def test_numbers_come_back(codec: str) -> None:
+    """No codec changes a number."""
+    _, back = store_in_memory(LINES, codec)
+    np.testing.assert_array_equal(back, LINES)
+
+
+def test_without_a_codec_size_is_that_of_the_chunks() -> None:
+    """Whole chunks of 32 x 32 px, and little more for shard indices and checksums."""
+    size, _ = store_in_memory(LINES, "none")
+    chunks = 64 * 96 * 9 * 2
+    assert chunks <= size < 1.01 * chunks
+
+
+def test_bit_planes_compress_better_than_bytes_in_order() -> None:
+    """The default codec holds counts with noise in fewer bytes than plain zstd."""
+    assert store_in_memory(LINES, "zstd-3")[0] < store_in_memory(LINES, "zstd-3 bytes in order")[0] < LINES.nbytes
+
+
+def test_an_unknown_codec_is_refused() -> None:
+    """The message names those there are."""
+    with pytest.raises(SettingsError, match="one of none, lz4-5"):
+        store_in_memory(LINES, "brotli")

@@ -17,13 +17,13 @@ from odc.geo.geobox import GeoBox
 
 from pipeline.errors import ArchiveError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
-from storage.arrays.ground_maps import ClassLegend
+from storage.arrays.class_maps import ClassNames
 from storage.arrays.layout import AngularGrid
 from storage.export.cog_files import ANGULAR, CogImage, Place, cog_problems, need_rasterio, write_cog
 
 rasterio = pytest.importorskip("rasterio", reason="GeoTIFF is written with rasterio, of the extra [geo]")
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
-LEGEND = ClassLegend(
+LEGEND = ClassNames(
     ("sugar beet", "soil & stones", "maïs"), np.array([[10, 200, 30], [120, 90, 60], [0, 0, 255]], "u1")
 )
 GRID = AngularGrid(1e-4, (1300, 1100))
@@ -115,7 +115,7 @@ def test_overviews_of_classes_hold_classes(tmp_path: Path) -> None:
 
 def test_overviews_of_classes_are_no_mean_of_colours(tmp_path: Path) -> None:
     """Three white pixels and a black one are white, though a grey class has a colour nearer to their mean."""
-    greys = ClassLegend(("black", "grey", "white"), np.repeat(np.array([[0], [180], [255]], "u1"), 3, axis=1))
+    greys = ClassNames(("black", "grey", "white"), np.repeat(np.array([[0], [180], [255]], "u1"), 3, axis=1))
     values = np.tile(np.array([[0, 2], [2, 2]], np.uint8), (300, 280))
     image = replace(class_image(values.shape), legend=greys)
     write_cog(tmp_path / "a.tif", image, rows_of(values))

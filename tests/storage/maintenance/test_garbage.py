@@ -9,16 +9,16 @@ import pytest
 from pipeline.errors import SettingsError
 from storage.archive.archive import Archive
 from storage.maintenance.garbage import IN_USE, Removal, clear_up, plan_clearance
+from storage.remote.opening import verify_archive
 from tests.storage.small_archive import flip, grow_old, small_survey
 
 
 def _problems(archive: Archive) -> list[str]:
-    return [f"{one.uri} {one.problem}" for one in archive.verify_all() if one.problem is not None]
+    return [f"{one.uri} {one.problem}" for one in verify_archive(archive) if one.problem is not None]
 
 
-def test_what_no_run_names_goes_and_the_rest_stays(tmp_path: Path) -> None:
+def test_what_no_run_names_goes_and_the_rest_stays(archive: Archive) -> None:
     """A store that a named one was made of stays, though no receipt names it."""
-    archive = Archive.open(tmp_path)
     kept, gone = small_survey(archive), small_survey(archive, seed=1, named=False)
     planned = clear_up(archive, keep_days=0, dry_run=True)
     assert [removal.uri for removal in planned.removals] == [gone.map.uri, gone.mosaic.uri, gone.raw.uri]
@@ -31,17 +31,15 @@ def test_what_no_run_names_goes_and_the_rest_stays(tmp_path: Path) -> None:
     assert clear_up(archive, keep_days=0).removals == ()
 
 
-def test_a_shared_input_stays(tmp_path: Path) -> None:
+def test_a_shared_input_stays(archive: Archive) -> None:
     """Of a map with another kernel that no run names, the raw lines are those of a map that one names."""
-    archive = Archive.open(tmp_path)
     kept, gone = small_survey(archive), small_survey(archive, kernel="nearest", named=False)
     assert gone.raw == kept.raw
     assert [one.uri for one in clear_up(archive, keep_days=0).removals] == [gone.map.uri, gone.mosaic.uri]
 
 
-def test_young_stores_stay_with_what_they_rest_on(tmp_path: Path) -> None:
+def test_young_stores_stay_with_what_they_rest_on(archive: Archive) -> None:
     """A survey under way has made a map of old raw lines: neither goes."""
-    archive = Archive.open(tmp_path)
     small = small_survey(archive, named=False)
     other = small_survey(archive, seed=5, named=False)
     for ref in (small.raw, small.mosaic, other.raw, other.mosaic, other.map):
@@ -56,9 +54,17 @@ def test_young_stores_stay_with_what_they_rest_on(tmp_path: Path) -> None:
     assert len(plan_clearance(archive, keep_days=4).removals) == 0
 
 
-def test_raw_lines_of_a_rig_go_only_when_asked(tmp_path: Path) -> None:
+def test_what_was_made_of_young_stores_is_young_itself(archive: Archive) -> None:
+    """By its date it is older than what it was made of only where the clock was set back."""
+    small = small_survey(archive, named=False)
+    grow_old(small.map, days=3)
+    plan = plan_clearance(archive, keep_days=2)
+    assert plan.removals == ()
+    assert plan.kept[small.map.uri] == "made of what is younger than 2 days"
+
+
+def test_raw_lines_of_a_rig_go_only_when_asked(archive: Archive) -> None:
     """A survey that broke off after its capture has lines that no run names and that cannot be had again."""
-    archive = Archive.open(tmp_path)
     small = small_survey(archive, named=False, simulated=False)
     assert small.raw.uri in clear_up(archive, keep_days=0).kept
     assert [ref.uri for ref in archive.refs()] == [small.raw.uri]
@@ -66,9 +72,8 @@ def test_raw_lines_of_a_rig_go_only_when_asked(tmp_path: Path) -> None:
     assert archive.refs() == []
 
 
-def test_spools_of_published_captures_and_dead_parts_go(tmp_path: Path) -> None:
+def test_spools_of_published_captures_and_dead_parts_go(tmp_path: Path, archive: Archive) -> None:
     """The spool of a capture that is not published is what its lines will be continued from."""
-    archive = Archive.open(tmp_path)
     small = small_survey(archive)
     for key in (small.raw.key, f"{small.raw.key}-mosaic", "underway"):  # tiles beside a spool are of earlier versions
         (archive.spool_folder(key) / "lines.bil").write_bytes(b"x" * 100)
@@ -88,9 +93,8 @@ def test_spools_of_published_captures_and_dead_parts_go(tmp_path: Path) -> None:
     assert not (tmp_path / "stages" / "rectify" / "dead.part").exists()
 
 
-def test_a_stray_file_among_the_runs_holds_nothing_up(tmp_path: Path) -> None:
+def test_a_stray_file_among_the_runs_holds_nothing_up(tmp_path: Path, archive: Archive) -> None:
     """It names nothing; a folder there might have."""
-    archive = Archive.open(tmp_path)
     small_survey(archive, named=False)
     (tmp_path / "runs").mkdir()
     (tmp_path / "runs" / "notes.txt").write_text("mine")
@@ -98,9 +102,8 @@ def test_a_stray_file_among_the_runs_holds_nothing_up(tmp_path: Path) -> None:
     assert (tmp_path / "runs" / "notes.txt").exists()
 
 
-def test_a_spool_stays_while_its_capture_may_be_in_need_of_it(tmp_path: Path) -> None:
+def test_a_spool_stays_while_its_capture_may_be_in_need_of_it(archive: Archive) -> None:
     """Held by whoever publishes its lines, or where what was published of them is damaged."""
-    archive = Archive.open(tmp_path)
     small = small_survey(archive)
     (archive.spool_folder(small.raw.key) / "lines.bil").write_bytes(b"x")
     with archive.publish("capture", small.raw.key):
@@ -113,10 +116,9 @@ def test_a_spool_stays_while_its_capture_may_be_in_need_of_it(tmp_path: Path) ->
 
 
 def test_what_does_not_let_itself_be_removed_is_not_told_as_gone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, archive: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The disk refuses: the next gc tries again."""
-    archive = Archive.open(tmp_path)
     (tmp_path / "stages/segment/aaaa.part").mkdir(parents=True)
     with monkeypatch.context() as broken:
         broken.setattr("storage.maintenance.garbage.remove_tree", lambda path: None)
@@ -124,9 +126,8 @@ def test_what_does_not_let_itself_be_removed_is_not_told_as_gone(
     assert [removal.uri for removal in clear_up(archive).removals] == ["stages/segment/aaaa.part"]
 
 
-def test_nothing_goes_while_somebody_uses_the_archive(tmp_path: Path) -> None:
+def test_nothing_goes_while_somebody_uses_the_archive(tmp_path: Path, archive: Archive) -> None:
     """Two surveys may use an archive at a time; clearing up waits for its turn, and says so."""
-    archive = Archive.open(tmp_path)
     small = small_survey(archive, named=False)
     with archive.in_use(), Archive.open(tmp_path).in_use():
         done = clear_up(archive, keep_days=0)
@@ -137,9 +138,8 @@ def test_nothing_goes_while_somebody_uses_the_archive(tmp_path: Path) -> None:
     assert archive.find("capture", small.raw.key) is None
 
 
-def test_a_store_that_is_held_stays(tmp_path: Path) -> None:
+def test_a_store_that_is_held_stays(archive: Archive) -> None:
     """Whoever holds a key's lock works on it."""
-    archive = Archive.open(tmp_path)
     small = small_survey(archive, named=False)
     with archive.publish(small.map.stage, small.map.key) as staged:
         assert staged.done
@@ -148,11 +148,9 @@ def test_a_store_that_is_held_stays(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("victim", ["receipt.json", "manifest.json"])
-def test_no_store_goes_where_a_run_cannot_tell_what_it_names(tmp_path: Path, victim: str) -> None:
+def test_no_store_goes_where_a_run_cannot_tell_what_it_names(archive: Archive, victim: str) -> None:
     """A damaged receipt is made up for by the run's manifest; with that damaged or gone all stores stay."""
-    archive = Archive.open(tmp_path)
     small, other = small_survey(archive), small_survey(archive, seed=1, named=False)
-    assert small.run is not None
     flip(small.run / victim)
     found = clear_up(archive, keep_days=0)
     if victim == "receipt.json":
@@ -167,9 +165,8 @@ def test_no_store_goes_where_a_run_cannot_tell_what_it_names(tmp_path: Path, vic
     assert archive.find("segment", other.map.key) == other.map
 
 
-def test_no_store_goes_where_a_store_cannot_tell_what_it_rests_on(tmp_path: Path) -> None:
+def test_no_store_goes_where_a_store_cannot_tell_what_it_rests_on(archive: Archive) -> None:
     """The map's manifest is damaged and no run recorded what it was made of: the mosaic might be its input."""
-    archive = Archive.open(tmp_path)
     small = small_survey(archive, named=False)
     with archive.new_run("old") as draft:
         draft.write_file("receipt.json", f'{{"products": {{"map": "{small.map.uri}/class_map.zarr"}}}}')
@@ -181,9 +178,8 @@ def test_no_store_goes_where_a_store_cannot_tell_what_it_rests_on(tmp_path: Path
 
 
 @pytest.mark.parametrize("at", range(4))
-def test_broken_off_it_leaves_a_whole_archive(tmp_path: Path, at: int) -> None:
+def test_broken_off_it_leaves_a_whole_archive(archive: Archive, at: int) -> None:
     """Stores go before those that they were made of; the next time does the rest."""
-    archive = Archive.open(tmp_path)
     small_survey(archive)
     small_survey(archive, seed=1, named=False)
     (archive.spool_folder(archive.refs("capture")[0].key) / "lines.bil").write_bytes(b"x")
@@ -201,9 +197,8 @@ def test_broken_off_it_leaves_a_whole_archive(tmp_path: Path, at: int) -> None:
     assert len(archive.refs()) == 3
 
 
-def test_manifests_in_a_circle_do_not_hang(tmp_path: Path) -> None:
+def test_manifests_in_a_circle_do_not_hang(archive: Archive) -> None:
     """Two stores that claim to be made of each other are cleared up like others."""
-    archive = Archive.open(tmp_path)
     for key, given in (("aaaa", "bbbb"), ("bbbb", "aaaa"), ("cccc", "cccc")):
         with archive.publish("segment", key, inputs=[given]) as staged:
             (staged.path / "data").write_bytes(b"x")

@@ -12,20 +12,21 @@ import pytest
 from pipeline.errors import ArchiveError, SceneError
 from storage.archive.archive import Archive
 from storage.maintenance.repair import Repaired, plan_repair, put_back, repair
+from storage.remote.opening import verify_archive
 from tests.storage.small_archive import Small, flip, small_survey
 
 VERSIONS = {"capture": 1, "rectify": 1, "segment": 1}
 
 
 def _bad(archive: Archive) -> list[str]:
-    return [one.uri for one in archive.verify_all() if one.problem is not None]
+    return [one.uri for one in verify_archive(archive) if one.problem is not None]
 
 
 def _repair(archive: Archive, rerun: Callable[[dict[str, Any]], None] | None = None) -> Repaired:
     def again(settings: dict[str, Any]) -> None:
         small_survey(archive, seed=settings["seed"], kernel=settings["kernel"])
 
-    return repair(archive, archive.verify_all(), rerun or again, versions=VERSIONS)
+    return repair(archive, verify_archive(archive), rerun or again, versions=VERSIONS)
 
 
 def _two(archive: Archive) -> tuple[Small, Small]:
@@ -36,9 +37,8 @@ def _moments(archive: Archive) -> dict[str, int]:
     return {ref.uri: (ref.path / "manifest.json").stat().st_mtime_ns for ref in archive.refs()}
 
 
-def test_only_what_depends_on_it_is_made_again(tmp_path: Path) -> None:
+def test_only_what_depends_on_it_is_made_again(tmp_path: Path, archive: Archive) -> None:
     """A broken mosaic: it and its map; not the raw lines, and nothing of the other survey."""
-    archive = Archive.open(tmp_path)
     small, _ = _two(archive)
     before = _moments(archive)
     flip(small.mosaic.path / "data.bin")
@@ -52,9 +52,8 @@ def test_only_what_depends_on_it_is_made_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("how", ["flip", "manifest", "lost", "gone"])
-def test_broken_raw_lines_of_the_simulator_are_made_again(tmp_path: Path, how: str) -> None:
+def test_broken_raw_lines_of_the_simulator_are_made_again(archive: Archive, how: str) -> None:
     """Whatever is wrong with them: both surveys that name them run again."""
-    archive = Archive.open(tmp_path)
     small, _ = _two(archive)
     if how == "flip":
         flip(small.raw.path / "data.bin")
@@ -77,9 +76,8 @@ def test_broken_raw_lines_of_the_simulator_are_made_again(tmp_path: Path, how: s
     assert _bad(archive) == []
 
 
-def test_raw_lines_of_a_rig_stay_with_all_that_was_made_of_them(tmp_path: Path) -> None:
+def test_raw_lines_of_a_rig_stay_with_all_that_was_made_of_them(archive: Archive) -> None:
     """They cannot be had again; a broken map beside them is made again of them."""
-    archive = Archive.open(tmp_path)
     small = small_survey(archive, simulated=False)
     before = _moments(archive)
     flip(small.raw.path / "data.bin")
@@ -94,9 +92,8 @@ def test_raw_lines_of_a_rig_stay_with_all_that_was_made_of_them(tmp_path: Path) 
     assert _bad(archive) == [small.raw.uri]
 
 
-def test_what_cannot_be_made_is_put_back(tmp_path: Path) -> None:
+def test_what_cannot_be_made_is_put_back(archive: Archive) -> None:
     """The scene has gone: the sound map, set aside with the broken mosaic, is where it was."""
-    archive = Archive.open(tmp_path)
     small = small_survey(archive)
     before = _moments(archive)
     flip(small.mosaic.path / "data.bin")
@@ -111,9 +108,8 @@ def test_what_cannot_be_made_is_put_back(tmp_path: Path) -> None:
     assert _bad(archive) == [small.mosaic.uri]
 
 
-def test_a_repair_broken_off_is_put_back_first(tmp_path: Path) -> None:
+def test_a_repair_broken_off_is_put_back_first(tmp_path: Path, archive: Archive) -> None:
     """At once where the process lives, and by the next repair where it was killed."""
-    archive = Archive.open(tmp_path)
     small = small_survey(archive)
     before = _moments(archive)
     flip(small.mosaic.path / "data.bin")
@@ -126,15 +122,14 @@ def test_a_repair_broken_off_is_put_back_first(tmp_path: Path) -> None:
     assert _moments(archive) == before
     (tmp_path / ".aside" / "segment").mkdir(parents=True)
     small.map.path.rename(tmp_path / ".aside" / "segment" / small.map.key)
-    told = {one.uri: one.problem for one in archive.verify_all() if one.problem is not None}
+    told = {one.uri: one.problem for one in verify_archive(archive) if one.problem is not None}
     assert "a repair was broken off" in (told[f".aside/segment/{small.map.key}"] or "")
     assert put_back(tmp_path) == [small.map.uri]
     assert _moments(archive) == before
 
 
-def test_nothing_that_was_set_aside_is_lost_by_the_next_repair(tmp_path: Path) -> None:
+def test_nothing_that_was_set_aside_is_lost_by_the_next_repair(tmp_path: Path, archive: Archive) -> None:
     """Also what no run names yet: it comes back before anything else is done; what was made again since stays."""
-    archive = Archive.open(tmp_path)
     small, other = small_survey(archive), small_survey(archive, seed=1, named=False)
     for ref in (other.map, other.mosaic):
         aside = tmp_path / ".aside" / ref.stage / ref.key
@@ -150,24 +145,21 @@ def test_nothing_that_was_set_aside_is_lost_by_the_next_repair(tmp_path: Path) -
     assert _bad(archive) == []
 
 
-def test_one_survey_is_run_again_once(tmp_path: Path) -> None:
+def test_one_survey_is_run_again_once(archive: Archive) -> None:
     """However many runs asked for the same, whatever they noted and wherever the archive lay."""
-    archive = Archive.open(tmp_path)
     small = small_survey(archive)
     for more in ({"notes": ["dull"]}, {"out": "elsewhere"}):
         asked = {"seed": 0, "kernel": "bilinear", "source": "sim", "scene": "farm", "budget": 0.5, **more}
         archive.new_run("farm").publish(settings=asked, rests_on=archive.manifest_hashes([small.map]))
     flip(small.mosaic.path / "data.bin")
     ran: list[str] = []
-    repair(archive, archive.verify_all(), lambda settings: ran.append(settings["kernel"]), versions=VERSIONS)
+    repair(archive, verify_archive(archive), lambda settings: ran.append(settings["kernel"]), versions=VERSIONS)
     assert ran == ["bilinear"]
 
 
-def test_a_run_that_lost_its_manifest_is_left_to_people(tmp_path: Path) -> None:
+def test_a_run_that_lost_its_manifest_is_left_to_people(archive: Archive) -> None:
     """Nothing vouches for what its receipt says."""
-    archive = Archive.open(tmp_path)
     small = small_survey(archive)
-    assert small.run is not None
     (small.run / "manifest.json").unlink()
     done = _repair(archive, lambda settings: pytest.fail("nothing to run"))
     assert not done.complete
@@ -175,9 +167,8 @@ def test_a_run_that_lost_its_manifest_is_left_to_people(tmp_path: Path) -> None:
     assert small.run.exists()
 
 
-def test_stores_of_runs_that_cannot_tell_their_settings_stay(tmp_path: Path) -> None:
+def test_stores_of_runs_that_cannot_tell_their_settings_stay(archive: Archive) -> None:
     """Nobody knows how to ask for them."""
-    archive = Archive.open(tmp_path)
     small = small_survey(archive, named=False)
     archive.new_run("farm").publish(rests_on=archive.manifest_hashes([small.map]))
     flip(small.mosaic.path / "data.bin")
@@ -186,9 +177,8 @@ def test_stores_of_runs_that_cannot_tell_their_settings_stay(tmp_path: Path) -> 
     assert _bad(archive) == [small.mosaic.uri]
 
 
-def test_what_no_run_names_is_dropped(tmp_path: Path) -> None:
+def test_what_no_run_names_is_dropped(archive: Archive) -> None:
     """Nobody asks for it: it is made again by whoever does."""
-    archive = Archive.open(tmp_path)
     small = small_survey(archive, named=False)
     flip(small.mosaic.path / "data.bin")
     done = _repair(archive, lambda settings: pytest.fail("nothing to run"))
@@ -197,9 +187,8 @@ def test_what_no_run_names_is_dropped(tmp_path: Path) -> None:
     assert _bad(archive) == []
 
 
-def test_what_was_never_of_the_archive_is_not_thrown_away(tmp_path: Path) -> None:
+def test_what_was_never_of_the_archive_is_not_thrown_away(tmp_path: Path, archive: Archive) -> None:
     """A folder in the place of a stage that is none, whoever laid it there."""
-    archive = Archive.open(tmp_path)
     notes = tmp_path / "stages" / "mine" / "notes.txt"
     small_survey(archive)
     notes.parent.mkdir()
@@ -212,21 +201,19 @@ def test_what_was_never_of_the_archive_is_not_thrown_away(tmp_path: Path) -> Non
     assert not done.complete
 
 
-def test_stores_of_a_version_no_longer_made_stay(tmp_path: Path) -> None:
+def test_stores_of_a_version_no_longer_made_stay(archive: Archive) -> None:
     """Sound ones with those that are broken: this version would make something else."""
-    archive = Archive.open(tmp_path)
     small = small_survey(archive)
     flip(small.raw.path / "data.bin")
-    plan = plan_repair(archive, archive.verify_all(), versions=VERSIONS | {"segment": 2})
+    plan = plan_repair(archive, verify_archive(archive), versions=VERSIONS | {"segment": 2})
     assert plan.remade == (small.mosaic.uri, small.raw.uri)
-    plan = plan_repair(archive, archive.verify_all(), versions=VERSIONS | {"capture": 2})
+    plan = plan_repair(archive, verify_archive(archive), versions=VERSIONS | {"capture": 2})
     assert plan.remade == ()
     assert "made by version 1 of the stage capture, which is now 2" in plan.hopeless[small.raw.uri]
 
 
-def test_a_damaged_run_is_run_again(tmp_path: Path) -> None:
+def test_a_damaged_run_is_run_again(archive: Archive) -> None:
     """By the settings of its receipt where only a picture is damaged; not by those of a damaged receipt."""
-    archive = Archive.open(tmp_path)
     with archive.new_run("farm") as draft:
         draft.write_file("receipt.json", json.dumps({"settings": {"seed": 0, "kernel": "bilinear", "source": "sim"}}))
         draft.write_file("quicklook.png", b"picture")
@@ -244,9 +231,8 @@ def test_a_damaged_run_is_run_again(tmp_path: Path) -> None:
     assert run.exists()
 
 
-def test_it_waits_for_nobody(tmp_path: Path) -> None:
+def test_it_waits_for_nobody(archive: Archive) -> None:
     """While a survey uses the archive, nothing of it is set aside."""
-    archive = Archive.open(tmp_path)
     small_survey(archive)
     with archive.in_use(), pytest.raises(ArchiveError, match="is in use; run verify --repair again"):
         _repair(archive)

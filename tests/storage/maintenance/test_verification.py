@@ -16,7 +16,8 @@ from storage.archive.archive import Archive, StageRef
 from storage.archive.manifests import _seal, _text
 from storage.archive.records import MANIFEST_HASH
 from storage.arrays.layout import create_group, open_group, read_array, write_image, write_small
-from storage.maintenance.shard_names import find_shard, name_damage
+from storage.maintenance.verification import find_shard, name_damage
+from storage.remote.opening import verify_archive
 from tests.storage.small_archive import flip, small_survey
 
 FLIPS = 80
@@ -36,15 +37,14 @@ def _with_cube(archive: Archive) -> StageRef:
 
 def _found(archive: Archive) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
-    for one in archive.verify_all():
+    for one in verify_archive(archive):
         if one.problem is not None:
             found.setdefault(one.uri, []).append(one.problem)
     return found
 
 
-def test_bits_that_flip_anywhere_are_found_and_named(tmp_path: Path) -> None:
+def test_bits_that_flip_anywhere_are_found_and_named(tmp_path: Path, archive: Archive) -> None:
     """Places are drawn from all bytes and from all files, manifests and receipts among them."""
-    archive = Archive.open(tmp_path)
     small_survey(archive)
     _with_cube(archive)
     files = [path for path in sorted(tmp_path.rglob("*")) if path.is_file()]
@@ -61,9 +61,8 @@ def test_bits_that_flip_anywhere_are_found_and_named(tmp_path: Path) -> None:
     assert _found(archive) == {}
 
 
-def test_a_broken_shard_is_named_by_its_rows_and_columns(tmp_path: Path) -> None:
+def test_a_broken_shard_is_named_by_its_rows_and_columns(archive: Archive) -> None:
     """And in it the chunks that fail their checksum, every broken file on its own."""
-    archive = Archive.open(tmp_path)
     ref = _with_cube(archive)
     flip(ref.path / "mosaic.zarr/values/c/1/0/0", at=100)
     flip(ref.path / "mosaic.zarr/values/c/0/1/0", at=-3)
@@ -76,9 +75,8 @@ def test_a_broken_shard_is_named_by_its_rows_and_columns(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("at", [0, 1000, -10])
-def test_no_flipped_bit_of_a_shard_is_read_silently(tmp_path: Path, at: int) -> None:
+def test_no_flipped_bit_of_a_shard_is_read_silently(archive: Archive, at: int) -> None:
     """Chunks and the shard's index have checksums: reading raises, or gives what was written."""
-    archive = Archive.open(tmp_path)
     ref = _with_cube(archive)
     before = read_array(open_group(ref.path / "mosaic.zarr"), "values")
     flip(ref.path / "mosaic.zarr/values/c/0/0/0", at=at)
@@ -117,9 +115,8 @@ def test_what_is_no_array_has_no_range(tmp_path: Path) -> None:
     assert name_damage(ref.path, "mosaic.zarr/values/c/0/0/0") == ""
 
 
-def test_a_lost_manifest_and_a_lost_store_are_told(tmp_path: Path) -> None:
+def test_a_lost_manifest_and_a_lost_store_are_told(tmp_path: Path, archive: Archive) -> None:
     """By the folder that is left, by the run that names it, and by what was made of it."""
-    archive = Archive.open(tmp_path)
     small = small_survey(archive)
     (small.mosaic.path / "manifest.json").unlink()
     with pytest.raises(IncompleteStoreError, match="it is missing"):
@@ -127,16 +124,14 @@ def test_a_lost_manifest_and_a_lost_store_are_told(tmp_path: Path) -> None:
     shutil.rmtree(small.raw.path)
     (tmp_path / "stages" / "note.txt").write_text("x")
     found = _found(archive)
-    assert small.run is not None
     assert f"is not there, but runs/{small.run.name} names it" in found.pop(small.raw.uri)
     assert "manifest.json is missing" in found.pop(small.mosaic.uri)
     assert "is a file, expected a folder" in found.pop("stages/note.txt")[0]
     assert found == {}
 
 
-def test_another_store_in_its_place_is_told(tmp_path: Path) -> None:
+def test_another_store_in_its_place_is_told(archive: Archive) -> None:
     """A store moved to another key, and one whose manifest is not that which a run recorded."""
-    archive = Archive.open(tmp_path)
     small = small_survey(archive)
     path = small.mosaic.path / "manifest.json"
     content = json.loads(path.read_text())
@@ -148,9 +143,8 @@ def test_another_store_in_its_place_is_told(tmp_path: Path) -> None:
     assert any(f"is that of {small.map.uri}" in one for one in _found(archive)["stages/segment/another"])
 
 
-def test_a_store_made_anew_is_not_doubted(tmp_path: Path) -> None:
+def test_a_store_made_anew_is_not_doubted(archive: Archive) -> None:
     """Its manifest differs from what the run recorded, in its date; its seal and its later date stand for it."""
-    archive = Archive.open(tmp_path)
     small = small_survey(archive)
     recorded = archive.manifest_hash(small.mosaic)
     archive.discard(small.mosaic)
@@ -159,21 +153,19 @@ def test_a_store_made_anew_is_not_doubted(tmp_path: Path) -> None:
     assert _found(archive) == {}
 
 
-def test_what_is_gone_is_told_once(tmp_path: Path) -> None:
+def test_what_is_gone_is_told_once(archive: Archive) -> None:
     """However many runs name it; and by what was made of it where no run does."""
-    archive = Archive.open(tmp_path)
     small, other = small_survey(archive), small_survey(archive, seed=1, named=False)
     small_survey(archive)
     for ref in (small.mosaic, other.mosaic):
         archive.discard(ref)
-    gone = [one for one in archive.verify_all() if one.kind == "missing"]
+    gone = [one for one in verify_archive(archive) if one.kind == "missing"]
     assert [one.uri for one in gone] == [small.mosaic.uri, other.mosaic.key]
     assert f"is not there, but {other.map.uri} was made of it" in str(gone[1].problem)
 
 
-def test_one_run_that_knows_a_manifest_vouches_for_it(tmp_path: Path) -> None:
+def test_one_run_that_knows_a_manifest_vouches_for_it(archive: Archive) -> None:
     """Another that knew an earlier one does not count against it; without the first it does, if it is younger."""
-    archive = Archive.open(tmp_path)
     small = small_survey(archive, named=False)
     for _ in range(2):
         time.sleep(0.01)
@@ -183,9 +175,8 @@ def test_one_run_that_knows_a_manifest_vouches_for_it(tmp_path: Path) -> None:
     assert _found(archive) == {}
 
 
-def test_a_store_older_than_one_of_its_doubters_is_doubted(tmp_path: Path) -> None:
+def test_a_store_older_than_one_of_its_doubters_is_doubted(tmp_path: Path, archive: Archive) -> None:
     """It cannot have been made anew since."""
-    archive = Archive.open(tmp_path)
     key = small_survey(Archive.open(tmp_path / "elsewhere"), named=False).map.uri
     archive.new_run("before").publish(rests_on={key: "0" * 64})
     time.sleep(0.01)
@@ -196,32 +187,31 @@ def test_a_store_older_than_one_of_its_doubters_is_doubted(tmp_path: Path) -> No
     assert list(_found(archive)) == [key]
 
 
-def test_what_is_cleared_away_meanwhile_is_no_damage(tmp_path: Path) -> None:
+def test_what_is_cleared_away_meanwhile_is_no_damage(archive: Archive) -> None:
     """gc may run beside it; what a run names must be there."""
-    archive = Archive.open(tmp_path)
     named, other = small_survey(archive), small_survey(archive, seed=1, named=False)
 
     def clear(ref: StageRef) -> list[str]:
-        return [one.uri for one in archive.verify_all(lambda uri, done: archive.discard(ref) and None) if one.problem]
+        return [
+            one.uri for one in verify_archive(archive, lambda uri, done: archive.discard(ref) and None) if one.problem
+        ]
 
     assert clear(other.map) == []
     assert clear(named.map) == [named.map.uri]
 
 
-def test_progress_goes_by_bytes(tmp_path: Path) -> None:
+def test_progress_goes_by_bytes(archive: Archive) -> None:
     """From nothing to nearly all, store by store."""
-    archive = Archive.open(tmp_path)
     small_survey(archive)
     seen: list[tuple[str, float]] = []
-    archive.verify_all(lambda uri, done: seen.append((uri, done)))
+    verify_archive(archive, lambda uri, done: seen.append((uri, done)))
     assert len(seen) == 4
     assert [done for _, done in seen] == sorted(done for _, done in seen)
     assert seen[0][1] == 0.0 < seen[-1][1] < 1.0
 
 
-def test_a_manifest_written_anew_is_told_by_the_receipt(tmp_path: Path) -> None:
+def test_a_manifest_written_anew_is_told_by_the_receipt(archive: Archive) -> None:
     """A manifest with other facts and a seal that fits is not the one that the run's stages name: verify says so."""
-    archive = Archive.open(tmp_path)
     small = small_survey(archive, named=False)
     row = {"name": "rectify", "key": small.mosaic.key, "state": "ran"}
     rows = [

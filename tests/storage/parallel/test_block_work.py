@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import signal
 import socket
@@ -25,6 +26,8 @@ from storage.arrays.mosaics import MosaicWriter
 from storage.parallel import cluster_work, worker_facts
 from storage.parallel.block_work import block_graph, run_blocks
 from storage.parallel.crew import Crew, count_cores
+from storage.parallel import cluster_work
+from storage.parallel.crew import Crew, count_cores, run_blocks
 
 PROCESSES = Crew("processes", 2)
 
@@ -191,7 +194,7 @@ def test_workers_that_see_other_files_are_refused(
     elsewhere: Crew, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A folder that differs there is named, with what both see and what to do; nothing is made."""
-    monkeypatch.setattr(worker_facts, "_seen", lambda folder: "with 7 names")
+    monkeypatch.setattr(cluster_work, "_seen", lambda folder: "with 7 names")
     with pytest.raises(
         SettingsError, match=rf"worker tcp:.* has {tmp_path} with 0 names .*, expected with 7 names .*mount"
     ):
@@ -201,34 +204,35 @@ def test_workers_that_see_other_files_are_refused(
 @pytest.fixture
 def other_versions(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
     """Somebody who may change what this process takes for its own versions."""
-    worker_facts.versions_here.cache_clear()
+    cluster_work.versions_here.cache_clear()
     yield monkeypatch
-    worker_facts.versions_here.cache_clear()
+    cluster_work.versions_here.cache_clear()
 
 
 def test_workers_of_another_version_are_refused(elsewhere: Crew, other_versions: pytest.MonkeyPatch) -> None:
     """Other code or another numpy there would give other bytes: the first that differs is named."""
-    other_versions.setattr(worker_facts, "version", lambda name: "0.1")
+    other_versions.setattr(cluster_work, "version", lambda name: "0.1")
     with pytest.raises(SettingsError, match=r"has numpy \d.*, expected 0.1 as here; install the same there"):
         run_blocks(square, [1], elsewhere)
-    worker_facts.versions_here.cache_clear()
-    other_versions.setattr(worker_facts, "_code_digest", lambda: "of code abc")
+    cluster_work.versions_here.cache_clear()
+    other_versions.setattr(cluster_work, "_code_digest", lambda: "of code abc")
     with pytest.raises(SettingsError, match=r"has spectralzoom of code \w+, expected of code abc as here"):
         run_blocks(square, [1], elsewhere)
 
 
 def test_workers_still_run_what_they_began_with(other_versions: pytest.MonkeyPatch) -> None:
     """Files that changed on the disk since are not what a process runs."""
-    before = worker_facts.versions_here()
-    other_versions.setattr(worker_facts, "_code_digest", lambda: "of code abc")
-    assert worker_facts.versions_here() == before
+    before = cluster_work.versions_here()
+    assert before["spectralzoom"] != f"of code {hashlib.sha256().hexdigest()[:12]}"  # of no file at all
+    other_versions.setattr(cluster_work, "_code_digest", lambda: "of code abc")
+    assert cluster_work.versions_here() == before
 
 
 def test_workers_with_several_threads_of_arithmetic_are_refused() -> None:
     """Sums of several threads are rounded otherwise: other bytes under the same key."""
-    expected = {**worker_facts.about_here([]), **worker_facts.ONE_THREAD}
+    expected = {**cluster_work.about_here([]), **cluster_work.ONE_THREAD}
     with pytest.raises(SettingsError, match=r"worker 1 has OMP_NUM_THREADS 4, expected 1 in its environment"):
-        worker_facts.check_facts("worker 1", expected | {"OMP_NUM_THREADS": "4"}, expected)
+        cluster_work.check_facts("worker 1", expected | {"OMP_NUM_THREADS": "4"}, expected)
 
 
 def test_a_scheduler_that_lacks_the_program_is_refused(elsewhere: Crew, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -272,7 +276,7 @@ import subprocess, sys, time
 from contextlib import suppress
 from pipeline.errors import PipelineError, WorkerError
 from storage.parallel import cluster_work
-from storage.parallel.block_work import run_blocks
+from storage.parallel.crew import run_blocks
 from storage.parallel.crew import Crew
 from tests.storage.parallel.test_block_work import nap
 
@@ -332,7 +336,7 @@ INTERRUPTED = """
 import signal, sys, time
 from functools import partial
 from pathlib import Path
-from storage.parallel.block_work import run_blocks
+from storage.parallel.crew import run_blocks
 from storage.parallel.crew import Crew
 from tests.storage.parallel.test_block_work import touch_slowly
 if __name__ == "__main__":
@@ -348,7 +352,7 @@ TERMINATED = """
 import os, signal, sys, threading
 from contextlib import suppress
 from pathlib import Path
-from storage.parallel.block_work import run_blocks
+from storage.parallel.crew import run_blocks
 from storage.parallel.crew import Crew
 def children():
     return [child for task in Path("/proc/self/task").glob("*/children") for child in task.read_text().split()]
@@ -414,11 +418,3 @@ def test_no_worker_outlives_its_crew(tmp_path: Path, sent: signal.Signals) -> No
         time.sleep(0.05)
     if sent == signal.SIGINT:
         assert said == b""
-
-
-@pytest.mark.parametrize(("side", "tiles"), [(10240, 2560), (2560, 160)])
-def test_graphs_of_the_largest_field_stay_small(tmp_path: Path, side: int, tiles: int) -> None:
-    """10240 x 10240 px and 270 bands, coarse and fine: a task a shard."""
-    writer = MosaicWriter(tmp_path / "m.zarr", (side, side), np.linspace(400, 1000, 270))
-    planned = plan_tiles([], LineCamera(), PixelGrid((0.0, 0.0), 1, (side, side)), writer.tile_shape)
-    assert len(block_graph(lambda number, *before: number, len(planned), 16)) == len(planned) == tiles

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from storage.readers.envi_cubes import open_envi_cube
+from storage.readers.envi_cubes import load_envi_header, open_envi_cube, parse_envi_header
 
 CODES = {"u1": 1, "i2": 2, "i4": 3, "f4": 4, "f8": 5, "c8": 6, "c16": 9, "u2": 12, "u4": 13, "i8": 14, "u8": 15}
 AXES = {"bil": (0, 2, 1), "bip": (0, 1, 2), "bsq": (2, 0, 1)}
@@ -133,3 +133,176 @@ def test_raw_frames_of_a_spaceborne_imager(real_data: Path) -> None:
     assert cube.values.dtype == np.dtype("<i2")
     flat = np.fromfile(cube.path, "<i2").reshape(3, 328, 1280)
     np.testing.assert_array_equal(cube.values[1], flat[1].T)
+
+
+PLAIN = "ENVI\nsamples = 4\nlines = 3\nbands = 2\ndata type = 12\ninterleave = bil\nbyte order = 0\n"
+
+REFUSED = {
+    "plantcv__arcgis.hdr": "begins with 'BYTEORDER I', expected ENVI",
+    "plantcv__darkReference_arcgis.hdr": "begins with 'BYTEORDER I', expected ENVI",
+    "plantcv__darkReference4.hdr": "interleave = 'bup', expected one of bil, bip, bsq",
+    "emit_l1b__EMIT_Linearity_20210111.hdr": "bands = '0', expected a whole number from 1",
+}
+
+
+def test_plain_header() -> None:
+    """What a header says is what comes back, and what it does not say is None."""
+    header = parse_envi_header(PLAIN)
+    assert (header.lines, header.samples, header.bands, header.offset) == (3, 4, 2, 0)
+    assert (header.dtype, header.interleave, header.kind) == (np.dtype("<u2"), "bil", "ENVI Standard")
+    assert header.wavelength_nm is header.fwhm_nm is header.nodata is None
+    assert header.notes == ()
+
+
+def test_odd_spelling_is_read() -> None:
+    """Case, spaces, a byte order mark, Windows line ends, blank lines and repeated keys do no harm."""
+    text = (
+        "\ufeffenvi \r\n\r\n  Samples=4\r\nLINES   =  3 \r\nbands = 2\r\nbands = 2\r\nData  Type = 4\r\n"
+        "interleave = BIP\r\nbyte order = 1\r\nheader offset = 128\r\n"
+    )
+    header = parse_envi_header(text)
+    assert (header.samples, header.lines, header.bands, header.offset) == (4, 3, 2, 128)
+    assert (header.interleave, header.dtype, header.notes) == ("bip", np.dtype(">f4"), ())
+
+
+def test_braces() -> None:
+    """Values in braces run over lines, nest and hold equal signs; escaped braces and those in mid line do not count."""
+    text = PLAIN + (
+        'description = {\n first {nested}\n samples = 9\n}\nhistory = a -> b{c\nproj = {PROJCS["x"], {1, 2}}\n'
+        "odd = {with \\{ escaped}\nband names = {red, near infrared}\n"
+    )
+    header = parse_envi_header(text)
+    assert header.samples == 4
+    assert header.fields["description"] == "first {nested}\n samples = 9"
+    assert header.fields["history"] == "a -> b{c"
+    assert header.fields["proj"] == 'PROJCS["x"], {1, 2}'
+    assert header.fields["odd"] == "with \\{ escaped"
+    assert header.band_names == ("red", "near infrared")
+
+
+def test_one_brace_too_many() -> None:
+    """A brace opened in vain does not swallow the fields after it; one that nothing closes is refused."""
+    header = parse_envi_header(PLAIN.replace("samples", "description = {a {b}\nsamples"))
+    assert header.samples == 4
+    assert "opens more braces than it closes" in header.notes[0]
+    with pytest.raises(SceneError, match=r"wavelength opens a brace that is never closed; is the header cut off"):
+        parse_envi_header(PLAIN + "wavelength = {400,\n500")
+
+
+def test_comment_lines() -> None:
+    """Lines that begin with a semicolon are no fields, but the settings in them are kept; also within braces."""
+    text = (
+        PLAIN + "; free words\n;Exposure (ms) = 100.25\n ;POST AOI width : 1600\nwavelength = {\n400\n;x = 1\n,402\n}\n"
+    )
+    header = parse_envi_header(text)
+    assert header.settings == {"exposure (ms)": "100.25", "post aoi width": "1600", "x": "1"}
+    np.testing.assert_array_equal(header.wavelength_nm, [400, 402])
+
+
+@pytest.mark.parametrize("listed", ["400,500", "\n400\n,500\n", " 400 , 500, ", "400 500", "4e2,\n5.0E+02"])
+def test_lists_of_numbers(listed: str) -> None:
+    """Commas may lead, trail or be missing."""
+    header = parse_envi_header(PLAIN + f"wavelength units = nm\nwavelength = {{{listed}}}\nfwhm = {{{listed}}}\n")
+    np.testing.assert_array_equal(header.wavelength_nm, [400, 500])
+    np.testing.assert_array_equal(header.fwhm_nm, [400, 500])
+
+
+@pytest.mark.parametrize(
+    ("unit", "listed", "found"),
+    [
+        ("Nanometers", "400, 500", [400, 500]),
+        ("Micrometers", "0.4, 0.5", [400, 500]),
+        ("um", "0.4, 2.5", [400, 2500]),
+        ("", "400, 500", [400, 500]),
+        ("Unknown", "0.4, 0.5", [400, 500]),
+        ("Wavenumber", "400, 500", None),
+        ("", "1, 500", None),
+        ("nm", "400, 500, 600", None),
+        ("nm", "400, x", None),
+    ],
+)
+def test_wavelengths(unit: str, listed: str, found: list[float] | None) -> None:
+    """Wavelengths come out in nm; what has no unit is read by its size, what cannot be read is left out with a note."""
+    header = parse_envi_header(PLAIN + f"wavelength units = {unit}\nwavelength = {{{listed}}}\n")
+    if found is None:
+        assert header.wavelength_nm is None
+        assert "left out" in header.notes[0]
+    else:
+        np.testing.assert_allclose(header.wavelength_nm, found)
+        assert bool(header.notes) == (unit in ("", "Unknown"))
+
+
+def test_missing_fields() -> None:
+    """Lines, byte order and offset may be missing; sizes, data type and interleave may not, and are named."""
+    header = parse_envi_header("ENVI\nsamples = 4\nbands = 2\ndata type = 12\ninterleave = bil\n")
+    assert (header.lines, header.offset, header.dtype) == (None, 0, np.dtype("<u2"))
+    assert header.notes == ("the byte order is not said, taken as little endian",)
+    for key in ("samples", "bands", "data type"):
+        text = "\n".join(line for line in PLAIN.splitlines() if not line.startswith(key))
+        with pytest.raises(SceneError, match=f"does not say {key}"):
+            parse_envi_header(text)
+    with pytest.raises(SceneError, match="no interleave, expected one of bil, bip, bsq"):
+        parse_envi_header(PLAIN.replace("interleave = bil\n", ""))
+    assert parse_envi_header(PLAIN.replace("interleave = bil\n", "").replace("bands = 2", "bands = 1")).notes
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("ENVI", "ENVY", "begins with 'ENVY', expected ENVI"),
+        ("samples = 4", "samples = many", "samples = 'many', expected a whole number from 1"),
+        ("samples = 4", "samples = 4.5", "samples = '4.5', expected a whole number"),
+        ("bands = 2", "bands = -2", "bands = '-2', expected a whole number from 1"),
+        ("data type = 12", "data type = 7", "data type = 7 is none of ENVI's"),
+        ("byte order = 0", "byte order = 2", r"byte order = 2, expected 0 \(little endian\)"),
+        ("bil", "xyz", "interleave = 'xyz'"),
+    ],
+)
+def test_refusals(old: str, new: str, words: str) -> None:
+    """What cannot be used is refused, and the message says what was expected."""
+    with pytest.raises(SceneError, match=words):
+        parse_envi_header(PLAIN.replace(old, new), "a.hdr")
+
+
+def test_what_is_no_text(tmp_path: Path) -> None:
+    """Missing, empty and binary files are refused; Latin letters of old programs are read."""
+    path = tmp_path / "a.hdr"
+    with pytest.raises(SceneError, match=r"a\.hdr cannot be read"):
+        load_envi_header(path)
+    path.write_bytes(b"")
+    with pytest.raises(SceneError, match="is empty, expected ENVI"):
+        load_envi_header(path)
+    path.write_bytes(b"ENVI\n\0\1")
+    with pytest.raises(SceneError, match=r"binary data, .* name the \.hdr file"):
+        load_envi_header(path)
+    path.write_bytes(PLAIN.encode() + "sensor = Kamera f\xfcr \xb5m".encode("latin-1"))
+    assert load_envi_header(path).fields["sensor"] == "Kamera f\xfcr \xb5m"
+
+
+def test_headers_of_real_instruments(real_data: Path) -> None:
+    """All 42 headers are read or refused with the reason; none is misread silently."""
+    refused = {}
+    read = {}
+    for path in sorted((real_data / "envi_headers").glob("*.hdr")):
+        try:
+            read[path.name] = load_envi_header(path)
+        except SceneError as error:
+            refused[path.name] = str(error)
+    assert len(read) + len(refused) == 42
+    assert set(refused) == set(REFUSED)
+    assert all(words in refused[name] for name, words in REFUSED.items())
+    spans = {
+        "enmap_box__enmap_berlin.hdr": (177, 460, 2409),
+        "enmap_box__gamsberg_field_library.hdr": (2151, 350, 2500),
+        "headwall_mvx__darkReference.hdr": (301, 400, 1000),
+        "specim_fenix_cal__Radiometric_2x2_1x1.hdr": (624, 377.35, 2503.73),
+        "hdr_roijoy__RO_004_5_2025-04-17_01-08-18_.hdr": (110, 370, 806),
+        "emit_l1b__reference.hdr": (288, 365.80463, 2504.28),
+    }
+    for name, (count, first, last) in spans.items():
+        found = read[name].wavelength_nm
+        assert found is not None
+        assert (len(found), found[0], found[-1]) == pytest.approx((count, first, last))
+    assert read["hdr_gdal__uint16_envi_bigendian.hdr"].dtype == np.dtype(">u2")
+    assert read["headwall_mvx__darkReference.hdr"].settings["exposure (ms)"] == "100.0033437"
+    assert read["plantcv__darkReference2.hdr"].notes == ("wavelength is left out: 35 for 978 bands",)

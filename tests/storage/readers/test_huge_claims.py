@@ -62,7 +62,7 @@ def test_packs_that_would_fill_the_memory(tmp_path: Path, monkeypatch: pytest.Mo
         for _ in range(shape[2]):
             member.write(bytes(1000 * 1000))
     assert (tmp_path / "a.npz").stat().st_size < 30_000
-    monkeypatch.setattr("storage.readers.declared_sizes.machine_bytes", lambda: 10_000_000)
+    monkeypatch.setattr("storage.readers.cube_sources.machine_bytes", lambda: 10_000_000)
     with (
         little_memory(),
         pytest.raises(SceneError, match=r"reading it takes about 0\.0 GB of memory, this machine has"),
@@ -183,7 +183,7 @@ def test_images_beyond_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     """A size that the file could mean is held against the machine's memory."""
     for name in ("a.png", "a.jpg", "a.bmp"):
         Image.new("RGB", (1000, 1000)).save(tmp_path / name)
-    monkeypatch.setattr("storage.readers.declared_sizes.machine_bytes", lambda: 1_000_000)
+    monkeypatch.setattr("storage.readers.cube_sources.machine_bytes", lambda: 1_000_000)
     for name in ("a.png", "a.jpg", "a.bmp"):
         with pytest.raises(SceneError, match="reading it takes about"):
             load_raster(tmp_path / name, dims=3)
@@ -237,7 +237,7 @@ def test_tiffs_that_claim_too_much(
     """A TIFF of a few bytes with the size of a country is refused, by either reader."""
     pytest.importorskip("tifffile")
     if plain:
-        monkeypatch.setattr("storage.readers.tiff_files.open_tiff_rows", lambda path: None)
+        monkeypatch.setattr("storage.readers.raster_files.open_tiff_rows", lambda path: None)
     else:
         pytest.importorskip("rasterio")
     hollow_tiff(tmp_path / "a.tif", side, tile)

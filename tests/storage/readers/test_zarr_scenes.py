@@ -281,7 +281,7 @@ def test_coordinates_that_claim_too_much(tmp_path: Path, cube: NDArray[np.uint16
 def test_blocks_beyond_the_memory(tmp_path: Path, cube: NDArray[np.uint16], monkeypatch: pytest.MonkeyPatch) -> None:
     """What reading some lines takes is held against the machine's memory, and chunks are read whole."""
     zarr.create_array(tmp_path / "a.zarr", data=cube, chunks=cube.shape)
-    monkeypatch.setattr("storage.readers.declared_sizes.machine_bytes", lambda: cube.nbytes - 1)
+    monkeypatch.setattr("storage.readers.cube_sources.machine_bytes", lambda: cube.nbytes - 1)
     with pytest.raises(SceneError, match="reading it takes about"):
         open_cube_source(tmp_path / "a.zarr")
 

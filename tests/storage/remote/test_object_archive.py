@@ -14,18 +14,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from storage.remote.opening import is_archive, open_archive
+from storage.remote.opening import is_archive, open_archive, verify_archive
 
 pytest.importorskip("obstore", reason="obstore is not installed (extra s3)")
 
 from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
-from storage.archive.addresses import StageRef
+from storage.archive.keys import StageRef
 from storage.archive.lineage import Catalogue
 from storage.arrays.layout import create_group, write_image
 from storage.maintenance.garbage import IN_USE, clear_up
-from storage.remote import object_places
-from storage.remote.object_places import UnreachableError, is_remote, parse_place
-from storage.remote.object_stores import AT_ONCE, Objects, some_at_a_time
+from storage.remote import object_stores
+from storage.remote.object_stores import AT_ONCE, Objects, UnreachableError, is_remote, parse_place, some_at_a_time
 from tests.storage.small_archive import small_survey
 from tests.storage.small_bucket import FIRST, SECOND, Machine, make, object_of, problems, rot
 
@@ -136,7 +135,7 @@ def test_a_flipped_bit_in_a_manifest_is_found(machine: Machine, at: int) -> None
     archive = machine(FIRST)
     ref, _ = make(archive)
     rot(archive, f"{ref.uri}/manifest.json", at)
-    assert [finding.uri for finding in archive.verify_all() if finding.problem] == [ref.uri]
+    assert [finding.uri for finding in verify_archive(archive) if finding.problem] == [ref.uri]
     with pytest.raises(IncompleteStoreError, match=r"no valid manifest\.json"):
         machine(SECOND).find("rectify", ref.key)
 
@@ -150,7 +149,7 @@ def test_missing_and_foreign_objects_are_found(machine: Machine) -> None:
     archive.objects.write(object_of(archive, ref, "a.bin") + ".more", b"x")
     archive.objects.remove(archive.objects.listing(small.mosaic.uri))
     assert set(problems(archive)) == {
-        f"{small.mosaic.uri} is not there, but {small.run and 'runs/' + small.run.name} names it",
+        f"{small.mosaic.uri} is not there, but runs/{small.run.name} names it",
         f"{ref.uri} b.json cannot be read: it is missing",
         f"{ref.uri} deep/a.bin.more is not in the manifest: take it out of the archive",
     }
@@ -174,7 +173,6 @@ def test_a_broken_chunk_is_named(machine: Machine) -> None:
 def test_a_run_is_seen_elsewhere_with_all_it_rests_on(machine: Machine) -> None:
     """ls of another machine has runs, receipts and stores; a rerun here sends no store again."""
     small = small_survey(machine(FIRST))
-    assert small.run is not None
     other = machine(SECOND, create=False, write=False)
     catalogue = Catalogue.read(other.root)
     (run,) = catalogue.runs
@@ -228,9 +226,9 @@ def test_a_capture_goes_on_without_a_network(
 ) -> None:
     """Where a working copy is, no answer is no reason not to begin; where there is none, it is refused at once."""
     make(machine(FIRST))
-    monkeypatch.setattr(object_places, "RETRIES", 0)
+    monkeypatch.setattr(object_stores, "RETRIES", 0)
     place = parse_place(bucket)
-    silent = object_places.ObjectPlace(place.bucket, place.prefix, "http://127.0.0.1:9")
+    silent = object_stores.ObjectPlace(place.bucket, place.prefix, "http://127.0.0.1:9")
     monkeypatch.setattr("storage.remote.object_archive.parse_place", lambda text: silent)
     with pytest.raises(UnreachableError, match=r"127\.0\.0\.1:9: it cannot be reached: check the network"):
         open_archive(bucket)
@@ -384,7 +382,7 @@ def test_what_a_store_answers_is_told_in_words(bucket: str, answer: str, words: 
     """What may pass by itself is told from what somebody has to change."""
     from obstore.exceptions import GenericError
 
-    with pytest.raises(UnreachableError, match=re.escape(words)) as told, object_places.answers_of(parse_place(bucket)):
+    with pytest.raises(UnreachableError, match=re.escape(words)) as told, object_stores.answers_of(parse_place(bucket)):
         raise GenericError(answer)
     assert told.value.passing is passing
 

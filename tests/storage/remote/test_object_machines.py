@@ -20,11 +20,10 @@ from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 from storage.maintenance.garbage import clear_up
 from storage.maintenance.verification import Finding
-from storage.remote import object_copies, object_leases
+from storage.remote import object_checks, object_copies
 from storage.remote.object_archive import ObjectArchive
-from storage.remote.object_places import UnreachableError
-from storage.remote.object_repairs import put_back_objects, repair_objects
-from storage.remote.object_stores import Objects
+from storage.remote.object_stores import Objects, UnreachableError
+from storage.remote.opening import put_back_objects, repair_objects, verify_archive
 from tests.storage.small_archive import Small, small_survey
 from tests.storage.small_bucket import FIRST, SECOND, Machine, make, object_of, problems, rot
 
@@ -117,7 +116,6 @@ def test_a_late_upload_rests_on_what_others_published_meanwhile(
     mine = machine(FIRST)
     small_survey(machine(SECOND))
     late = survey_in_silence(mine, monkeypatch)
-    assert late.run is not None
     archive = machine(FIRST)
     assert problems(archive) == []
     runs = Catalogue.read(machine(THIRD, create=False).root).runs
@@ -148,7 +146,7 @@ def test_a_broken_off_repair_keeps_its_files_from_gc(machine: Machine, monkeypat
     def kill(settings: dict[str, Any]) -> None:
         raise KeyboardInterrupt
 
-    found = [one for one in archive.verify_all() if one.problem]
+    found = [one for one in verify_archive(archive) if one.problem]
     with monkeypatch.context() as patch:
         _put_back_once(patch)
         with pytest.raises(KeyboardInterrupt):
@@ -168,14 +166,13 @@ def _put_back_once(patch: pytest.MonkeyPatch) -> None:
         calls.append(archive)
         return put_back_objects(archive) if len(calls) == 1 else []
 
-    patch.setattr("storage.remote.object_repairs.put_back_objects", put_back)
+    patch.setattr("storage.remote.opening.put_back_objects", put_back)
 
 
 def test_a_run_that_lost_its_manifest_keeps_its_stores(machine: Machine) -> None:
     """verify names it, gc removes no store and nothing of the run; where the run is known, verify --repair cures it."""
     archive = machine(FIRST)
     small = small_survey(archive)
-    assert small.run is not None
     archive.objects.remove([f"runs/{small.run.name}/manifest.json"])
     other = machine(SECOND, create=False)
     (found,) = problems(other)
@@ -183,7 +180,7 @@ def test_a_run_that_lost_its_manifest_keeps_its_stores(machine: Machine) -> None
     done = clear_up(other, keep_days=0)
     assert done.removals == ()
     assert "has lost its manifest.json" in str(done.obstacle)
-    done_here = repair_objects(archive, [one for one in archive.verify_all() if one.problem], lambda settings: None)
+    done_here = repair_objects(archive, [one for one in verify_archive(archive) if one.problem], lambda settings: None)
     assert done_here.complete
     assert problems(other) == []
 
@@ -192,7 +189,6 @@ def test_gc_clears_away_runs_that_were_only_begun(machine: Machine) -> None:
     """A killed survey leaves the claim of a name; a published run's stays."""
     archive = machine(FIRST)
     small = small_survey(archive)
-    assert small.run is not None
     archive.objects.write("runs/20261120T101010-killed/begun", b"0")
     archive.objects.write("elsewhere/runs/20261120T101010-other/begun", b"another archive, below this one")
     (removal,) = clear_up(machine(SECOND, create=False), keep_days=0).removals
@@ -244,7 +240,6 @@ def test_a_damaged_store_that_waits_holds_nobody_up(
 ) -> None:
     """It cannot be uploaded, nor the run that names it; they stay here, all else goes on, and why is said."""
     late = survey_in_silence(machine(FIRST), monkeypatch)
-    assert late.run is not None
     folder = late.raw.path
     kept = (folder / "data.bin").read_bytes()
     (folder / "data.bin").write_bytes(kept[:-1])
@@ -299,7 +294,7 @@ def test_a_repair_that_changes_nothing_is_no_cure(machine: Machine) -> None:
     archive = machine(FIRST)
     small = small_survey(archive)
     archive.objects.write(object_of(archive, small.map, "data.bin") + ".more", b"x")
-    found = [one for one in archive.verify_all() if one.problem]
+    found = [one for one in verify_archive(archive) if one.problem]
     done = repair_objects(archive, found, lambda settings: small_survey(machine(FIRST)) and None)
     assert done.remade == [small.map.uri]
     assert problems(archive) == []
@@ -317,7 +312,7 @@ def test_a_repair_knows_its_old_copy_from_what_stands(machine: Machine) -> None:
     rot(other, object_of(other, small.raw, "data.bin"))
     mended = machine(FIRST, create=False)
     assert mended.copy.is_known(small.raw.uri)
-    found = [one for one in mended.verify_all() if one.problem]
+    found = [one for one in verify_archive(mended) if one.problem]
     done = repair_objects(mended, found, lambda settings: small_survey(machine(FIRST)) and None)
     assert done.complete
     assert problems(mended) == []
@@ -389,7 +384,7 @@ def test_findings_of_a_bucket_are_of_known_kinds(machine: Machine) -> None:
     archive = machine(FIRST)
     archive.objects.write(".withdrawn/stages/rectify/key/manifest.json", b"{}")
     expected = "a repair was broken off; run verify --repair again"
-    assert archive.verify_all() == [Finding(".withdrawn/stages/rectify/key/manifest.json", expected, "stray")]
+    assert verify_archive(archive) == [Finding(".withdrawn/stages/rectify/key/manifest.json", expected, "stray")]
 
 
 def test_a_manifest_that_is_lost_is_written_again_from_any_machine_that_knows_it(machine: Machine) -> None:
@@ -398,7 +393,7 @@ def test_a_manifest_that_is_lost_is_written_again_from_any_machine_that_knows_it
     other = machine(SECOND, create=False)
     other.objects.remove([f"{small.raw.uri}/manifest.json"])
     assert not (other.root / small.raw.uri / "data.bin").exists()
-    done = repair_objects(other, [one for one in other.verify_all() if one.problem], lambda settings: None)
+    done = repair_objects(other, [one for one in verify_archive(other) if one.problem], lambda settings: None)
     assert (done.remade, done.complete) == ([small.raw.uri], True)
     assert problems(other) == []
 
@@ -438,7 +433,7 @@ def test_what_a_run_names_is_not_forgotten_where_the_bucket_lost_it(machine: Mac
     archive = machine(SECOND)
     archive.objects.remove(archive.objects.listing(small.raw.uri))
     here = machine(FIRST, create=False)
-    done = repair_objects(here, [one for one in here.verify_all() if one.problem], lambda settings: None)
+    done = repair_objects(here, [one for one in verify_archive(here) if one.problem], lambda settings: None)
     assert (done.remade, done.complete) == ([small.raw.uri], True)
     assert problems(archive) == []
 
@@ -459,7 +454,7 @@ def test_a_survey_does_not_begin_under_somebody_who_clears_up(
 ) -> None:
     """It waits, and says at last which object to remove; two surveys do not disturb each other."""
     one, other = machine(FIRST), machine(SECOND)
-    monkeypatch.setattr(object_leases, "WAIT_S", 0.1)
+    monkeypatch.setattr(object_checks, "WAIT_S", 0.1)
     with (
         one.in_use(alone=True) as alone,
         pytest.raises(ArchiveError, match=r"cleared up or repaired elsewhere \(\.in-use/alone-"),
@@ -479,7 +474,7 @@ def test_a_lease_of_a_machine_that_never_returned_counts_for_a_day(
     archive.objects.write(".in-use/shared-lost", b"")
     with archive.in_use(alone=True) as alone:
         assert not alone
-    monkeypatch.setattr(object_leases, "LIFE_S", -1.0)
+    monkeypatch.setattr(object_checks, "LIFE_S", -1.0)
     with archive.in_use(alone=True) as alone:
         assert alone
 
@@ -493,6 +488,6 @@ def test_a_lease_that_was_taken_away_is_taken_again(machine: Machine, monkeypatc
         return len(names) == 1 or create(self, name, content)
 
     monkeypatch.setattr(Objects, "create", create_in_vain)
-    monkeypatch.setattr(object_leases, "_PAUSE_S", 0.01)
+    monkeypatch.setattr(object_checks, "_PAUSE_S", 0.01)
     with archive.in_use():
         assert list(archive.objects.listing(".in-use")) == [names[0]]
