@@ -10,24 +10,18 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from flows.evaluate.budgets import summarise_equal_time, summarise_rig
-from flows.evaluate.controls import design_of, open_controls
 from flows.evaluate.costs import Prices
-from flows.evaluate.curve import REFERENCE
-from flows.evaluate.files import publish_evaluation
-from flows.evaluate.frames import Candidate, open_candidates, open_frames
-from flows.evaluate.jobs import Jobs, Show, sort_frames
-from flows.evaluate.kept_results import writing
+from flows.evaluate.frames import Candidate, Jobs, Show, open_candidates, open_frames, scene_of, sort_frames
 from flows.evaluate.request import COST, EvaluateRequest, checked_request
-from flows.evaluate.rows import known_or_none
-from flows.evaluate.series import Record, seeds_of
-from flows.evaluate.summary import summarise
+from flows.evaluate.rows import Trial, design_of, known_or_none, open_controls
+from flows.evaluate.series import REFERENCE, Record, seeds_of
+from flows.evaluate.summary import summarise, summarise_equal_time, summarise_rig
 from flows.evaluate.table import print_evaluation
-from flows.evaluate.work import Judged, Work
+from flows.evaluate.work import Judged, Record, Work, writing
 from flows.terminal.progress import StageProgress
 from flows.terminal.shown_text import on_stdout
 from models.evaluation.bootstrap import LEVEL
-from models.evaluation.metrics import agreement, false_pixels, iou_per_class
+from models.evaluation.metrics import agreement, false_pixels, iou_per_class, mean_iou
 from models.network.process import keep_freed_memory
 from models.weights.files import describe_weights, unsealed_note
 from storage.archive.whole_files import to_json
@@ -156,3 +150,56 @@ def _of_frame(row: Record) -> Record:
         "per_class_iou": [known_or_none(iou) for iou in iou_per_class(counts)],
         "false_pixels": false_pixels(counts).tolist(),
     }
+
+
+SHOWN_SHARE = 0.10  # of the seats, or the nearest one tried: what the pictures show
+
+
+def publish_evaluation(work: Work, content: dict[str, Any], runs: list[list[Record]], show: Show) -> list[str]:
+    """Write figures, plots and pictures into the folder, where there is one; names of the files."""
+    out = work.request.out
+    if out is None:
+        return []
+    from flows.evaluate.plots import draw_evaluation, draw_frame, draw_rig
+
+    shown = shown_row(work.trial)
+    files = [out / "evaluation.json", out / "evaluation.png"]
+    with writing(out):
+        draw_evaluation(files[1], content)
+        if content["rig"]["rows"]:
+            files.append(out / "rig.png")
+            draw_rig(files[-1], content)
+        for title, name, index in ends(runs, *shown):
+            show("drawing", len(files) / 6, title)
+            path, scene = out / f"{title}.png", scene_of(work.data, name)
+            draw_frame(path, f"{title} frame", work.look(scene, name, index), work.loaded(index), *shown)
+            files.append(path)
+        content["files"] = [str(path) for path in files]
+        temporary = files[0].with_name("evaluation.json.part")
+        temporary.write_text(to_json(content), encoding="utf-8")
+        temporary.replace(files[0])
+    show("drawing", 1.0, "")
+    return [str(path) for path in files]
+
+
+def shown_row(trial: Trial) -> tuple[str, float]:
+    """Policy and share of the pictures: the first policy, and the share nearest 10 %."""
+    policy = trial.policies[0] if trial.policies and trial.shares else "none"
+    share = min(trial.shares, key=lambda share: abs(share - SHOWN_SHARE), default=0.0) if policy != "none" else 0.0
+    return policy, share
+
+
+def ends(runs: list[list[Record]], policy: str, share: float) -> list[tuple[str, str, int]]:
+    """Title, frame and weights of the lowest and the highest mIoU of a frame's own; one frame alone is the worst."""
+    judged: dict[str, tuple[float, int]] = {}
+    for number, records in enumerate(runs):
+        for record in records:
+            row = next(row for row in record["rows"] if (row["policy"], row["share"]) == (policy, share))
+            own = mean_iou(np.array(row["counts"]))
+            if not np.isnan(own):
+                judged.setdefault(record["frame"], (own, number))
+    if not judged:
+        return []
+    worst, best = (choose(judged, key=lambda name: judged[name][0]) for choose in (min, max))
+    named = [("worst", worst)] if worst == best else [("worst", worst), ("best", best)]
+    return [(title, name, judged[name][1]) for title, name in named]

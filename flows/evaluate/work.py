@@ -2,29 +2,75 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import time
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any
 
-from flows.evaluate.controls import design_of, judge_control
-from flows.evaluate.costs import capture_seconds
-from flows.evaluate.equal_time import judge_equal_time
-from flows.evaluate.frames import Candidate, Look, Sight, look_at, sight_of
-from flows.evaluate.jobs import Job, Jobs, Show, scene_of
-from flows.evaluate.kept_results import KeptResults
-from flows.evaluate.pooled import Bought, buy_by_seed, joined_rows, judge_pooled, pooled_policies, score_frame
+from flows.evaluate.costs import Rounds, capture_seconds, time_frame
+from flows.evaluate.frames import Candidate, Job, Jobs, Look, Show, Sight, look_at, scene_of, sight_of
 from flows.evaluate.request import COST, EvaluateRequest
-from flows.evaluate.rig_plans import BUDGETS, judge_rig
-from flows.evaluate.rows import Trial, judge_frame
-from flows.evaluate.timing import Rounds, time_frame
+from flows.evaluate.rig_plans import BUDGETS, judge_equal_time, judge_rig
+from flows.evaluate.rows import (
+    Bought,
+    Trial,
+    buy_by_seed,
+    design_of,
+    joined_rows,
+    judge_control,
+    judge_frame,
+    judge_pooled,
+    pooled_policies,
+    score_frame,
+)
 from flows.terminal.figures import format_seconds
 from flows.training.data import TrainingData
 from models.weights.files import AnyWeights, Weights
+from pipeline.errors import ArchiveError
 from pipeline.geometry.camera import LineCamera
 from pipeline.planning.line_blocks import WIDTHS
 from pipeline.simulator.scenes.scene import RasterScene
+
+VERSION = 2  # of what a kept result says
+
+
+@contextmanager
+def writing(folder: Path) -> Iterator[None]:
+    """Turn a folder that cannot be written to into an error that says so."""
+    try:
+        yield
+    except OSError as error:
+        raise ArchiveError(f"cannot write to {folder}: {error.strerror}; choose another --out") from error
+
+
+@dataclass(frozen=True)
+class KeptResults:
+    """A folder of results by what they follow from; without a folder nothing is kept."""
+
+    folder: Path | None
+
+    def made(self, what: str, follows_from: dict[str, Any], make: Callable[[], dict[str, Any] | None]) -> Any:
+        """Give the result that was kept, or make it and keep it: whole or not at all. A damaged one is made again."""
+        if self.folder is None:
+            return make()
+        text = json.dumps([VERSION, what, follows_from], sort_keys=True)
+        path = self.folder / f"{what}-{hashlib.sha256(text.encode()).hexdigest()[:20]}.json"
+        try:
+            return json.loads(path.read_text(encoding="utf-8"))["result"]
+        except (OSError, ValueError, LookupError, TypeError):
+            result = make()
+        with writing(self.folder):
+            self.folder.mkdir(parents=True, exist_ok=True)
+            temporary = path.with_name(path.name + ".part")
+            temporary.write_text(json.dumps({"follows_from": follows_from, "result": result}), encoding="utf-8")
+            temporary.replace(path)
+        return result
+
 
 Record = dict[str, Any]
 Report = Callable[[float], None]

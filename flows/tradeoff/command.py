@@ -13,20 +13,13 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-import flows.tradeoff.budget
-import flows.tradeoff.line_model
-import flows.tradeoff.overlap
-import flows.tradeoff.resample
-import flows.tradeoff.scan_step
-import flows.tradeoff.segment
+import flows.tradeoff.farm
+import flows.tradeoff.rectify
 import flows.tradeoff.simulate
-import flows.tradeoff.simulate_bands
-import flows.tradeoff.simulate_noise
-import flows.tradeoff.simulate_rays
-import flows.tradeoff.store
-import flows.tradeoff.tie_spacing  # noqa: F401 - each registers its entry
+import flows.tradeoff.simulate_light
+import flows.tradeoff.simulate_noise  # noqa: F401 - each registers its entries
 from flows.terminal.figures import format_seconds
-from flows.tradeoff.entries import Level, Point, Result, cheapest_within, find_tradeoffs, measure_tradeoff, registered
+from flows.tradeoff.entries import Point, Result, cheapest_within, find_tradeoffs, measure_tradeoff, registered
 from flows.tradeoff.plots import draw_tradeoffs
 from pipeline.errors import ArchiveError, SettingsError
 
@@ -73,9 +66,12 @@ def _short(seconds: float) -> str:
 
 
 def _caption(result: Result) -> str:
-    machine = result.machine
+    machine, floors = result.machine, ""
     priced = "the cost model" if any(point.modelled_s is not None for point in result.points) else "processor time"
-    floors = "".join(f"{_within(result, level)}\n" for level in result.levels)
+    for level in result.levels:
+        point = cheapest_within(result, level.error)
+        found = "no setting" if point is None else f"{point.setting}, {_short(point.ns_per_unit * 1e-9)}"
+        floors += f"within {level.name} ({level.error:.2g}): {found}\n"
     if result.memory_floor_ns is not None:
         floors += f"copying the bytes of a {result.unit} alone: {_short(result.memory_floor_ns * 1e-9)}\n"
     rounds = f"{result.repeats} repeat{'s' if result.repeats > 1 else ''} in turn"
@@ -85,13 +81,6 @@ def _caption(result: Result) -> str:
         f"{machine['processor']}"
     )
     return escape(words)
-
-
-def _within(result: Result, level: Level) -> str:
-    """Say what keeps below a level costs."""
-    point = cheapest_within(result, level.error)
-    found = "no setting" if point is None else f"{point.setting}, {_short(point.ns_per_unit * 1e-9)}"
-    return f"within {level.name} ({level.error:.2g}): {found}"
 
 
 def run_tradeoff(stage: str | None, out: Path, repeats: int, seed: int, console: Console) -> dict[str, Any]:

@@ -55,22 +55,26 @@ def tradeoff_figure(results: Sequence[Result]) -> Figure:
 
 def _draw_tradeoff(axes: Axes, result: Result) -> None:
     points = [point for point in result.points if math.isfinite(point.error)]
-    size, unit = _time_unit(result)
-    place = {id(point): (_time(result, point) / size, point.error) for point in points}
-    exact = _logarithmic(axes, result, list(place.values()), (result.memory_floor_ns or 0) / size)
-    place = {key: (x, y if y > 0 else exact) for key, (x, y) in place.items()}
+    modelled = any(point.modelled_s is not None for point in result.points)
+    least = min(point.ns_per_unit for point in result.points)
+    fits = (one for one in _UNITS if least >= one[0])
+    size, unit = (1.0, "s") if modelled else next(fits, _UNITS[-1])
     floor = None if result.memory_floor_ns is None else result.memory_floor_ns / size
+    place = {id(one): ((one.price_s if modelled else one.ns_per_unit) / size, one.error) for one in points}
+    exact = _logarithmic(axes, result, list(place.values()), floor or 0)
+    place = {key: (x, y if y > 0 else exact) for key, (x, y) in place.items()}
     _draw_levels(axes, result, list(place.values()), floor)
     if floor is not None:
         _draw_memory_floor(axes, floor)
     front = sorted((point for point in points if point.pareto), key=lambda point: point.price_s)
     for group, style, line in ((front, _FRONT, 1.4), ([p for p in points if not p.pareto], _BEATEN, 0)):
-        axes.plot(*_columns([place[id(point)] for point in group]), linewidth=line, zorder=3, **style)
-    for (x, y), together in _by_place(axes, [(place[id(point)], point) for point in points]):
+        x, y = ([place[id(point)][axis] for point in group] for axis in (0, 1))
+        axes.plot(x, y, linewidth=line, zorder=3, **style)
+    for at, together in _by_place(axes, [(place[id(point)], point) for point in points]):
         beside = (7, 7) if any(point.pareto for point in together) else (9, -4)
         axes.annotate(
             ", ".join(str(point.setting) for point in together),
-            (x, y),
+            at,
             beside,
             textcoords="offset points",
             color=INK,
@@ -79,7 +83,7 @@ def _draw_tradeoff(axes: Axes, result: Result) -> None:
             path_effects=[withStroke(linewidth=3, foreground=_PAPER)],
         )
     axes.set_title(f"{result.stage}: {result.knob}", loc="left", weight="bold", color=INK, size=13)
-    axes.set_xlabel("seconds by the cost model" if unit == "s" else f"{unit} / {result.unit}", color=INK)
+    axes.set_xlabel("seconds by the cost model" if modelled else f"{unit} / {result.unit}", color=INK)
     axes.set_ylabel(result.error, color=INK)
     axes.set_facecolor(_PAPER)
     axes.grid(visible=True, which="major", color=_GRID, linewidth=0.8)
@@ -101,27 +105,6 @@ def _by_place(
         else:
             together.append(point)
     return found
-
-
-def _columns(places: Sequence[tuple[float, float]]) -> tuple[list[float], list[float]]:
-    return [x for x, _ in places], [y for _, y in places]
-
-
-def _time(result: Result, point: Point) -> float:
-    """Seconds of the model, or nanoseconds for a unit."""
-    return point.price_s if _is_modelled(result) else point.ns_per_unit
-
-
-def _is_modelled(result: Result) -> bool:
-    return any(point.modelled_s is not None for point in result.points)
-
-
-def _time_unit(result: Result) -> tuple[float, str]:
-    """Size and name of the unit that suits the times."""
-    if _is_modelled(result):
-        return 1.0, "s"
-    least = min(point.ns_per_unit for point in result.points)
-    return next(((size, name) for size, name in _UNITS if least >= size), _UNITS[-1])
 
 
 def _draw_levels(axes: Axes, result: Result, places: Sequence[tuple[float, float]], floor: float | None) -> None:
@@ -178,7 +161,12 @@ def _logarithmic(axes: Axes, result: Result, places: Sequence[tuple[float, float
     has_zero = any(y == 0 for _, y in places)
     axes.set_ylim(_widened(exact if has_zero else low, high))
     for axis in (axes.xaxis, axes.yaxis):
-        _plain_ticks(axis)
+        low_tick, high_tick = axis.get_view_interval()
+        decades = math.log10(high_tick / low_tick)
+        parts = (1.0,) if decades > 4 else (1.0, 3.0) if decades > 1.6 else (1.0, 2.0, 5.0)
+        axis.set_major_locator(LogLocator(subs=parts, numticks=12))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: _plain(value)))
+        axis.set_minor_formatter(NullFormatter())
     if has_zero:
         ticks = [tick for tick in axes.get_yticks() if low * 0.999 <= tick <= axes.get_ylim()[1]]
         axes.yaxis.set_major_locator(FixedLocator([exact, *ticks]))
@@ -195,16 +183,6 @@ def _range(values: Sequence[float]) -> tuple[float, float]:
 
 def _widened(low: float, high: float, above: float = _ROOM) -> tuple[float, float]:
     return low / (high / low) ** _ROOM, high * (high / low) ** above
-
-
-def _plain_ticks(axis: Any) -> None:
-    """Plain figures: at every decade, and within them where there are few."""
-    low, high = axis.get_view_interval()
-    decades = math.log10(high / low)
-    parts = (1.0,) if decades > 4 else (1.0, 3.0) if decades > 1.6 else (1.0, 2.0, 5.0)
-    axis.set_major_locator(LogLocator(subs=parts, numticks=12))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: _plain(value)))
-    axis.set_minor_formatter(NullFormatter())
 
 
 def _plain(value: float) -> str:

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.survey.full_look import columns_of_all_seats
 from flows.survey.run import SurveyRun
 from flows.survey.stage import Product, Wanted, stage
 from flows.survey.stages.class_map import glance_at, patch_columns
@@ -34,12 +33,16 @@ from models.evaluation.metrics import (
 from models.policies.free_seats import CONTROL_SHARE, Controls, run_controls
 from models.policies.policies import score_seats
 from models.reading.inference import CoarseLook, Glance, glance_of_columns, segment
-from pipeline.geometry.grid import UNLABELLED
+from models.weights.files import Weights
+from pipeline.geometry.grid import UNLABELLED, SceneGrid
+from pipeline.geometry.scan import Sweep
 from pipeline.planning.fine_pass import price_of_seats
 from pipeline.planning.savings import count_lines
 from pipeline.planning.selection import frame_seats
+from pipeline.rectify.region import read_seats
+from pipeline.rectify.resample import Kernel
 from pipeline.simulator.effects.pointing import CommonOffset, PointingErrors
-from pipeline.simulator.simulated import SimulatedSource
+from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 from storage.archive.archive import StageRef
 from storage.archive.keys import array_digest
 from storage.archive.stored_tables import read_table
@@ -229,3 +232,52 @@ def _figures(run: SurveyRun, counts: NDArray[np.int64]) -> dict[str, Any]:
 def load_accuracy(evaluated: StageRef) -> dict[str, Any]:
     """Read the figures of an evaluation."""
     return read_table(evaluated.path / RECORD)
+
+
+MEMORY_SHARE = 32  # a band of seats may take this part of the memory
+
+
+def columns_of_all_seats(
+    source: SimulatedSource,
+    full: Sequence[Sweep],
+    grid: SceneGrid,
+    weights: Weights,
+    *,
+    memory: int,
+    kernel: Kernel,
+    report: Callable[[float], None] = lambda done: None,
+) -> NDArray[np.float32]:
+    """Scan the scene in full, a band of seats at a time, and keep the normalised columns only.
+
+    Parameters
+    ----------
+    full
+        Sweeps of the full scan.
+    memory
+        What the survey may take. [bytes]
+
+    Returns
+    -------
+    (seat, p, p, column) float32 of the padded grid; seats beyond the scene are 0.
+    """
+    sweeps = [SimulatedSweep(source, sweep) for sweep in full]
+    p, valid = grid.patch, grid.valid_seats()
+    columns = np.zeros((int(np.prod(grid.seat_shape)), p, p, weights.basis.columns), np.float32)
+    band_bytes = memory // MEMORY_SHARE
+    done = 0
+    for seats in _bands_of_seats(grid, full[0].along == "x", band_bytes, len(source.wavelength_nm)):
+        values, _ = read_seats(sweeps, source.camera, grid, seats, kernel)
+        columns[seats] = weights.columns(values, source.wavelength_nm)
+        done += len(seats)
+        report(done / len(valid))
+    return columns
+
+
+def _bands_of_seats(grid: SceneGrid, rows: bool, most_bytes: int, bands: int) -> list[NDArray[np.intp]]:
+    """Valid seats in bands across the scan, as many rows (or columns) a band as fit."""
+    valid = grid.valid_seats()
+    row, column = np.divmod(valid, grid.seat_shape[1])
+    place = row if rows else column
+    one = int(np.count_nonzero(place == 0)) * grid.patch**2 * bands * 4
+    deep = max(1, most_bytes // one)
+    return [valid[place // deep == band] for band in range(int(place.max()) // deep + 1)]

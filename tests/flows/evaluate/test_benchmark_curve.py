@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from flows.evaluate.curve import curve_figures
+from flows.evaluate.series import curve_figures
 
 
 def test_a_straight_line_in_the_logarithm_closes_half():

@@ -15,10 +15,17 @@ from rich.console import Console
 
 from flows.evaluate import work as benchmark_work
 from flows.evaluate.command import evaluate_weights, run_evaluate
-from flows.evaluate.plot import evaluation_figure
-from flows.evaluate.pooled import buy_by_seed, buy_together, judge_pooled, pooled_policies, score_frame
+from flows.evaluate.plots import evaluation_figure
 from flows.evaluate.request import EvaluateRequest
-from flows.evaluate.rows import Trial, judge_frame
+from flows.evaluate.rows import (
+    Trial,
+    buy_by_seed,
+    buy_together,
+    judge_frame,
+    judge_pooled,
+    pooled_policies,
+    score_frame,
+)
 from models.policies.policies import score_seats
 from pipeline.planning.selection import seat_count
 from tests.flows.small_fields import FRAMES, QUICK, looked_at, scene_at, write_field, write_weights

@@ -13,17 +13,15 @@ from rich.console import Console
 
 from flows.cli.main import main
 from flows.evaluate import work as benchmark_work
-from flows.evaluate.command import evaluate_weights, run_evaluate
-from flows.evaluate.costs import Prices
-from flows.evaluate.files import ends
+from flows.evaluate.command import ends, evaluate_weights, run_evaluate
+from flows.evaluate.costs import Prices, Rounds, cpu_seconds, row_seconds
 from flows.evaluate.frames import open_candidates
-from flows.evaluate.kept_results import KeptResults
 from flows.evaluate.request import EvaluateRequest
 from flows.evaluate.rows import ORACLE, Trial, captured_px, judge_frame, placings
 from flows.evaluate.series import collect_row
 from flows.evaluate.summary import summarise
 from flows.evaluate.table import print_evaluation
-from flows.evaluate.timing import Rounds, cpu_seconds, row_seconds
+from flows.evaluate.work import KeptResults
 from flows.training.data import farm_test_data, pack_mask
 from flows.training.train import TrainRequest, train_weights
 from models.evaluation.metrics import average_accuracy, kappa, mean_iou, overall_accuracy

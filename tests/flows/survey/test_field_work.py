@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from flows.settings.load import load_settings
-from flows.survey.field_work import SHARD, FieldWork, region_params
-from flows.survey.region_work import Scoring, WeightsFile
+from flows.survey.field_work import SHARD, FieldWork, Scoring, WeightsFile, region_params
 from flows.survey.run import SurveyRun, open_run
 from models.reading.regions import Region, plan_regions
 from pipeline.errors import SettingsError, WeightsError
@@ -118,7 +117,7 @@ def test_a_worker_at_regions_keeps_no_tiles(
     """What it held for the mosaic is given back before a region is read: the memory was promised once."""
     run, stages = surveyed
     let_go: list[bool] = []
-    monkeypatch.setattr("flows.survey.region_work.let_tiles_go", lambda: let_go.append(True))
+    monkeypatch.setattr("flows.survey.field_work.let_tiles_go", lambda: let_go.append(True))
     work = _work(run, Crew(workers=1), 1)
     work.score("entropy", _store(stages, "rectify/*/mosaic.zarr"), lambda done: None)
     assert len(let_go) == 2

@@ -8,7 +8,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from flows.survey.model_work import work_done, work_of_map
+from flows.survey.extent import work_done, work_of_map
 from flows.survey.run import SurveyRun
 from models.network.cost import multiply_adds
 from models.network.sizes import SegmenterConfig

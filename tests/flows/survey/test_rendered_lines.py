@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flows.survey.rendered_lines import rendering_crew, take_lines
+from flows.survey.stages.capture import rendering_crew, take_lines
 from pipeline.errors import RigError, SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep

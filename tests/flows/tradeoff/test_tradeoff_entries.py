@@ -8,15 +8,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flows.tradeoff import budget as tradeoff_budget
-from flows.tradeoff import store as tradeoff_store
+from flows.tradeoff import farm as tradeoff_farm
 from flows.tradeoff.entries import measure_tradeoff
-from flows.tradeoff.line_model import LINE_MODEL
-from flows.tradeoff.overlap import OVERLAP, Seams
-from flows.tradeoff.resample import RESAMPLE, draw_waves, noise_levels
-from flows.tradeoff.scan_step import SCAN_STEP
-from flows.tradeoff.store import BITS, CODEC, SIZE
-from flows.tradeoff.tie_spacing import TIE_SPACING
+from flows.tradeoff.farm import BITS, BUDGET, CODEC, SIZE
+from flows.tradeoff.rectify import (
+    LINE_MODEL,
+    OVERLAP,
+    PERIODS_PX,
+    RESAMPLE,
+    SCAN_STEP,
+    TIE_SPACING,
+    Seams,
+    draw_waves,
+    noise_levels,
+)
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel
@@ -26,11 +31,11 @@ from pipeline.rectify.registration.shifts import PairShift
 
 def test_waves_are_what_they_claim():
     """The analytic scene holds periods of 4 to 40 px only and is the same for the same seed."""
-    waves = draw_waves(3)
+    waves = draw_waves(3, 64, PERIODS_PX)
     period = 1 / np.hypot(*waves.frequency.T)
     assert period.min() >= 4
     assert period.max() <= 40
-    np.testing.assert_array_equal(waves.at(np.ones((1, 2))), draw_waves(3).at(np.ones((1, 2))))
+    np.testing.assert_array_equal(waves.at(np.ones((1, 2))), draw_waves(3, 64, PERIODS_PX).at(np.ones((1, 2))))
 
 
 def test_noise_levels_follow_the_camera():
@@ -93,8 +98,8 @@ def test_fewer_lines_take_less_time_and_show_less():
 
 def test_a_larger_budget_takes_more_seconds_and_draws_a_better_map(monkeypatch):
     """Coarse and fine seconds together keep the budget and nearly use it up; the error is that of the class map."""
-    monkeypatch.setattr(tradeoff_budget, "SHAPE", (256, 640))
-    half, whole = measure_tradeoff(replace(tradeoff_budget.BUDGET, settings=(0.6, 1.0)), repeats=1).points
+    monkeypatch.setattr(tradeoff_farm, "BUDGET_SHAPE", (256, 640))
+    half, whole = measure_tradeoff(replace(BUDGET, settings=(0.6, 1.0)), repeats=1).points
     *_, full_s = cheapest_full(SceneGrid(256, 640, 16, 4), LineCamera(), CostModel())
     assert 0.55 < half.price_s / full_s <= 0.6
     assert 0.95 < whole.price_s / full_s <= 1.0
@@ -103,7 +108,7 @@ def test_a_larger_budget_takes_more_seconds_and_draws_a_better_map(monkeypatch):
 
 def test_fewer_bits_are_smaller_and_change_more_of_the_map(monkeypatch):
     """Kept bits of the mosaic: at eleven hardly a class changes, at three many do, in fewer bytes."""
-    monkeypatch.setattr(tradeoff_store, "SHAPE", (128, 192))
+    monkeypatch.setattr(tradeoff_farm, "STORE_SHAPE", (128, 192))
     state = BITS.prepare(0)
     judged = {kept: BITS.judge(state, kept, BITS.run(state, kept)) for kept in (23.0, 11.0, 3.0)}
     sizes = {kept: SIZE.judge(state, kept, SIZE.run(state, kept)) for kept in judged}
@@ -114,7 +119,7 @@ def test_fewer_bits_are_smaller_and_change_more_of_the_map(monkeypatch):
 
 def test_codecs_give_back_raw_lines_in_fewer_bytes(monkeypatch):
     """Every codec but none stores a sample of uint16 in less than two bytes."""
-    monkeypatch.setattr(tradeoff_store, "SHAPE", (128, 192))
+    monkeypatch.setattr(tradeoff_farm, "STORE_SHAPE", (128, 192))
     state = CODEC.prepare(0)
     sizes = {codec: CODEC.judge(state, codec, CODEC.run(state, codec)) for codec in CODEC.settings}
     assert all(size < 2 for codec, size in sizes.items() if codec != "none")

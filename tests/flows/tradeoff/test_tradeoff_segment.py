@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from flows.tradeoff import farm as tradeoff_farm
-from flows.tradeoff import segment as tradeoff_segment
 from flows.tradeoff.entries import find_tradeoffs
-from flows.tradeoff.segment import AGREEMENT, BAND_COUNT, BANDS, PRECISION, PRECISIONS, SEATS, SHARES, Farm
+from flows.tradeoff.farm import AGREEMENT, BAND_COUNT, BANDS, PRECISION, PRECISIONS, SEATS, SHARES, Farm
 from models.network.segmenter import Segmenter, SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
 from models.weights.files import Weights
@@ -34,9 +33,9 @@ def farm() -> Farm:
     weights = Weights(model, basis, flat, scene.class_names, np.asarray(scene.class_colours))
     kept: list[bool] = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("models.network.process.keep_freed_memory", lambda: kept.append(True))
+        patch.setattr(tradeoff_farm, "keep_freed_memory", lambda: kept.append(True))
         patch.setattr(tradeoff_farm, "load_weights", lambda path: weights)
-        patch.setattr(tradeoff_segment, "SHAPE", SHAPE)
+        patch.setattr(tradeoff_farm, "SEGMENT_SHAPE", SHAPE)
         prepared: Farm = SEATS.prepare(0)
     assert kept == [True]  # as surveys do
     return prepared

@@ -15,8 +15,7 @@ import torch
 from flows.training import start as train_start
 from flows.training import train as flow
 from flows.training.data import pack_mask, unpack_mask
-from flows.training.start import joined_split
-from flows.training.train import TrainRequest, train_weights
+from flows.training.train import TrainRequest, joined_split, train_weights
 from models.training.start_weights import StartFile
 from models.training.train import TrainingSettings
 from models.weights.files import describe_weights, load_weights

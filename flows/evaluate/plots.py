@@ -1,17 +1,29 @@
-"""An evaluation as a plot: mIoU over CPU seconds, one line a policy, none, all and the baseline as lines across."""
+"""An evaluation as plots (mIoU over costs and over capture seconds), and a frame of it as a picture."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from numpy.typing import NDArray
 
-from flows.publish.panels import INK, MUTED
+from flows.evaluate.frames import Look
+from flows.evaluate.rows import Trial, placings
+from flows.publish.panels import INK, MUTED, class_palette, class_rgb, outline
 from flows.terminal.figures import format_percent
+from models.evaluation.metrics import confusion, mean_iou, overall_accuracy
+from models.reading.inference import segment
+from models.weights.files import Weights
+from pipeline.geometry.grid import UNLABELLED
+from pipeline.planning.selection import frame_seats
+from storage.arrays.quicklooks import choose_bands, stretch
 
 _COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#882255", "#332288", "#999933")
 PAPER, GRID = "#fbfaf7", "#e3e1d8"
@@ -33,7 +45,7 @@ def evaluation_figure(content: dict[str, Any]) -> Figure:
     for number, (panel, (what, label, unit)) in enumerate(
         zip(figure.subplots(1, len(wanted), squeeze=False).ravel(), wanted, strict=True)
     ):
-        _draw_panel(panel, content, what, unit)
+        _draw_costs(panel, content, what, unit)
         panel.set_xlabel(label, color=INK)
         panel.set_ylabel("mIoU [%]", color=INK)
         if not number:
@@ -46,7 +58,7 @@ def evaluation_figure(content: dict[str, Any]) -> Figure:
     return figure
 
 
-def _draw_panel(axes: Axes, content: dict[str, Any], what: str, unit: float) -> None:
+def _draw_costs(axes: Axes, content: dict[str, Any], what: str, unit: float) -> None:
     rows = [row for row in content["rows"] if row["miou"] is not None]
     low, high = _reach(rows)
     far = [row for row in rows if 100 * row["miou"] < low]
@@ -159,3 +171,129 @@ def _name_shares(axes: Axes, rows: list[dict[str, Any]], what: str, unit: float)
         axes.annotate(
             format_percent(share), place, (0, -14), textcoords="offset points", color=INK, size=9, ha="center"
         )
+
+
+_STYLES = {
+    "gain": ("#0072B2", "-", "o"),
+    "entropy": ("#E69F00", "-", "o"),
+    "uniform lines": (INK, "--", "s"),
+    "random lines": ("#CC79A7", "--", "^"),
+}
+
+
+def draw_rig(path: Path, content: dict[str, Any]) -> None:
+    """Draw mIoU over capture seconds into a PNG file."""
+    figure = rig_figure(content)
+    FigureCanvasAgg(figure)
+    figure.savefig(path, format="png")
+
+
+def rig_figure(content: dict[str, Any]) -> Figure:
+    """Give the figure; the band around our plan is the interval of its difference to uniform lines."""
+    rows = [row for row in content["rig"]["rows"] if row["miou"] is not None]
+    figure = Figure(figsize=(7.4, 5.2), dpi=110, layout="constrained", facecolor=PAPER)
+    axes = figure.subplots()
+    ends = {row["policy"]: row for row in content["rows"] if row["policy"] in ("none", "all")}
+    for name, style in (("none", (0, (2, 2))), ("all", "-")):
+        label = f"{name}: {'coarse pass alone' if name == 'none' else 'every seat'}"
+        axes.axhline(100 * ends[name]["miou"], color=MUTED, linewidth=1.1, linestyle=style, label=label, zorder=1)
+    even = {row["budget"]: row["miou"] for row in rows if row["policy"] == "uniform lines"}
+    for plan in dict.fromkeys(row["policy"] for row in rows):
+        own = sorted((row for row in rows if row["policy"] == plan), key=lambda row: row["budget"])
+        colour, line, marker = _STYLES[plan]
+        seconds = [row["seconds"] for row in own]
+        axes.plot(
+            seconds,
+            [100 * row["miou"] for row in own],
+            color=colour,
+            linestyle=line,
+            marker=marker,
+            markersize=5,
+            linewidth=1.6,
+            label=plan,
+            zorder=3,
+        )
+        bounds = [row["against_uniform"] for row in own]
+        if all(one is not None and one["low"] is not None for one in bounds):
+            low, high = (
+                [100 * (even[row["budget"]] + one[end]) for row, one in zip(own, bounds, strict=True)]
+                for end in ("low", "high")
+            )
+            axes.fill_between(seconds, low, high, color=colour, alpha=0.12, linewidth=0, zorder=0)
+    axes.set_xlabel("capture seconds a frame, coarse pass included", color=INK)
+    axes.set_ylabel("mIoU [%]", color=INK)
+    axes.set_title(
+        f"{content['dataset']}, rig mode: {counted(len(content['frames']))}", loc="left", color=INK, weight="bold"
+    )
+    axes.set_facecolor(PAPER)
+    axes.grid(visible=True, color=GRID, linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.legend(loc="outside lower center", ncols=3, frameon=False, labelcolor=INK)
+    return figure
+
+
+LONG_SIDE = 900  # of a panel [px]; larger frames are thinned
+
+
+def draw_frame(path: Path, title: str, look: Look, weights: Weights, policy: str, share: float) -> None:
+    """Draw one frame at one share of the seats into a PNG file."""
+    figure = frame_figure(title, look, weights, policy, share)
+    FigureCanvasAgg(figure)
+    figure.savefig(path, format="png")
+
+
+def frame_figure(title: str, look: Look, weights: Weights, policy: str, share: float) -> Figure:
+    """Give the figure of four panels: image, labels, map, and where map and labels differ with the seats."""
+    seats = chosen_seats(look, weights, policy, share)
+    drawn = segment(weights, look.seen, look.fine[seats], seats).classes
+    counts = confusion(look.labels, drawn, weights.config.classes)
+    scores = f"mIoU {100 * mean_iou(counts):.1f}, overall {100 * overall_accuracy(counts):.1f}"
+    palette = class_palette(weights.config.classes, weights.class_colours)
+    height, width = look.labels.shape
+    step = max(1, max(height, width) // LONG_SIDE)
+    figure = Figure(figsize=(12, 12 * height / width + 1.2), dpi=100, layout="constrained")
+    panels = figure.subplots(2, 2).ravel()
+    known = look.labels != UNLABELLED
+    wrong = np.where(known & (drawn != look.labels), 1.0, 0.0)[..., None]
+    faded = 0.25 + 0.6 * _image(look, weights).mean(axis=-1, keepdims=True)
+    error = np.concatenate([np.maximum(faded, wrong), faded * (1 - wrong), faded * (1 - wrong)], axis=-1)
+    pictures = {
+        "image": _image(look, weights),
+        "labels": class_rgb(look.labels, palette),
+        f"map: {policy}, K = {format_percent(share)}, {scores}": class_rgb(drawn, palette),
+        f"{len(seats)} of {len(look.seen.grid.valid_seats())} seats; red: not the label": error,
+    }
+    for axes, (name, picture) in zip(panels, pictures.items(), strict=True):
+        _draw_panel(axes, name, picture[::step, ::step], (height, width))
+    chosen = np.zeros(look.seen.grid.seat_shape, bool)
+    chosen.ravel()[seats] = True
+    lines = outline(chosen, look.seen.grid.patch, (height, width))
+    for axes in panels[[0, 3]]:
+        axes.add_collection(LineCollection(lines, colors="#FFD23F", linewidths=1.0))
+    handles = [Patch(color=tuple(c), label=n) for n, c in zip(weights.class_names, palette, strict=True)]
+    figure.legend(handles=handles, loc="outside lower center", ncols=6, frameon=False, labelcolor=INK)
+    figure.suptitle(f"{title}: {look.name}", x=0.01, ha="left", color=INK, weight="bold")
+    return figure
+
+
+def chosen_seats(look: Look, weights: Weights, policy: str, share: float) -> NDArray[np.intp]:
+    """Seats of a policy, the ones that were judged."""
+    if policy == "none":
+        return np.empty(0, np.intp)
+    one = placings(Trial((share,), (policy,)), look, weights)[0]
+    return frame_seats(one.scores, share, look.seen.grid.valid_share().ravel() > 0).seats
+
+
+def _image(look: Look, weights: Weights) -> NDArray[np.float32]:
+    """The frame in natural or false colour, from the spectral columns."""
+    basis = weights.basis
+    bands, _ = choose_bands(np.linspace(basis.low_nm, basis.high_nm, basis.columns))
+    return stretch(look.picture[..., list(bands)])
+
+
+def _draw_panel(axes: Axes, name: str, picture: NDArray[np.floating], shape: tuple[int, int]) -> None:
+    height, width = shape
+    axes.imshow(np.clip(picture, 0, 1), extent=(-0.5, width - 0.5, height - 0.5, -0.5), interpolation="nearest")
+    axes.set_title(name, loc="left", color=INK, size=11)
+    axes.set_axis_off()
