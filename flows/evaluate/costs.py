@@ -1,7 +1,8 @@
 """What a row costs: samples, bytes, multiply-adds, seconds of the processor, seconds of capture.
 
-Each is the mean over frames and stands beside the baseline's, capture beside a full scan. The processor's seconds are of
-one thread; all parts go in turn, round after round, so that whatever slows the machine meets them alike.
+Each is the mean over frames and stands beside the baseline's, capture beside a full scan. The processor's seconds are
+of one thread: glance, scores and map, and the map of every control. All parts go in turn, round after round, so that
+whatever slows the machine meets them alike.
 """
 
 from __future__ import annotations

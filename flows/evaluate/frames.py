@@ -154,17 +154,13 @@ def open_frames(
     SettingsError : a choice that does not go with the data set.
     SceneError : no scene, or a name that it has not.
     """
-    if dataset not in FARM_NAMES:
-        data = open_training_data(dataset, 0, scenes, camera, **choices)
-        return _only(dataset, data, frames)
-    open_training_data(dataset, 0, 1, camera, **choices)  # refuses choices that are for files
-    count = FARM_TEST_SCENES if scenes is None else scenes
-    if count < 1:
-        raise SettingsError(f"--scenes must be at least 1, got {count}")
-    return _only(dataset, farm_test_data(count, camera), frames)
-
-
-def _only(dataset: str, data: TrainingData, frames: tuple[str, ...]) -> TrainingData:
+    built_in = dataset in FARM_NAMES
+    data = open_training_data(dataset, 0, 1 if built_in else scenes, camera, **choices)
+    if built_in:
+        count = FARM_TEST_SCENES if scenes is None else scenes
+        if count < 1:
+            raise SettingsError(f"--scenes must be at least 1, got {count}")
+        data = farm_test_data(count, camera)
     unknown = [name for name in frames if name not in data.train]
     if unknown:
         raise SceneError(f"{dataset} has no frame {', '.join(unknown)}; it has {', '.join(data.train)}")
@@ -172,25 +168,11 @@ def _only(dataset: str, data: TrainingData, frames: tuple[str, ...]) -> Training
     return TrainingData(data.law, names, (), (), data.camera, data.files)
 
 
-def check_frame(scene: RasterScene, described: Description) -> None:
-    """Refuse a frame that these weights cannot be judged on.
-
-    Raises
-    ------
-    SceneError : no labels, or of a class that the weights do not know.
-    """
-    if scene.labels is None:
-        raise SceneError(
-            f"frame {scene.name} has no labels, and a map is judged by labels: give --labels or a scene.toml"
-        )
-    check_labels(scene, described)
-
-
 def look_at(scene: RasterScene, name: str, weights: Weights, camera: LineCamera, seed: int) -> Look:
     """Look at a frame with the camera of the training, and glance at it with the weights."""
     sight = sight_of(scene, name, weights, camera, seed)
     seen = glance_of_columns(weights, sight.seen.columns, sight.seen.grid)
-    return Look(name, seen, sight.fine, sight.labels, sight.bands, sight.picture)
+    return Look(**(vars(sight) | {"seen": seen}))
 
 
 def sight_of(scene: RasterScene, name: str, weights: AnyWeights, camera: LineCamera, seed: int) -> Sight:
@@ -202,7 +184,7 @@ def sight_of(scene: RasterScene, name: str, weights: AnyWeights, camera: LineCam
     _, reached = weights.basis.matrix(scene.wavelength_nm)
     example = normalised(observed, weights.normalisation, reached)
     labels = judged_labels(scene, Description(config, weights.basis, weights.class_names, weights.record))
-    assert labels is not None  # check_frame
+    assert labels is not None  # sort_frames
     return Sight(
         name,
         CoarseLook(grid, np.ascontiguousarray(example.coarse, np.float32)),
@@ -262,15 +244,26 @@ def sort_frames(
     for number, name in enumerate(data.train):
         show("looking for frames", number / len(data.train), name)
         scene = scene_of(data, name)
+        if scene.labels is None:
+            raise SceneError(
+                f"frame {scene.name} has no labels, and a map is judged by labels: give --labels or a scene.toml"
+            )
         for one in weights:
-            check_frame(scene, one.described)
+            check_labels(scene, one.described)
         job = Job(name, *(_fit(some, scene, name, data.law, chosen) for some in (weights, controls)))
-        _check_pixels(scene, [*(weights[at] for at in job.weights), *(controls[at] for at in job.controls)])
-        if job.weights:
-            jobs.frames.append(job)
-            labelled = labelled or _has_labels(scene, weights[job.weights[0]])
-        else:
+        fit = [*(weights[at] for at in job.weights), *(controls[at] for at in job.controls)]
+        for one in fit[1:]:
+            if one.pixels_of(scene) != fit[0].pixels_of(scene):
+                raise SettingsError(
+                    f"{one.path} and {fit[0].path} were trained on different pixels of {scene.name}, so that others "
+                    "are left to judge each of them on; evaluate them one by one"
+                )
+        if not job.weights:
             jobs.left_out.append(name)
+            continue
+        jobs.frames.append(job)
+        labels = judged_labels(scene, weights[job.weights[0]].described)
+        labelled = labelled or (labels is not None and bool((labels != UNLABELLED).any()))
     show("looking for frames", 1.0, f"{len(jobs.frames)} of {len(data.train)}")
     _check_left(request, jobs, weights, controls)
     if not labelled:
@@ -286,21 +279,6 @@ def _fit(some: Sequence[Candidate], scene: RasterScene, name: str, law: str, cho
         for number, one in enumerate(some)
         if not one.trained_on(scene, name, law, bands_chosen=chosen) and not (in_turn and one.validated_on(name, law))
     )
-
-
-def _has_labels(scene: RasterScene, one: Candidate) -> bool:
-    """Whether a frame has labelled pixels that did not teach these weights."""
-    labels = judged_labels(scene, one.described)
-    return labels is not None and bool((labels != UNLABELLED).any())
-
-
-def _check_pixels(scene: RasterScene, fit: Sequence[Candidate]) -> None:
-    for one in fit[1:]:
-        if one.pixels_of(scene) != fit[0].pixels_of(scene):
-            raise SettingsError(
-                f"{one.path} and {fit[0].path} were trained on different pixels of {scene.name}, so that others are "
-                "left to judge each of them on; evaluate them one by one"
-            )
 
 
 def _check_left(

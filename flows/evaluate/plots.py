@@ -29,15 +29,14 @@ _COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#
 PAPER, GRID = "#fbfaf7", "#e3e1d8"
 
 
-def draw_evaluation(path: Path, content: dict[str, Any]) -> None:
-    """Draw mIoU over CPU seconds, and over bytes, into a PNG file."""
-    figure = evaluation_figure(content)
+def save_png(figure: Figure, path: Path) -> None:
+    """Write a figure into a PNG file."""
     FigureCanvasAgg(figure)
     figure.savefig(path, format="png")
 
 
 def evaluation_figure(content: dict[str, Any]) -> Figure:
-    """Give the figure. Where no frame was timed the seconds are left out."""
+    """mIoU over CPU seconds and over bytes, one line a policy; where no frame was timed the seconds are left out."""
     timed = any(row["cost"]["cpu_s"]["done"] is not None for row in content["rows"])
     wanted = [("cpu_s", "CPU seconds a frame, one thread", 1.0)] if timed else []
     wanted.append(("bytes", "MB a frame, estimated from samples", 1e6))
@@ -49,9 +48,7 @@ def evaluation_figure(content: dict[str, Any]) -> Figure:
         panel.set_xlabel(label, color=INK)
         panel.set_ylabel("mIoU [%]", color=INK)
         if not number:
-            panel.set_title(
-                f"{content['dataset']}: {counted(len(content['frames']))}", loc="left", color=INK, weight="bold"
-            )
+            panel.set_title(_title(content), loc="left", color=INK, weight="bold")
     figure.legend(
         *panel.get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False, labelcolor=INK
     )
@@ -60,7 +57,11 @@ def evaluation_figure(content: dict[str, Any]) -> Figure:
 
 def _draw_costs(axes: Axes, content: dict[str, Any], what: str, unit: float) -> None:
     rows = [row for row in content["rows"] if row["miou"] is not None]
-    low, high = _reach(rows)
+    # the axis ends with the weights' own rows, and with controls that are no further below than these span
+    own = [100 * row["miou"] for row in rows if not row["control"]]
+    span = max(max(own) - min(own), 1.0)
+    shown = [100 * row["miou"] for row in rows if 100 * row["miou"] >= min(own) - span]
+    low, high = min(shown) - 0.25 * span, max(shown) + 0.15 * span
     far = [row for row in rows if 100 * row["miou"] < low]
     rows = [row for row in rows if 100 * row["miou"] >= low]
     single = {row["policy"]: row for row in rows if row["share"] in (0.0, 1.0)}
@@ -70,7 +71,12 @@ def _draw_costs(axes: Axes, content: dict[str, Any], what: str, unit: float) -> 
         if name in lines:
             label, style = lines[name]
             axes.axhline(100 * row["miou"], color=MUTED, linewidth=1.1, linestyle=style, label=label, zorder=1)
-        _mark(axes, row, what, unit, name not in lines)
+        x = row["cost"][what]["done"]
+        if x is not None:  # a square for a row without a curve, and its name where no line across has it
+            place = (x / unit, 100 * row["miou"])
+            axes.plot(*place, "s", color=MUTED, zorder=2)
+            if name not in lines:
+                _write_at(axes, name, place, 7)
     policies = list(dict.fromkeys(row["policy"] for row in rows if row["policy"] not in single))
     for number, policy in enumerate(policies):
         own = sorted((row for row in rows if row["policy"] == policy), key=lambda row: row["share"])
@@ -84,18 +90,14 @@ def _draw_costs(axes: Axes, content: dict[str, Any], what: str, unit: float) -> 
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=12))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
+    _ruled(axes)
+
+
+def _ruled(axes: Axes) -> None:
     axes.set_facecolor(PAPER)
     axes.grid(visible=True, which="major", color=GRID, linewidth=0.8)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
-
-
-def _reach(rows: list[dict[str, Any]]) -> tuple[float, float]:
-    """Ends of the axis [%]: all rows of the weights, with controls that are no further below than these span."""
-    own = [100 * row["miou"] for row in rows if not row["control"]]
-    span = max(max(own) - min(own), 1.0)
-    shown = [100 * row["miou"] for row in rows if 100 * row["miou"] >= min(own) - span]
-    return min(shown) - 0.25 * span, max(shown) + 0.15 * span
 
 
 def _point_down(axes: Axes, far: list[dict[str, Any]], what: str, unit: float) -> None:
@@ -122,15 +124,9 @@ def _point_down(axes: Axes, far: list[dict[str, Any]], what: str, unit: float) -
         )
 
 
-def _mark(axes: Axes, row: dict[str, Any], what: str, unit: float, named: bool) -> None:
-    """A square for a row without a curve, and its name where no line across has it."""
-    x = row["cost"][what]["done"]
-    if x is None:
-        return
-    place = (x / unit, 100 * row["miou"])
-    axes.plot(*place, "s", color=MUTED, zorder=2)
-    if named:
-        axes.annotate(row["policy"], place, (0, 7), textcoords="offset points", color=INK, size=9, ha="center")
+def _title(content: dict[str, Any], mode: str = "") -> str:
+    frames = len(content["frames"])
+    return f"{content['dataset']}{mode}: {frames} frame{'' if frames == 1 else 's'}"
 
 
 def _draw_line(axes: Axes, own: list[dict[str, Any]], what: str, unit: float, colour: str, base: float) -> None:
@@ -155,11 +151,6 @@ def _draw_line(axes: Axes, own: list[dict[str, Any]], what: str, unit: float, co
     axes.fill_between(x, low, high, color=colour, alpha=0.12, linewidth=0, zorder=0)
 
 
-def counted(frames: int) -> str:
-    """Name a number of frames."""
-    return "1 frame" if frames == 1 else f"{frames} frames"
-
-
 def _name_shares(axes: Axes, rows: list[dict[str, Any]], what: str, unit: float) -> None:
     """Name each share below the lowest of its points."""
     for share in sorted({row["share"] for row in rows}):
@@ -167,10 +158,11 @@ def _name_shares(axes: Axes, rows: list[dict[str, Any]], what: str, unit: float)
             (row for row in rows if row["share"] == share and row["cost"][what]["done"] is not None),
             key=lambda row: row["miou"],
         )
-        place = (lowest["cost"][what]["done"] / unit, 100 * lowest["miou"])
-        axes.annotate(
-            format_percent(share), place, (0, -14), textcoords="offset points", color=INK, size=9, ha="center"
-        )
+        _write_at(axes, format_percent(share), (lowest["cost"][what]["done"] / unit, 100 * lowest["miou"]), -14)
+
+
+def _write_at(axes: Axes, name: str, place: tuple[float, float], points: int) -> None:
+    axes.annotate(name, place, (0, points), textcoords="offset points", color=INK, size=9, ha="center")
 
 
 _STYLES = {
@@ -181,15 +173,8 @@ _STYLES = {
 }
 
 
-def draw_rig(path: Path, content: dict[str, Any]) -> None:
-    """Draw mIoU over capture seconds into a PNG file."""
-    figure = rig_figure(content)
-    FigureCanvasAgg(figure)
-    figure.savefig(path, format="png")
-
-
 def rig_figure(content: dict[str, Any]) -> Figure:
-    """Give the figure; the band around our plan is the interval of its difference to uniform lines."""
+    """mIoU over capture seconds, one line a plan; its band is the interval of its difference to uniform lines."""
     rows = [row for row in content["rig"]["rows"] if row["miou"] is not None]
     figure = Figure(figsize=(7.4, 5.2), dpi=110, layout="constrained", facecolor=PAPER)
     axes = figure.subplots()
@@ -202,17 +187,8 @@ def rig_figure(content: dict[str, Any]) -> Figure:
         own = sorted((row for row in rows if row["policy"] == plan), key=lambda row: row["budget"])
         colour, line, marker = _STYLES[plan]
         seconds = [row["seconds"] for row in own]
-        axes.plot(
-            seconds,
-            [100 * row["miou"] for row in own],
-            color=colour,
-            linestyle=line,
-            marker=marker,
-            markersize=5,
-            linewidth=1.6,
-            label=plan,
-            zorder=3,
-        )
+        style = {"color": colour, "linestyle": line, "marker": marker, "markersize": 5, "linewidth": 1.6, "zorder": 3}
+        axes.plot(seconds, [100 * row["miou"] for row in own], label=plan, **style)
         bounds = [row["against_uniform"] for row in own]
         if all(one is not None and one["low"] is not None for one in bounds):
             low, high = (
@@ -222,25 +198,13 @@ def rig_figure(content: dict[str, Any]) -> Figure:
             axes.fill_between(seconds, low, high, color=colour, alpha=0.12, linewidth=0, zorder=0)
     axes.set_xlabel("capture seconds a frame, coarse pass included", color=INK)
     axes.set_ylabel("mIoU [%]", color=INK)
-    axes.set_title(
-        f"{content['dataset']}, rig mode: {counted(len(content['frames']))}", loc="left", color=INK, weight="bold"
-    )
-    axes.set_facecolor(PAPER)
-    axes.grid(visible=True, color=GRID, linewidth=0.8)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
+    axes.set_title(_title(content, ", rig mode"), loc="left", color=INK, weight="bold")
+    _ruled(axes)
     figure.legend(loc="outside lower center", ncols=3, frameon=False, labelcolor=INK)
     return figure
 
 
 LONG_SIDE = 900  # of a panel [px]; larger frames are thinned
-
-
-def draw_frame(path: Path, title: str, look: Look, weights: Weights, policy: str, share: float) -> None:
-    """Draw one frame at one share of the seats into a PNG file."""
-    figure = frame_figure(title, look, weights, policy, share)
-    FigureCanvasAgg(figure)
-    figure.savefig(path, format="png")
 
 
 def frame_figure(title: str, look: Look, weights: Weights, policy: str, share: float) -> Figure:
@@ -256,16 +220,22 @@ def frame_figure(title: str, look: Look, weights: Weights, policy: str, share: f
     panels = figure.subplots(2, 2).ravel()
     known = look.labels != UNLABELLED
     wrong = np.where(known & (drawn != look.labels), 1.0, 0.0)[..., None]
-    faded = 0.25 + 0.6 * _image(look, weights).mean(axis=-1, keepdims=True)
+    basis = weights.basis
+    bands, _ = choose_bands(np.linspace(basis.low_nm, basis.high_nm, basis.columns))
+    image = stretch(look.picture[..., list(bands)])  # in natural or false colour, from the spectral columns
+    faded = 0.25 + 0.6 * image.mean(axis=-1, keepdims=True)
     error = np.concatenate([np.maximum(faded, wrong), faded * (1 - wrong), faded * (1 - wrong)], axis=-1)
     pictures = {
-        "image": _image(look, weights),
+        "image": image,
         "labels": class_rgb(look.labels, palette),
         f"map: {policy}, K = {format_percent(share)}, {scores}": class_rgb(drawn, palette),
         f"{len(seats)} of {len(look.seen.grid.valid_seats())} seats; red: not the label": error,
     }
     for axes, (name, picture) in zip(panels, pictures.items(), strict=True):
-        _draw_panel(axes, name, picture[::step, ::step], (height, width))
+        shown = np.clip(picture[::step, ::step], 0, 1)
+        axes.imshow(shown, extent=(-0.5, width - 0.5, height - 0.5, -0.5), interpolation="nearest")
+        axes.set_title(name, loc="left", color=INK, size=11)
+        axes.set_axis_off()
     chosen = np.zeros(look.seen.grid.seat_shape, bool)
     chosen.ravel()[seats] = True
     lines = outline(chosen, look.seen.grid.patch, (height, width))
@@ -283,17 +253,3 @@ def chosen_seats(look: Look, weights: Weights, policy: str, share: float) -> NDA
         return np.empty(0, np.intp)
     one = placings(Trial((share,), (policy,)), look, weights)[0]
     return frame_seats(one.scores, share, look.seen.grid.valid_share().ravel() > 0).seats
-
-
-def _image(look: Look, weights: Weights) -> NDArray[np.float32]:
-    """The frame in natural or false colour, from the spectral columns."""
-    basis = weights.basis
-    bands, _ = choose_bands(np.linspace(basis.low_nm, basis.high_nm, basis.columns))
-    return stretch(look.picture[..., list(bands)])
-
-
-def _draw_panel(axes: Axes, name: str, picture: NDArray[np.floating], shape: tuple[int, int]) -> None:
-    height, width = shape
-    axes.imshow(np.clip(picture, 0, 1), extent=(-0.5, width - 0.5, height - 0.5, -0.5), interpolation="nearest")
-    axes.set_title(name, loc="left", color=INK, size=11)
-    axes.set_axis_off()

@@ -1,4 +1,8 @@
-"""One frame judged as the rig would survey it: plans of lines at equal seconds, and rows with the exposure of equal time."""
+"""One frame judged as the rig would survey it: plans of lines at equal seconds, and rows at equal time.
+
+A plan that is done early may expose for longer. At equal time the exposure changes until coarse pass and lines take
+what the full scan takes at the usual exposure; the light then clips at the same full well.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +22,7 @@ from models.reading.inference import segment
 from models.weights.files import Weights
 from pipeline.errors import BudgetError, PoseError
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import CostModel
+from pipeline.geometry.scan import Axis, CostModel
 from pipeline.planning.coverage import cheapest_full, coarse_sweeps
 from pipeline.planning.fine_pass import check_budget, plan_fine
 from pipeline.planning.line_blocks import WIDTHS, line_blocks, most_shown
@@ -51,7 +55,7 @@ def judge_rig(
     except PoseError as error:
         return {"frame": look.name, "rows": [], "left_out": [{"budget": None, "why": str(error)}]}
     coarse_s = cost.seconds(coarse, camera)
-    spends = _plans(look, camera, cost, seed)
+    spends = _plans(look, camera, cost, along, seed)
     for number, budget in enumerate(BUDGETS):
         try:
             fine_s = check_budget(budget, coarse_s, full_s)
@@ -60,29 +64,16 @@ def judge_rig(
             continue
         for at, (plan, draw, spend) in enumerate(spends):
             seats, seconds, lines = spend(fine_s)
-            drawn = segment(weights, look.seen, look.fine[seats], seats).classes
-            counts = confusion(look.labels, drawn, weights.config.classes)
-            rows.append(
-                {
-                    "policy": plan,
-                    "share": budget,
-                    "draw": draw,
-                    "seats": len(seats),
-                    "seconds": coarse_s + seconds,
-                    "full_s": full_s,
-                    "lines": count_lines(coarse) + lines,
-                    "full_lines": count_lines(full),
-                    "counts": counts.tolist(),
-                }
-            )
+            row = {"policy": plan, "share": budget, "seconds": coarse_s + seconds, "full_s": full_s}
+            row |= {"lines": count_lines(coarse) + lines, "full_lines": count_lines(full)}
+            rows.append(row | _judged(look, weights, seats) | {"draw": draw})
             report((number + (at + 1) / len(spends)) / len(BUDGETS))
     return {"frame": look.name, "rows": rows, "left_out": left_out}
 
 
-def _plans(look: Look, camera: LineCamera, cost: CostModel, seed: int) -> list[tuple[str, int, Spend]]:
+def _plans(look: Look, camera: LineCamera, cost: CostModel, along: Axis, seed: int) -> list[tuple[str, int, Spend]]:
     """Every way to spend seconds, with its name and draw."""
     grid = look.seen.grid
-    along = cheapest_full(grid, camera, cost)[0]
     options = [line_blocks(grid, camera, cost, along, rows) for rows in WIDTHS]
 
     def ours(policy: str) -> Spend:
@@ -141,18 +132,18 @@ def judge_equal_time(
             row = {"policy": policy, "share": share, "seconds": seconds, "full_s": full_s}
             rows.append(row | _judged(longer, weights, seats) | {"exposure": exposed.exposure_ms / camera.exposure_ms})
             report(0.8 * (number + 1) / len(wanted))
-        rows += _longer_plans(trial, scene, look, weights, camera, cost)
+        rows += _longer_plans(trial, scene, look, weights, camera, cost, full_s)
     except PoseError:
         return None
     return {"frame": look.name, "rows": rows}
 
 
 def _longer_plans(
-    trial: Trial, scene: RasterScene, look: Look, weights: Weights, camera: LineCamera, cost: CostModel
+    trial: Trial, scene: RasterScene, look: Look, weights: Weights, camera: LineCamera, cost: CostModel, full_s: float
 ) -> list[dict[str, Any]]:
     """Plans of lines: at each budget the exposure grows by its inverse, and lines fill the full scan's seconds."""
     grid = look.seen.grid
-    along, _, full_s = cheapest_full(grid, camera, cost)
+    along = cheapest_full(grid, camera, cost)[0]
     coarse = coarse_sweeps(grid, camera, along)
     rows = []
     for budget in BUDGETS:

@@ -1,9 +1,16 @@
-"""One frame judged by one set of weights or a control: every policy at every share of the seats, as counts that add up."""
+"""One frame judged by one set of weights or a control: every policy at each share of the seats, as counts that add up.
+
+Controls are networks of other designs, trained for themselves: the paper's reads the seats that the Sobel policy
+chooses at each share, the others read the whole frame once. Pooled rows have one threshold for the scores of all
+frames: bare frames buy fewer seats, rich ones more, together the same share. That takes a second pass, for the scores
+of all frames are needed first. Frames left out in turn are scored by different weights; these scores are nats on every
+frame, whoever gave them.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -65,7 +72,7 @@ def judge_frame(
     grid = look.seen.grid
     valid = grid.valid_seats()
     placed = placings(trial, look, weights)
-    gain = placed[-1].scores
+    gain, scores_of = placed[-1].scores, {(one.policy, one.draw): one.scores for one in placed}
     wanted = list(wanted_rows(trial, placed, look))
     rows = []
     for number, (policy, draw, share, seats) in enumerate(wanted):
@@ -74,7 +81,8 @@ def judge_frame(
         row |= judge_map(look, drawn, seats, weights.config.classes)
         row |= cost_of_seats(look, weights, seats, policy)
         row["gain"], row["best_gain"] = gain_sums(gain, seats, valid)
-        row["ap_top"] = _ap_top(placed, policy, draw, gain, seats, valid)
+        scores, best = scores_of.get((policy, draw)), top_seats(gain[valid], len(seats))  # as many of the oracle's best
+        row["ap_top"] = None if scores is None else known_or_none(average_precision(scores[valid], best))
         rows.append(row)
         report((number + 1) / len(wanted))
     return {
@@ -82,7 +90,15 @@ def judge_frame(
         "shape": [grid.height, grid.width],
         "seats": len(valid),
         "rows": rows,
-        "ranking": [_ranking(one, gain, valid) for one in placed],
+        "ranking": [
+            {
+                "policy": one.policy,
+                "draw": one.draw,
+                "ap_gain": known_or_none(average_precision(one.scores[valid], gain[valid] > 0)),
+                "spearman": known_or_none(rank_correlation(one.scores[valid], gain[valid])),
+            }
+            for one in placed
+        ],
         "positive_seats": int((gain[valid] > 0).sum()),
     }
 
@@ -120,10 +136,10 @@ def cost_of_seats(look: Look, weights: Weights, seats: Seats, policy: str) -> di
     """Samples with those of the coarse pass, their bytes, and multiply-adds (`none` and `all`: the map alone)."""
     known = {"none": None, "all": None, ORACLE: "random"}.get(policy, policy)  # the oracle scores by labels
     adds = multiply_adds(weights.config, look.seen.grid, len(seats), look.bands, known)
-    return cost_of(look, float(np.prod(look.seen.grid.coarse_shape)) + fine_samples(look, seats), adds)
+    return _cost_of(look, float(np.prod(look.seen.grid.coarse_shape)) + fine_samples(look, seats), adds)
 
 
-def cost_of(look: Sight, samples: float, adds: MultiplyAdds) -> dict[str, Any]:
+def _cost_of(look: Sight, samples: float, adds: MultiplyAdds) -> dict[str, Any]:
     """Samples, their bytes before compression, and multiply-adds, also told apart by what they are for."""
     return {
         "samples": samples,
@@ -136,25 +152,6 @@ def cost_of(look: Sight, samples: float, adds: MultiplyAdds) -> dict[str, Any]:
 def fine_samples(look: Sight, seats: Seats) -> float:
     """Pixels of the scene in the seats."""
     return float(look.seen.grid.valid_share().ravel()[seats].sum() * look.seen.grid.patch**2)
-
-
-def _ap_top(
-    placed: list[Placing], policy: str, draw: int, gain: NDArray[np.float64], seats: Seats, valid: Seats
-) -> float | None:
-    """Average precision of the scores against as many of the oracle's best seats."""
-    one = next((one for one in placed if (one.policy, one.draw) == (policy, draw)), None)
-    return (
-        None if one is None else known_or_none(average_precision(one.scores[valid], top_seats(gain[valid], len(seats))))
-    )
-
-
-def _ranking(one: Placing, gain: NDArray[np.float64], valid: Seats) -> dict[str, Any]:
-    return {
-        "policy": one.policy,
-        "draw": one.draw,
-        "ap_gain": known_or_none(average_precision(one.scores[valid], gain[valid] > 0)),
-        "spearman": known_or_none(rank_correlation(one.scores[valid], gain[valid])),
-    }
 
 
 def known_or_none(value: float) -> float | None:
@@ -232,7 +229,7 @@ def judge_control(
         drawn = draw_with_control(weights, sight.seen, sight.fine[seats], seats).classes
         row = {"policy": design, "draw": 0, "share": share, "seats": len(seats)}
         row |= judge_map(sight, drawn, seats, weights.config.classes)
-        row |= cost_of(sight, control_samples(sight, design, seats), control_adds(sight, weights, design, seats))
+        row |= _control_cost(sight, weights, design, seats)
         rows.append(row | {"gain": None, "best_gain": None, "ap_top": None})
         report((number + 1) / len(shares))
     grid = sight.seen.grid
@@ -246,41 +243,32 @@ def judge_control(
     }
 
 
-def control_samples(sight: Sight, design: str, seats: Seats) -> float:
-    """Samples that a control's camera takes: coarse ones, fine ones of the seats, or those of a grid coarser by two."""
-    grid = sight.seen.grid
-    if design == "coarser":
-        return float(-(-grid.height // 2) * -(-grid.width // 2))
-    coarse = 0.0 if design == DENSE else float(np.prod(grid.coarse_shape))
-    return coarse + fine_samples(sight, seats)
-
-
-def control_adds(sight: Sight, weights: AnyWeights, design: str, seats: Seats) -> MultiplyAdds:
-    """Multiply-adds of a control's map, and of its policy where it has one."""
+def _control_cost(sight: Sight, weights: AnyWeights, design: str, seats: Seats) -> dict[str, Any]:
+    """Its camera takes coarse samples, fine ones of the seats, or those of a grid coarser by two."""
     config, grid = weights.config, sight.seen.grid
-    own = control_multiply_adds(config, grid, len(seats), sight.bands)
-    score = multiply_adds(config, grid, 0, sight.bands, POLICY).score if design == BUYS_SEATS else 0
-    return MultiplyAdds(own.glance, own.score + score, own.encode, own.decode)
+    samples = 0.0 if design == DENSE else float(np.prod(grid.coarse_shape))
+    samples += fine_samples(sight, seats)
+    if design == "coarser":
+        samples = float(-(-grid.height // 2) * -(-grid.width // 2))
+    adds = control_multiply_adds(config, grid, len(seats), sight.bands)
+    if design == BUYS_SEATS:
+        adds = replace(adds, score=adds.score + multiply_adds(config, grid, 0, sight.bands, POLICY).score)
+    return _cost_of(sight, samples, adds)
 
 
 POOLED = ("gain", "entropy")  # scores that mean the same on every frame [nat]
-_MARK = ", pooled"
+POOLED_MARK = ", pooled"
 Bought = dict[tuple[int, str], list[Record]]  # (weights, frame) -> policy, share, seats, threshold
-
-
-def pooled_name(policy: str) -> str:
-    """What a policy's rows with one threshold for all frames are called."""
-    return policy + _MARK
 
 
 def is_pooled(name: str) -> bool:
     """Whether rows of this name have one threshold for all frames."""
-    return name.endswith(_MARK)
+    return name.endswith(POOLED_MARK)
 
 
 def own_policy(name: str) -> str:
     """Give the policy whose scores a row goes by."""
-    return name.removesuffix(_MARK)
+    return name.removesuffix(POOLED_MARK)
 
 
 def pooled_policies(policies: Sequence[str]) -> tuple[str, ...]:
@@ -333,7 +321,7 @@ def judge_pooled(
     for number, one in enumerate(bought):
         seats = select_seats(score_seats(one["policy"], look.seen), one["seats"], allowed).seats
         drawn = segment(weights, look.seen, look.fine[seats], seats).classes
-        row = {**one, "policy": pooled_name(one["policy"]), "draw": 0}
+        row = {**one, "policy": one["policy"] + POOLED_MARK, "draw": 0}
         row |= judge_map(look, drawn, seats, weights.config.classes)
         row |= cost_of_seats(look, weights, seats, one["policy"])
         rows.append(row | {"gain": None, "best_gain": None, "ap_top": None})

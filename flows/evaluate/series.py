@@ -1,7 +1,7 @@
-"""Records of several weights as rows of counts: which weights make up one seed, and what a whole curve comes to.
+"""Records of several weights as rows of counts: which weights make up one seed, and which run judged which frame.
 
 Weights of frames left out in turn have no frame in common; together they are one seed of the training, judged on all
-of their frames. Weights that share a frame are different seeds.
+of their frames. Weights that share a frame are different seeds. And what a whole curve of mIoU over cost comes to.
 """
 
 from __future__ import annotations
@@ -151,26 +151,16 @@ def curve_figures(none: Point, points: Sequence[Point], every: Point) -> CurveFi
         return CurveFigures(None, None, None)
     curve = sorted([none, *points, every])
     reached = [cost / every[0] for cost, miou in curve if miou >= ENOUGH * every[1]]
-    return CurveFigures(_auc_gap(curve, none, every), _hypervolume(curve, none, every), min(reached, default=None))
-
-
-def _auc_gap(curve: list[Point], none: Point, every: Point) -> float | None:
-    if every[1] - none[1] < LEAST_GAP:
-        return None
-    inside = [(cost, miou) for cost, miou in curve if none[0] <= cost <= every[0]]
-    place = np.log([cost for cost, _ in inside])
-    closed = (np.array([miou for _, miou in inside]) - none[1]) / (every[1] - none[1])
-    return float(np.trapezoid(closed, place) / (place[-1] - place[0]))
-
-
-def _hypervolume(curve: list[Point], none: Point, every: Point) -> float:
-    total, best, before = 0.0, none[1], 0.0
-    for cost, miou in curve:
-        if cost > every[0]:
-            break
-        total += (best - none[1]) * (cost / every[0] - before)
-        best, before = max(best, miou), cost / every[0]
-    return total
+    gap, auc_gap = every[1] - none[1], None
+    if gap >= LEAST_GAP:
+        cost, miou = np.array([one for one in curve if none[0] <= one[0] <= every[0]]).T
+        place = np.log(cost)
+        auc_gap = float(np.trapezoid((miou - none[1]) / gap, place) / (place[-1] - place[0]))
+    volume, best, before = 0.0, none[1], 0.0
+    for share, reaches in ((cost / every[0], miou) for cost, miou in curve if cost <= every[0]):
+        volume += (best - none[1]) * (share - before)
+        best, before = max(best, reaches), share
+    return CurveFigures(auc_gap, volume, min(reached, default=None))
 
 
 def summarise_curves(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
