@@ -79,9 +79,9 @@ class Extent:
             case "patch values":
                 return self._fine_pixels * self.bands
             case "operations of the map":
-                return self._map_operations
-            case "operations of a glance":
-                return self._glance_operations
+                return self._map_operations()
+            case "operations of a glance":  # of reading the coarse patches of the whole field alone
+                return float(multiply_adds(self.config, whole_field(self.grid).grid, 0, self.bands, None).total)
             case "surveys":  # what is the same for every field
                 return 1
 
@@ -91,7 +91,6 @@ class Extent:
         across = self.grid.width if self.along == "x" else self.grid.height
         return (self.fine_lines or 0) * min(self.camera.samples, across)
 
-    @property
     def _map_operations(self) -> float:
         """Multiply-adds of reading coarse and fine patches together, region by region, seats spread evenly."""
         if self.fine_lines is None:
@@ -103,11 +102,6 @@ class Extent:
             seats = round(min(self._fine_pixels / pixels, 1.0) * read.height * read.width / read.patch**2)
             total += multiply_adds(self.config, read, seats, self.bands, None).total
         return float(total)
-
-    @property
-    def _glance_operations(self) -> float:
-        """Multiply-adds of reading the coarse patches of the whole field alone."""
-        return float(multiply_adds(self.config, whole_field(self.grid).grid, 0, self.bands, None).total)
 
 
 def work_done(run: SurveyRun, seats: NDArray[np.integer]) -> MultiplyAdds:
@@ -127,12 +121,9 @@ def work_done(run: SurveyRun, seats: NDArray[np.integer]) -> MultiplyAdds:
 def work_of_map(run: SurveyRun, seats: NDArray[np.integer]) -> MultiplyAdds:
     """Count the map drawn with fine patches at these seats of the field."""
     regions = plan_regions(run.grid, SHARD)
-    parts = [astuple(_of_region(run, region, _count(region, seats), None)) for region in regions]
+    counts = [int(np.count_nonzero(region.numbers_here(seats) >= 0)) for region in regions]
+    parts = [astuple(_of_region(run, region, count, None)) for region, count in zip(regions, counts, strict=True)]
     return MultiplyAdds(*(sum(part) for part in zip(*parts, strict=True)))
-
-
-def _count(region: Region, seats: NDArray[np.integer]) -> int:
-    return int(np.count_nonzero(region.numbers_here(seats) >= 0))
 
 
 def _of_region(run: SurveyRun, region: Region, seats: int, policy: str | None) -> MultiplyAdds:

@@ -42,17 +42,13 @@ class WeightsFile:
     path: Path
     key: str
 
+    @lru_cache(maxsize=1)  # noqa: B019 - the record is a value
     def load(self) -> Weights:
         """Read them, once a process. Raises WeightsError where the file has changed since."""
-        return _weights_at(self)
-
-
-@lru_cache(maxsize=1)
-def _weights_at(file: WeightsFile) -> Weights:
-    weights = load_weights(file.path)
-    if content_key(file.path) != file.key:
-        raise WeightsError(f"the weights {file.path} have changed since the survey began; start it again")
-    return weights
+        weights = load_weights(self.path)
+        if content_key(self.path) != self.key:
+            raise WeightsError(f"the weights {self.path} have changed since the survey began; start it again")
+        return weights
 
 
 @dataclass(frozen=True)
@@ -69,7 +65,10 @@ class Scoring:
         let_tiles_go()
         weights = self.weights.load()
         look = look_at(weights, self.mosaic, region)
-        seen = unread(look) if self.policy in IMAGE_POLICIES + NETWORK_POLICIES else read_glance(weights, look)
+        if self.policy in IMAGE_POLICIES + NETWORK_POLICIES:  # nothing but the coarse image is asked for
+            seen = Glance(look.grid, look.columns, np.empty((0, 0, 0), np.float32), origin=look.origin)
+        else:
+            seen = read_glance(weights, look)
         network = None if self.vgg is None else self.vgg.saliency(weights)
         return region.crop_seats(score_seats(self.policy, seen, network=network))
 
@@ -95,11 +94,6 @@ class Drawing:
         write_class_tile(self.out, origin, region.crop(drawn.classes), region.crop(drawn.confidence))
         coarse = 0 if seen.strange is None else int(np.count_nonzero(region.crop_coarse(seen.strange)))
         return coarse, int(region.crop_seats(strange).sum())
-
-
-def unread(look: CoarseLook) -> Glance:
-    """Stand in for the glance where nothing but the coarse image is asked for."""
-    return Glance(look.grid, look.columns, np.empty((0, 0, 0), np.float32), origin=look.origin)
 
 
 def look_at(weights: Weights, mosaic: Path, region: Region) -> CoarseLook:
@@ -231,15 +225,6 @@ class FieldWork:
         paths = mosaic.resolve(), patches.resolve(), out.resolve()
         parts = run_blocks(Drawing(self.weights, *paths), self.regions, crew, report=report, paths=paths)
         return sum(coarse for coarse, _ in parts), sum(fine for _, fine in parts)
-
-    def check_memory(self, seats: NDArray[np.integer], bands: int) -> None:
-        """Refuse a memory in which no region with its part of these seats of the field can be read.
-
-        Raises
-        ------
-        SettingsError : not even one region at a time fits; names the least that does.
-        """
-        self.crew_for(seats, bands)
 
     def crew_for(self, seats: NDArray[np.integer], bands: int, *, beside: int = 0) -> Crew:
         """Give the crew, no larger than memory holds regions with their parts of these seats of the field.

@@ -61,50 +61,41 @@ class SimulatedField:
 
     @property
     def name(self) -> str:
-        """What the receipt calls it."""
         return self.source.name
 
     def key(self, field: str) -> dict[str, Any]:
-        """Nothing more."""
         return {}
 
     def saying(self, say: Callable[[str], None]) -> SimulatedField:
-        """The same: lines come all the time."""
-        return self
+        return self  # lines come all the time
 
     def lit(self, chosen: Mapping[Effect, str], clock: Mapping[str, float]) -> SimulatedField:
-        """The same with effects and clock."""
         return SimulatedField(replace(self.source, chosen=chosen, clock=clock))
 
     def opened(self, spool: Path) -> AbstractContextManager[Source]:
-        """The simulation, which keeps nothing."""
         return nullcontext(self.source)
 
 
 @dataclass(frozen=True)
 class RigField:
-    """The rig that the settings name. Its effects are its own."""
+    """The rig that the settings name. Its effects are its own; what its camera gives is kept beside the lines."""
 
     rig: RigSource
     name = "rig"
     simulates = False
 
     def key(self, field: str) -> dict[str, Any]:
-        """Which field, and how the mirror is mounted where it is not straight."""
         mounting = self.rig.rig.mounting
         return {"field": field} | ({} if mounting == STRAIGHT else {"mounting": asdict(mounting)})
 
     def saying(self, say: Callable[[str], None]) -> RigField:
-        """The same, telling of paths going up, captures and files."""
         return RigField(self.rig.saying(say))
 
     def lit(self, chosen: Mapping[Effect, str], clock: Mapping[str, float]) -> RigField:
-        """The same: nothing is simulated."""
         return self
 
     @contextmanager
     def opened(self, spool: Path) -> Iterator[Source]:
-        """The rig with its devices held on to; what its camera gives is kept beside the lines and goes with them."""
         source = self.rig.keeping(FetchedFiles(spool / FETCHED))
         with source.session():
             yield source
@@ -144,7 +135,7 @@ def open_devices(settings: Settings, clock: Clock = SYSTEM_CLOCK) -> RigDevices:
     DeviceGone : no such port, in use, not permitted, or the camera is not there. DeadlinePassed : nothing answers.
     RigError : another device does.
     """
-    from pipeline.rig.camera.headwall_camera import HeadwallCamera
+    from pipeline.rig.camera.headwall_camera import HeadwallCamera  # these three load pyserial too
     from pipeline.rig.capture.capture_runner import RigDevices
     from pipeline.rig.mirror.mirror_controller import open_mirror
 

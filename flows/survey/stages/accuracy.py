@@ -73,12 +73,12 @@ def evaluate(
     if not run.scene.labelled or not run.settings.accuracy:
         return None
     inputs = [mosaic, patches, class_map, effects, *pointing]
-    _wait_for(inputs)
+    for ref in inputs:
+        _ = ref.key  # a plan stops here where one is not known yet: for its own key the labels have to be drawn
     off = _map_offset(run, pointing)
     labels = _moved(run, off)
 
     def build(path: Path) -> None:
-        """Judge the map, the coarse look alone, and with controls other placements."""
         classes = load_class_map(class_map.path / "class_map.zarr").classes
         judged = np.where(classes == UNLABELLED, np.uint8(UNLABELLED), labels)  # what has no class is not
         seen = glance_at(run, mosaic)
@@ -101,12 +101,6 @@ def evaluate(
         **run.source_key(),
     }
     return Wanted(build, params, inputs)
-
-
-def _wait_for(inputs: Sequence[StageRef]) -> None:
-    """Let a plan stop here where a key is not known yet: for its own the labels have to be drawn."""
-    for ref in inputs:
-        _ = ref.key
 
 
 def _map_offset(run: SurveyRun, pointing: Sequence[StageRef]) -> NDArray[np.float64]:

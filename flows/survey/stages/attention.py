@@ -33,7 +33,6 @@ def attend(run: SurveyRun, mosaic: StageRef) -> Wanted:
     settings = run.settings
 
     def build(path: Path) -> None:
-        """Score the seats, and refuse a plan whose map would not fit the memory."""
         work = FieldWork.of(run)
         scores = _scores(run, work, mosaic)
         plan = plan_fine(
@@ -47,7 +46,7 @@ def attend(run: SurveyRun, mosaic: StageRef) -> Wanted:
             full=run.plan.full,
             threshold=settings.threshold,
         )
-        work.check_memory(plan.seats, len(run.scene.wavelength_nm))  # before the rig goes back, not after
+        work.crew_for(plan.seats, len(run.scene.wavelength_nm))  # refuses what does not fit before the rig goes back
         rank = np.full(scores.shape, -1, np.int32)
         rank[plan.seats[np.argsort(-scores[plan.seats], kind="stable")]] = np.arange(len(plan.seats))
         shape = run.grid.seat_shape

@@ -50,23 +50,17 @@ def sweeps_wanted(
     total = sum(sweep.lines for sweep in sweeps) or 1
 
     def build(path: Path) -> None:
-        """Take the sweeps one after the other, each into a cube of its own."""
         before, manifest = 0, load_manifest(inputs[-1]) if run.source.simulates else None
         run.report(0.0)  # a rig is at work long before its first line is here
         lit = run.source.lit(chosen_effects(inputs[-1]), clock)
         with lit.opened(run.archive.spool_folder(key)) as source:
             for sweep in sweeps:
-                done = partial(_report_lines, run, before / total, total)
-                _capture_sweep(run, source, sweep, path, key=key, report=done, effects=manifest)
+                _capture_sweep(run, source, sweep, path, key=key, before=before, total=total, effects=manifest)
                 before += sweep.lines
             if source.record is not None:
                 write_table(path / RIG_RECORD, source.record)
 
     return Wanted(build, params, inputs, then=partial(run.archive.drop_spool, key))
-
-
-def _report_lines(run: CaptureRun, before: float, total: int, lines: int) -> None:
-    run.report(before + lines / total)
 
 
 def _capture_sweep(
@@ -76,7 +70,8 @@ def _capture_sweep(
     path: Path,
     *,
     key: str,
-    report: Callable[[int], None],
+    before: int,
+    total: int,
     effects: Mapping[str, Any] | None,
 ) -> None:
     """Lines into the spool and then the cube, one by one, from where a broken capture stopped.
@@ -96,12 +91,12 @@ def _capture_sweep(
         def take(line: Line) -> None:
             spool.append(line)
             cube.write([line])
-            report(spool.count)
+            run.report((before + spool.count) / total)
 
         spool.mend(source.lines_again(sweep, spool.lost))
         for block in spool.blocks():
             cube.write(block)
-        report(spool.count)
+        run.report((before + spool.count) / total)
         take_lines(source, sweep, take, run.settings.crew, first=spool.count)
 
 
@@ -127,7 +122,7 @@ def take_lines(
     ------
     What ``take`` raises; what the first block that cannot be rendered does, once the lines before it are taken.
     """
-    workers = rendering_crew(crew)
+    workers = Crew("threads", crew.workers)  # whoever else makes blocks, for the scene lies in this process's memory
     if workers.count == 1 or not isinstance(source, SimulatedSource):
         for line in source.lines(sweep, first):
             take(line)
@@ -135,11 +130,6 @@ def take_lines(
     blocks = [range(start, min(start + at_once, sweep.lines)) for start in range(first, sweep.lines, at_once)]
     make = partial(_rendered, source, sweep, Semaphore(workers.count))
     run_blocks(make, blocks, replace(workers, workers=workers.count + 1), keep=False, each=_InOrder(take, first))
-
-
-def rendering_crew(crew: Crew) -> Crew:
-    """Who renders: threads of this process, whoever else makes blocks, for the scene lies in its memory."""
-    return Crew("threads", crew.workers)
 
 
 def _rendered(source: SimulatedSource, sweep: Sweep, free: Semaphore, numbers: range) -> list[Line] | Exception:
