@@ -64,7 +64,8 @@ def parse_settings(table: Mapping[str, object], origin: Mapping[str, str] | None
     """
     origin = origin or {}
     settings = Settings(**_check_table(table, SURVEY, "", origin))
-    check_together(settings, origin)
+    for wrong in _wrongs(settings, origin):
+        raise SettingsError(wrong)
     return settings
 
 
@@ -146,12 +147,6 @@ def anchor_paths(table: dict[str, object], folder: Path) -> dict[str, object]:
 
 IN_NAT = ("gain", "entropy")  # policies whose scores are gains, or the most that these can be
 _VGG_FROM = {"vgg-static": VGG_FROM, "vgg-trained": TRAINED_VGG_FROM}  # policies that read a file of VGG19
-
-
-def check_together(settings: Settings, origin: Mapping[str, str]) -> None:
-    """Refuse what no key can say alone (SettingsError); ``origin`` tells where each (dotted) key came from."""
-    for wrong in _wrongs(settings, origin):
-        raise SettingsError(wrong)
 
 
 def _wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]:

@@ -92,7 +92,10 @@ def train_weights(request: TrainRequest, report: Report = lambda what, done, fig
     def progress(now: Progress) -> None:
         report("training", now.done, f"step {now.step}, loss {now.loss:.3f}")
 
-    split = joined_split(_split(about, data), start)  # before validation scenes are looked at: what was trained on
+    own = {"train": dict(about.keys), "validation": list(data.validation), "held_out": list(data.held_out)}
+    split = joined_split(
+        own | {"pixels": dict(about.pixels)}, start
+    )  # before validation scenes are looked at: what was trained on
     model, summary = train(
         config, examples, normalisation.gain_shift, request.settings, progress, start=state, checkpoint=checkpoint
     )
@@ -140,15 +143,6 @@ class _About:
     wavelength_nm: NDArray[np.float64]
     keys: dict[str, str] = field(default_factory=dict)  # scene -> identity of its light
     pixels: dict[str, str] = field(default_factory=dict)  # identity -> trained pixels, where not all labelled ones
-
-
-def _split(about: _About, data: TrainingData) -> dict[str, Any]:
-    return {
-        "train": dict(about.keys),
-        "validation": list(data.validation),
-        "held_out": list(data.held_out),
-        "pixels": dict(about.pixels),
-    }
 
 
 def _observe_all(
