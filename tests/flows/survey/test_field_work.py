@@ -132,9 +132,9 @@ def test_too_little_memory_is_refused_before_the_work(
     """The message says what a region takes and the least memory that does, and that much is enough."""
     work = replace(FieldWork.of(surveyed[0]), crew=crew, memory=300 * 2**20)
     with pytest.raises(SettingsError, match=rf"exceeds --memory 300 MiB: .*96 x 128 px.*{words}") as refused:
-        work.check_memory(np.arange(192), 3)
+        work.crew_for(np.arange(192), 3)
     least = int(str(refused.value).split("--memory")[-1].split()[0])
-    replace(work, memory=least * 2**20).check_memory(np.arange(192), 3)
+    replace(work, memory=least * 2**20).crew_for(np.arange(192), 3)
 
 
 def test_no_more_regions_at_a_time_than_memory_holds(surveyed: tuple[SurveyRun, Path]) -> None:

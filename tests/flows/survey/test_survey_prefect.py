@@ -185,7 +185,7 @@ def test_sigterm_that_ends_the_server_too(prefect_home: Path, monkeypatch: pytes
         raise Terminated
 
     monkeypatch.setattr(prefect, "flow", flow)
-    monkeypatch.setattr(engine, "_survey", terminate)
+    monkeypatch.setattr(engine, "survey", terminate)
     settings = SimpleNamespace(scene="farm", seed=0, budget=0.5)
     with temporary_settings(), pytest.raises(Terminated):
         engine._run_flow(SimpleNamespace(run=SimpleNamespace(name="farm", settings=settings)), terminate)  # type: ignore[arg-type]
