@@ -31,14 +31,8 @@ from pipeline.errors import SceneError, SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.instrument import USUAL
 from pipeline.simulator.scenes.farm.canvas import CLASSES
-from tests.flows.small_fields import FRAMES, QUICK, looked_at, scene_at, write_field, write_weights
+from tests.flows.small_fields import FRAMES, QUICK, looked_at, scene_at, write_weights
 from tests.models.conftest import make_weights
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of three small frames."""
-    return write_field(tmp_path_factory.mktemp("evaluate") / "field")
 
 
 @pytest.fixture(scope="module")
