@@ -138,7 +138,6 @@ NOTES = {
 
 
 def _of_frame(row: Record) -> Record:
-    """The figures of a frame alone, over the classes of its own labels."""
     counts = np.array(row["counts"])
     return {
         **{name: row[name] for name in ("policy", "draw", "share", "seats")},

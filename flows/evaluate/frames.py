@@ -272,7 +272,6 @@ def sort_frames(
 
 
 def _fit(some: Sequence[Candidate], scene: RasterScene, name: str, law: str, chosen: bool) -> tuple[int, ...]:
-    """Numbers of those that may be judged on a frame."""
     in_turn = len({one.held_out for one in some}) > 1
     return tuple(
         number

@@ -152,7 +152,6 @@ def _draw_line(axes: Axes, own: list[dict[str, Any]], what: str, unit: float, co
 
 
 def _name_shares(axes: Axes, rows: list[dict[str, Any]], what: str, unit: float) -> None:
-    """Name each share below the lowest of its points."""
     for share in sorted({row["share"] for row in rows}):
         lowest = min(
             (row for row in rows if row["share"] == share and row["cost"][what]["done"] is not None),

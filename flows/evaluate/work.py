@@ -151,7 +151,6 @@ class Work:
         return [Task("pooled", job.name, index) for job in jobs.frames for index in job.weights]
 
     def _first_of_each(self, job: Job) -> tuple[int, ...]:
-        """A control of each design."""
         first: dict[str, int] = {}
         for index in job.controls:
             first.setdefault(design_of(self.controls[index]), index)

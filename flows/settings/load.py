@@ -89,7 +89,6 @@ def _check_table(
 
 
 def _parse_table(key: str, value: object, place: str, origin: Mapping[str, str]) -> object:
-    """One of the tables that stand for a dataclass."""
     if not isinstance(value, Mapping):
         raise SettingsError(f"{place} must be a table, [{key}] with keys below it; got {value!r}")
     given = _check_table(value, TABLES[key], f"{key}.", origin)
@@ -150,7 +149,6 @@ _VGG_FROM = {"vgg-static": VGG_FROM, "vgg-trained": TRAINED_VGG_FROM}  # policie
 
 
 def _wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]:
-    """What does not go together, and what to do about it."""
     policy, scene, air, camera = settings.policy, settings.scene, settings.air, settings.camera
     if (policy == "mask") != (settings.mask is not None):
         wants = "policy 'mask' needs a mask file" if settings.mask is None else "a mask is used by policy 'mask' only"

@@ -46,7 +46,6 @@ class _Maker:
     spent: dict[str, float | None] = field(default_factory=dict)  # CPU seconds by stage; None where it was there
 
     def __call__(self, name: str, stage: Stage, wanted: Wanted) -> StageRef:
-        """Find or make the store that a stage wants."""
         began = time.process_time()
         self.progress.show(name, 0.0)
         ref, built = stage.produce(self.run.archive, wanted)

@@ -100,8 +100,6 @@ class Comparison:
 
 @dataclass
 class _ChangeSums:
-    """What blocks add up to."""
-
     exact_cpu_s: float = 0.0
     cpu_s: float = 0.0
     greatest: float = -1.0

@@ -136,12 +136,10 @@ def _draw_change(axes: Axes, found: Comparison) -> AxesImage:
 
 
 def _extent(view: View) -> tuple[float, float, float, float]:
-    """Left, right, bottom and top of the view, in px of the camera."""
     return view.samples.start, view.samples.stop, len(view.lines) * view.sweep.step, 0.0
 
 
 def _most(found: Comparison) -> float:
-    """Where colours end."""
     return found.tolerance or found.measured or 1.0
 
 

@@ -102,7 +102,6 @@ def run_emulate(
 
 
 def _tell(request: EmulateRequest, served: ServedRig, console: Console, *, as_json: bool) -> None:
-    """Say how to connect, and write the file that was asked for."""
     table = _rig_table(served, request.settings.rig)
     if request.out is not None:
         try:
@@ -158,7 +157,6 @@ def _toml_value(value: object) -> str:
 
 
 def _state(rig: EmulatedRig) -> str:
-    """What both devices do, in a line."""
     seen = rig.seen()
     x, y = seen.position
     last = f", last: {seen.last}" if seen.last else ""

@@ -89,7 +89,6 @@ def inside_flow() -> bool:
 
 
 def _task_step(runner: StageRunner) -> Step:
-    """What runs a stage as a Prefect task of the flow that it is called in."""
     from prefect import task
     from prefect.cache_policies import NO_CACHE
 

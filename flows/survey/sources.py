@@ -2,30 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 from flows.settings.survey_settings import Settings
-from pipeline.geometry.mounting import STRAIGHT
-from pipeline.geometry.scan import Sweep, sweep_positions
-from pipeline.rig.camera.camera_files import KeptInMemory
-from pipeline.rig.camera.camera_settings import CameraLimits, check_times
-from pipeline.rig.clock import SYSTEM_CLOCK, Clock
+from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.effect import Effect
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Source
-from storage.arrays.fetched_files import FetchedFiles
-
-if TYPE_CHECKING:
-    from pipeline.rig.capture.capture_runner import RigDevices
-    from pipeline.rig.capture.rig_source import RigSource
-
-FETCHED = "camera"  # folder within a capture's spool
 
 
 class FieldSource(Protocol):
@@ -76,80 +65,15 @@ class SimulatedField:
         return nullcontext(self.source)
 
 
-@dataclass(frozen=True)
-class RigField:
-    """The rig that the settings name. Its effects are its own; what its camera gives is kept beside the lines."""
-
-    rig: RigSource
-    name = "rig"
-    simulates = False
-
-    def key(self, field: str) -> dict[str, Any]:
-        mounting = self.rig.rig.mounting
-        return {"field": field} | ({} if mounting == STRAIGHT else {"mounting": asdict(mounting)})
-
-    def saying(self, say: Callable[[str], None]) -> RigField:
-        return RigField(self.rig.saying(say))
-
-    def lit(self, chosen: Mapping[Effect, str], clock: Mapping[str, float]) -> RigField:
-        return self
-
-    @contextmanager
-    def opened(self, spool: Path) -> Iterator[Source]:
-        source = self.rig.keeping(FetchedFiles(spool / FETCHED))
-        with source.session():
-            yield source
-
-
 def field_source(
     scene: RasterScene, settings: Settings, simulated: SimulatedSource, planned: Sequence[Sweep]
 ) -> FieldSource:
-    """Give who looks, as the settings say. Of a rig nothing is connected before its first line.
-
-    Raises
-    ------
-    SettingsError : exposure and frame period are nothing that the camera takes.
-    PoseError : the mirror, as mounted, does not reach all of the planned sweeps.
-    """
+    """Give who looks, as the settings say; raises what `flows.survey.rig_field.rig_field` does."""
     if settings.source != "rig":
         return SimulatedField(simulated)
-    from pipeline.rig.capture.rig_source import RigSource, RigView  # drivers load pyserial, which others do without
+    from flows.survey.rig_field import rig_field  # drivers load pyserial and scipy, which others do without
 
-    camera = settings.camera
-    check_times(camera.exposure_ms, camera.frame_ms, CameraLimits(most_rate_hz=camera.max_rate_hz))
-    if settings.rig.mounting != STRAIGHT:
-        for sweep in planned:
-            settings.rig.mounting.to_device(sweep_positions(sweep, camera))
-    view = RigView(camera, scene.wavelength_nm, scene.shape)
-    pairs = settings.cost.vector_pairs
-    return RigField(
-        RigSource(view, lambda: open_devices(settings), KeptInMemory(), rig=settings.rig, vector_pairs=pairs)
-    )
-
-
-def open_devices(settings: Settings, clock: Clock = SYSTEM_CLOCK) -> RigDevices:
-    """Connect to mirror and camera; nothing moves.
-
-    Raises
-    ------
-    DeviceGone : no such port, in use, not permitted, or the camera is not there. DeadlinePassed : nothing answers.
-    RigError : another device does.
-    """
-    from pipeline.rig.camera.headwall_camera import HeadwallCamera  # these three load pyserial too
-    from pipeline.rig.capture.capture_runner import RigDevices
-    from pipeline.rig.mirror.mirror_controller import open_mirror
-
-    rig = settings.rig
-    mirror = open_mirror(rig.mirror(settings.cost.vector_pairs), clock, known=True)
-    limits = CameraLimits(most_rate_hz=settings.camera.max_rate_hz)
-    camera = HeadwallCamera.at(rig.camera, rig.files, limits=limits, clock=clock)
-    devices = RigDevices(mirror, camera, clock)
-    try:
-        camera.is_capturing()
-    except BaseException:
-        devices.close()
-        raise
-    return devices
+    return rig_field(scene, settings, planned)
 
 
 def for_rig(settings: Settings) -> Settings:

@@ -72,7 +72,6 @@ class StageRunner:
     records: dict[str, StageRecord] = field(default_factory=dict)
 
     def __call__(self, stage: str, /, *inputs: StageRef) -> StageRef | None:
-        """Run one of ``STAGES`` by its name."""
         self.watch(stage, "running", 0.0)
         meter, reached = _Meter(), 0.0
 

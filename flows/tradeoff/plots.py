@@ -176,7 +176,6 @@ def _logarithmic(axes: Axes, result: Result, places: Sequence[tuple[float, float
 
 
 def _range(values: Sequence[float]) -> tuple[float, float]:
-    """Least and greatest, at least a factor of two apart."""
     low, high = min(values), max(values)
     return (low, high) if high >= 2 * low else (low / 2**0.5, high * 2**0.5)
 

@@ -262,7 +262,6 @@ def _capture(source: SimulatedSource, step: int) -> tuple[SimulatedSweep, Values
 
 
 def _rectify(camera: LineCamera, lines: SimulatedSweep, values: Values) -> Values:
-    """The scene at its own pixels."""
     origin = (-(SHAPE[0] - 1) / 2, -(SHAPE[1] - 1) / 2)
     coordinates = grid_lookup(
         lines.position, camera, along="x", binning=1, origin_px=origin, spacing_px=1.0, shape=SHAPE

@@ -179,7 +179,6 @@ def _prepare_rays(seed: int) -> Rough:
 
 
 def _box_alone(lines: FarmLines, variant: str) -> dict[Any, str]:
-    """Exact rays, slit and pixel."""
     rays: dict[Any, str] = {effect: its for effect, its in lines.exact.items() if effect in RAYS}
     return {**rays, SLIT: variant}
 

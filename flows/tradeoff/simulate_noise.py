@@ -131,7 +131,6 @@ def _moments(state: Counted, raw: Raw) -> tuple[Floats, Floats, Floats]:
 
 
 def _variance_error(state: Counted, _variant: Setting, raw: Raw) -> float:
-    """Greatest error of the variance, as a share."""
     _, seen, wanted = _moments(state, raw)
     return float(np.abs(seen / wanted - 1).max())
 

@@ -44,7 +44,6 @@ def validate(weights: AnyWeights, examples: Iterable[Example], seed: int, show: 
 
 
 def _parts(weights: AnyWeights, example: Example) -> tuple[SceneGrid, Patches, NDArray[np.uint8]]:
-    """The grid of a scene, every fine patch of it, and its labels without the padding."""
     grid = SceneGrid(*example.shape, weights.config.patch, weights.config.factor)
     return grid, patches_of(example.fine, grid.patch).astype(np.float32), example.labels[: grid.height, : grid.width]
 

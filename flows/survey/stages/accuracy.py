@@ -135,7 +135,6 @@ def _sure_source(run: SurveyRun, off: NDArray[np.float64]) -> SimulatedSource:
 def _controls(
     run: SurveyRun, seen: Glance, patches: StageRef, labels: NDArray[np.uint8], result: dict[str, Any]
 ) -> dict[str, Any]:
-    """`all`, the other placements, and how long either reading takes."""
     columns = columns_of_all_seats(
         run.simulated,
         run.plan.full,

@@ -136,7 +136,6 @@ def seen_shares(run: SurveyRun, patches: StageRef) -> NDArray[np.float64]:
 
 
 def _only(registration: Sequence[StageRef]) -> StageRef | None:
-    """The registration where there is one."""
     if len(registration) > 1:
         raise ShapeError(f"expected one registration or none, got {len(registration)}")
     return registration[0] if registration else None

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-import flows.survey.sources
+import flows.survey.rig_field
 import flows.terminal.progress
 from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
@@ -91,7 +91,7 @@ def emulated(
             mirror.connect()
             return RigDevices(mirror, line.camera(), line.clock)
 
-        patch.setattr(flows.survey.sources, "open_devices", open_devices)
+        patch.setattr(flows.survey.rig_field, "open_devices", open_devices)
         yield whole
 
 
