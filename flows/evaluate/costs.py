@@ -47,16 +47,8 @@ Part = tuple[str, str]  # what it is, and of which policy, share or control
 Works = dict[Part, Callable[[], object]]
 
 
-@dataclass(frozen=True)
-class Rounds:
-    """How often each part is timed, after so many rounds that are not counted."""
-
-    counted: int = 10
-    warm_up: int = 3
-
-
 def time_frame(
-    trial: Trial, look: Look, weights: Weights, rounds: Rounds, controls: Sequence[tuple[Sight, AnyWeights]] = ()
+    trial: Trial, look: Look, weights: Weights, rounds: int, controls: Sequence[tuple[Sight, AnyWeights]] = ()
 ) -> dict[str, Any]:
     """CPU seconds of a frame from its spectral columns: glance, each policy's scores, the map at each share.
 
@@ -105,14 +97,14 @@ def _control_works(trial: Trial, sight: Sight, weights: AnyWeights) -> Works:
     return works
 
 
-def cpu_seconds(works: Mapping[Part, Callable[[], object]], rounds: Rounds) -> dict[Part, float]:
-    """Median CPU time of the process that each part takes, all parts in turn in every round [s]."""
+def cpu_seconds(works: Mapping[Part, Callable[[], object]], rounds: int, *, warm_up: int = 3) -> dict[Part, float]:
+    """Median CPU time of the process that each part takes over so many rounds, after some that do not count [s]."""
     taken: dict[Part, list[float]] = {part: [] for part in works}
-    for number in range(rounds.warm_up + rounds.counted):
+    for number in range(warm_up + rounds):
         for part, work in works.items():
             start = time.process_time()
             work()
-            if number >= rounds.warm_up:
+            if number >= warm_up:
                 taken[part].append(time.process_time() - start)
     return {part: statistics.median(seconds) for part, seconds in taken.items()}
 

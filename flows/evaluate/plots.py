@@ -186,8 +186,14 @@ def rig_figure(content: dict[str, Any]) -> Figure:
         own = sorted((row for row in rows if row["policy"] == plan), key=lambda row: row["budget"])
         colour, line, marker = _STYLES[plan]
         seconds = [row["seconds"] for row in own]
-        style = {"color": colour, "linestyle": line, "marker": marker, "markersize": 5, "linewidth": 1.6, "zorder": 3}
-        axes.plot(seconds, [100 * row["miou"] for row in own], label=plan, **style)
+        drawn: dict[str, Any] = {
+            "color": colour,
+            "linestyle": line,
+            "marker": marker,
+            "markersize": 5,
+            "linewidth": 1.6,
+        }
+        axes.plot(seconds, [100 * row["miou"] for row in own], label=plan, zorder=3, **drawn)
         bounds = [row["against_uniform"] for row in own]
         if all(one is not None and one["low"] is not None for one in bounds):
             low, high = (

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from flows.evaluate.costs import Rounds, capture_seconds, time_frame
+from flows.evaluate.costs import capture_seconds, time_frame
 from flows.evaluate.frames import Candidate, Job, Jobs, Look, Show, Sight, look_at, scene_of, sight_of
 from flows.evaluate.request import COST, EvaluateRequest
 from flows.evaluate.rig_plans import BUDGETS, judge_equal_time, judge_rig
@@ -230,7 +230,7 @@ class Work:
             case "equal":
                 return judge_equal_time(trial, scene, look, weights, camera, COST, report)
             case "time":
-                return time_frame(trial, look, weights, Rounds(self.request.timed_runs), beside)
+                return time_frame(trial, look, weights, self.request.timed_runs, beside)
             case "capture":
                 return capture_seconds(trial, look, weights, camera, COST)
         return judge_frame(trial, look, weights, report)

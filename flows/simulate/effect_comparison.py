@@ -209,8 +209,9 @@ class _Ways:
         block = self.chosen.block(sweep, lines)
         _, other, other_raw, chosen_s = _taken(self.chosen, block)
         alike = read_out(light, block, self.chosen.choice)
-        raws = (bin_samples(one, sweep.binning) for one in (raw, other_raw, alike))
-        return _Both(*(stored_mean(one, sweep.binning) for one in (shown, other)), *raws, exact_s, chosen_s)
+        exact_mean, chosen_mean = (stored_mean(one, sweep.binning) for one in (shown, other))
+        exact_raw, chosen_raw, alike_raw = (bin_samples(one, sweep.binning) for one in (raw, other_raw, alike))
+        return _Both(exact_mean, chosen_mean, exact_raw, chosen_raw, alike_raw, exact_s, chosen_s)
 
     def change(self, both: _Both, sweep: Sweep) -> NDArray[np.float64]:
         """By how much the stored light differs, in the unit of the tolerance, (line, binned sample, band)."""

@@ -26,26 +26,6 @@ from pipeline.errors import SettingsError
 COPIED_BYTES = 1 << 26  # beyond any cache
 
 
-class Copying:
-    """A copy of memory that is timed like a setting: every round once, the least counts."""
-
-    def __init__(self) -> None:
-        self._source: NDArray[np.uint8] = np.ones(COPIED_BYTES, np.uint8)
-        self._target = np.zeros_like(self._source)
-        self._seconds: list[float] = []
-
-    def run(self) -> None:
-        """Copy once."""
-        start = time.process_time()
-        np.copyto(self._target, self._source)
-        self._seconds.append(time.process_time() - start)
-
-    @property
-    def ns_per_byte(self) -> float:
-        """Least time of one byte read or written; NaN before the first copy. [ns]"""
-        return 1e9 * min(self._seconds, default=float("nan")) / (2 * COPIED_BYTES)
-
-
 @contextmanager
 def one_thread() -> Iterator[int]:
     """Hold torch, where a stage has loaded it, to one thread; gives the number of threads in use."""
@@ -215,16 +195,14 @@ def measure_tradeoff(tradeoff: Tradeoff[State, Output], *, repeats: int = 5, see
     if repeats < 1:
         raise SettingsError(f"repeats must be at least 1, got {repeats}")
     state = tradeoff.prepare(seed)
-    copying = None if tradeoff.moved_bytes is None else Copying()
     with one_thread() as threads:
         load_before = mean_load()
         judged = [_judge(tradeoff, state, setting) for setting in tradeoff.settings]
-        clocks = _time_in_turn(tradeoff, state, repeats, copying)
+        clocks, floor = _time_in_turn(tradeoff, state, repeats)
         machine = describe_machine(threads) | {"load_before": load_before, "load_after": mean_load()}
     points = [_timed(point, own, judged[0], clocks[0]) for point, own in zip(judged, clocks, strict=True)]
     named = (tradeoff.stage, tradeoff.knob, tradeoff.error, tradeoff.unit, tradeoff.reference)
     levels = () if tradeoff.levels is None else tradeoff.levels(state)
-    floor = None if copying is None else copying.ns_per_byte * (tradeoff.moved_bytes or 0)
     return Result(*named, repeats, seed, machine, mark_pareto(points), levels, floor)
 
 
@@ -240,21 +218,26 @@ def _judge(tradeoff: Tradeoff[State, Output], state: State, setting: Setting) ->
     )
 
 
-def _time_in_turn(
-    tradeoff: Tradeoff[State, Output], state: State, repeats: int, copying: Copying | None
-) -> list[Clocks]:
-    """Seconds by setting and round; every round starts at another setting."""
-    count = len(tradeoff.settings)
+def _time_in_turn(tradeoff: Tradeoff[State, Output], state: State, repeats: int) -> tuple[list[Clocks], float | None]:
+    """Seconds by setting and round, and the least time of copying a unit's bytes [ns].
+
+    Every round starts at another setting, with one copy of memory before it.
+    """
+    count, moved = len(tradeoff.settings), tradeoff.moved_bytes
+    source: NDArray[np.uint8] = np.ones(0 if moved is None else COPIED_BYTES, np.uint8)
+    target, copies = np.zeros_like(source), []
     clocks: list[Clocks] = [[] for _ in range(count)]
     for turn in range(repeats):
-        if copying is not None:
-            copying.run()
+        if moved is not None:
+            start = time.process_time()
+            np.copyto(target, source)
+            copies.append(time.process_time() - start)
         for offset in range(count):
             number = (turn + offset) % count
             wall, cpu = time.perf_counter(), time.process_time()
             tradeoff.run(state, tradeoff.settings[number])
             clocks[number].append((time.process_time() - cpu, time.perf_counter() - wall))
-    return clocks
+    return clocks, None if moved is None else 1e9 * min(copies) / (2 * COPIED_BYTES) * moved  # read and written
 
 
 def _timed(point: Point, clocks: Clocks, first: Point, first_clocks: Clocks) -> Point:

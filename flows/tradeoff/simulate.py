@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -126,6 +126,7 @@ EXACT = "exact"
 TOLERANCES = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)  # sigma
 USUAL_TOLERANCE = 0.1
 ALL_CHEAP = "all cheap"
+CHOICES = (EXACT, *TOLERANCES, ALL_CHEAP)  # all effects exact, by a tolerance, all of them cheap
 
 Raw = NDArray[np.uint16]
 
@@ -144,18 +145,13 @@ class Surveyed:
 
     lines: FarmLines
     against: Against
-    chosen: dict[Setting, Chosen] = field(default_factory=dict)  # decided once, as in a survey
-
-    def choice(self, setting: Setting) -> Chosen:
-        """Decide for a tolerance; or take all effects, each exact or each cheap."""
-        if setting not in self.chosen:
-            self.chosen[setting] = _decided(self.lines, setting)
-        return self.chosen[setting]
+    chosen: dict[Setting, Chosen]  # decided once, as in a survey
 
 
 def _prepare(seed: int) -> Surveyed:
     lines = look_at_lines(seed)
-    return Surveyed(lines, Against.of(_shown(lines, lines.exact, lines.light(lines.exact)), lines.rig))
+    against = Against.of(_shown(lines, lines.exact, lines.light(lines.exact)), lines.rig)
+    return Surveyed(lines, against, {setting: _decided(lines, setting) for setting in CHOICES})
 
 
 def _decided(lines: FarmLines, setting: Setting) -> Chosen:
@@ -182,7 +178,7 @@ def _shown(lines: FarmLines, chosen: Mapping[Effect, str], light: Light) -> Ligh
 
 
 def _judged(state: Surveyed, setting: Setting, made: tuple[Light, Raw]) -> Light:
-    return _shown(state.lines, state.choice(setting).effects, made[0])
+    return _shown(state.lines, state.chosen[setting].effects, made[0])
 
 
 TOLERANCE = register(
@@ -192,14 +188,14 @@ TOLERANCE = register(
         error=ERROR,
         unit="px*band",
         reference="everything that the rig has, exact; on average over the noise",
-        settings=(EXACT, *TOLERANCES, ALL_CHEAP),
+        settings=CHOICES,
         prepare=_prepare,
-        run=lambda state, setting: _simulate(state.lines, state.choice(setting).effects),
+        run=lambda state, setting: _simulate(state.lines, state.chosen[setting].effects),
         judge=lambda state, setting, made: state.against.greatest(_judged(state, setting, made)),
         work=lambda state, _setting: state.lines.values,
         levels=lambda state: state.against.levels(),
         beside={
-            "bound [σ]": lambda state, setting, _made: state.choice(setting).bound,  # noqa: RUF001
+            "bound [σ]": lambda state, setting, _made: state.chosen[setting].bound,  # noqa: RUF001
             RMS: lambda state, setting, made: state.against.rms(_judged(state, setting, made)),
             DN: lambda state, setting, made: state.against.greatest_dn(_judged(state, setting, made)),
         },

@@ -14,7 +14,7 @@ from rich.console import Console
 from flows.cli.main import main
 from flows.evaluate import work as benchmark_work
 from flows.evaluate.command import ends, evaluate_weights, run_evaluate
-from flows.evaluate.costs import Prices, Rounds, cpu_seconds, row_seconds
+from flows.evaluate.costs import Prices, cpu_seconds, row_seconds
 from flows.evaluate.frames import open_candidates
 from flows.evaluate.request import EvaluateRequest
 from flows.evaluate.rows import ORACLE, Trial, captured_px, judge_frame, placings
@@ -381,7 +381,7 @@ def test_everything_timed_goes_in_turn():
     """Whatever slows the machine for a while meets all parts alike; rounds of warming up are not counted."""
     went: list[str] = []
     works = {("segment", name): lambda name=name: went.append(name) for name in ("a", "b")}  # type: ignore[misc]
-    taken = cpu_seconds(works, Rounds(counted=2, warm_up=1))
+    taken = cpu_seconds(works, 2, warm_up=1)
     assert went == ["a", "b"] * 3
     assert all(seconds >= 0 for seconds in taken.values())
 

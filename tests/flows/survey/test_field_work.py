@@ -27,11 +27,11 @@ ALL_CELLS = 3  # a halo that reaches over the whole field
 
 @pytest.fixture(scope="module")
 def surveyed(
-    tmp_path_factory: pytest.TempPathFactory, survey_png: Survey, scene_files: Path, weights: Path
+    tmp_path_factory: pytest.TempPathFactory, surveyed_png: Survey, scene_files: Path, weights: Path
 ) -> tuple[SurveyRun, Path]:
     """A survey of scene.png, and the folder of its stages."""
     out = tmp_path_factory.mktemp("field") / "archive"
-    survey_png(out)
+    surveyed_png(out)
     flags = {"scene": str(scene_files / "scene.png"), "weights": str(weights), "out": str(out), "budget": "0.8"}
     return open_run(load_settings(None, flags)), out / "stages"
 

@@ -94,10 +94,12 @@ class Walk:
 
 
 @pytest.fixture(scope="module")
-def walk(tmp_path_factory: pytest.TempPathFactory, survey_png: Any, scene_files: Path, weights: Path) -> Walk:
+def walk(
+    tmp_path_factory: pytest.TempPathFactory, survey_png: Any, surveyed_png: Any, scene_files: Path, weights: Path
+) -> Walk:
     """The same command again and again, each stage in turn failing by a bug and then by its words."""
     folder = tmp_path_factory.mktemp("failures")
-    receipt = survey_png(folder / "undisturbed").receipt
+    receipt = surveyed_png(folder / "undisturbed").receipt
     keys = {stage["name"]: stage["key"] for stage in receipt["stages"] if stage["state"] == "ran"}
     found = Walk(folder / "undisturbed", folder / "archive", keys, {}, {}, Counter(), {})
     scene = ["--scene", scene_files / "scene.png", "--labels", scene_files / "labels.png", "--weights", weights]

@@ -122,9 +122,11 @@ def test_the_picture_of_raw_lines_reads_no_raw_line(copied: Path, monkeypatch: p
 BROKEN_AT = 21
 
 
-def test_lost_lines_are_rendered_again(survey_png: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lost_lines_are_rendered_again(
+    survey_png: Any, surveyed_png: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Bits flip in index, header and numbers: verify tells of it, and the same command ends with the same stores."""
-    survey_png(tmp_path / "whole")
+    surveyed_png(tmp_path / "whole")
     append, appended = Spool.append, [0]
 
     def breaks(spool: Spool, line: Line) -> None:
@@ -152,10 +154,10 @@ def test_lost_lines_are_rendered_again(survey_png: Any, tmp_path: Path, monkeypa
     assert {one.kind for one in after.verify_all()} == {"whole"}
 
 
-def test_processes_make_the_same_archive(tmp_path: Path, survey_png: Survey) -> None:
+def test_processes_make_the_same_archive(tmp_path: Path, survey_png: Survey, surveyed_png: Survey) -> None:
     """A whole survey by two processes publishes the same keys and the same bytes as one by threads."""
     roots = tmp_path / "threads", tmp_path / "processes"
-    survey_png(roots[0])
+    surveyed_png(roots[0])
     survey_png(roots[1], scheduler="processes", workers=2)
     kept = [
         {

@@ -77,7 +77,7 @@ def test_what_is_chosen_keeps_its_bound_and_the_bound_its_tolerance(lines: FarmL
     monkeypatch.setattr(tradeoff_simulate, "look_at_lines", lambda seed: lines)
     state = TOLERANCE.prepare(0)
     found = errors(TOLERANCE, state)
-    bounds = {setting: state.choice(setting).bound for setting in TOLERANCE.settings}
+    bounds = {setting: state.chosen[setting].bound for setting in TOLERANCE.settings}
     assert found[EXACT] == bounds[EXACT] == 0
     assert all(found[one] <= bounds[one] <= one for one in TOLERANCES)
     assert found[ALL_CHEAP] <= bounds[ALL_CHEAP]
