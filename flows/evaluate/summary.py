@@ -53,16 +53,8 @@ def summarise(
 ) -> Record:
     """Give the figures of every row, against the baseline: the better of `all` and the dense control.
 
-    Parameters
-    ----------
-    runs
-        Of each weights, the records of `judge_frame`.
-    trial
-        ``shares``, ``policies``, ``seed``, ``draws`` (of the bootstrap).
-    prices
-        Times and capture seconds of some frames.
-    controls, designs
-        Of each control, the records of `judge_control`, and which design it is.
+    ``runs`` are of each weights the records of `judge_frame`, ``controls`` those of `judge_control` with the design of
+    each; ``trial`` has ``shares``, ``policies``, ``seed`` and ``draws`` (of the bootstrap).
     """
     rows = _rows(runs, trial, controls, designs)
     whole, none = rows["all", 1.0], rows["none", 0.0]

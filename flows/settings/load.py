@@ -18,15 +18,10 @@ from storage.archive.toml_files import read_toml
 
 
 def load_settings(path: str | Path | None = None, flags: Mapping[str, object] | None = None) -> Settings:
-    """Read the file, lay the flags over it and check the whole.
+    """Read the TOML file (None: defaults and flags alone), lay the flags over it and check the whole.
 
-    Parameters
-    ----------
-    path
-        TOML file; None for defaults and flags alone. Relative paths in it start at its folder, those of flags at the
-        current folder.
-    flags
-        Keys as in the file, ``camera.exposure_ms`` for one in a table; None means not given.
+    Relative paths in the file start at its folder, those of flags at the current one. Flags are keys as in the file,
+    ``camera.exposure_ms`` for one in a table; None means not given.
 
     Raises
     ------
@@ -52,15 +47,9 @@ def load_settings(path: str | Path | None = None, flags: Mapping[str, object] | 
 
 
 def parse_settings(table: Mapping[str, object], origin: Mapping[str, str] | None = None) -> Settings:
-    """Check a table of settings and fill in the defaults.
+    """Check a table of settings, with tables in it as in the file, and fill in the defaults; None means not given.
 
-    Parameters
-    ----------
-    table
-        Keys and values as in the file, ``camera``, ``cost``, ``pose`` and the like being tables themselves; None in
-        them means not given.
-    origin
-        Where each (dotted) key came from, for the messages: a file's name or ``flag``.
+    ``origin`` says where each (dotted) key came from, for the messages: a file's name or ``flag``.
     """
     origin = origin or {}
     settings = Settings(**_check_table(table, SURVEY, "", origin))

@@ -242,16 +242,7 @@ def columns_of_all_seats(
 ) -> NDArray[np.float32]:
     """Scan the scene in full, a band of seats at a time, and keep the normalised columns only.
 
-    Parameters
-    ----------
-    full
-        Sweeps of the full scan.
-    memory
-        What the survey may take. [bytes]
-
-    Returns
-    -------
-    (seat, p, p, column) float32 of the padded grid; seats beyond the scene are 0.
+    Gives (seat, p, p, column) float32 of the padded grid; seats beyond the scene are 0. ``memory`` is in bytes.
     """
     sweeps = [SimulatedSweep(source, sweep) for sweep in full]
     p, valid = grid.patch, grid.valid_seats()
