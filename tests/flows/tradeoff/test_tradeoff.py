@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from flows.tradeoff import entries as tradeoff_module
-from flows.tradeoff.command import print_tradeoff, run_tradeoff
+from flows.tradeoff.command import draw_tradeoffs, print_tradeoff, run_tradeoff, tradeoff_figure
 from flows.tradeoff.entries import (
     Level,
     Point,
@@ -28,7 +28,6 @@ from flows.tradeoff.entries import (
     register,
     registered,
 )
-from flows.tradeoff.plots import draw_tradeoffs, tradeoff_figure
 from pipeline.errors import ArchiveError, SettingsError
 
 

@@ -14,9 +14,8 @@ from rich.console import Console
 from flows.tradeoff import simulate as tradeoff_simulate
 from flows.tradeoff import simulate_light as tradeoff_simulate_light
 from flows.tradeoff import simulate_noise as tradeoff_simulate_noise
-from flows.tradeoff.command import print_tradeoff
+from flows.tradeoff.command import print_tradeoff, tradeoff_figure
 from flows.tradeoff.entries import Level, Point, Tradeoff, find_tradeoffs, mark_pareto, measure_tradeoff
-from flows.tradeoff.plots import tradeoff_figure
 from flows.tradeoff.simulate import (
     ALL_CHEAP,
     EXACT,
