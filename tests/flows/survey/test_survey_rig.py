@@ -6,8 +6,6 @@ import io
 import json
 import re
 import socket
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -18,6 +16,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+import flows.survey.prefect_engine
 import flows.survey.rig_field
 import flows.terminal.progress
 from flows.publish.run_folder import Published
@@ -386,16 +385,17 @@ def test_another_device_is_not_moved(command_line: CommandLine, tmp_path: Path, 
     assert not any("=" in act.request.line for act in rig.mirror.acts)
 
 
-def test_default_engine_says_it_once_as_well(tmp_path: Path):
+def test_default_engine_says_it_once_as_well(
+    command_line: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     """Through Prefect, which tries again, a port that is not there is one message too, and no traceback."""
+    monkeypatch.setattr(flows.survey.prefect_engine, "RETRY_DELAY_S", 0.0)
     file = tmp_path / "rig.toml"
     file.write_text('source = "rig"\nscene = "farm"\nsize = "96x96"\nbands = [40, 90]\n[rig]\nport = "/dev/ttyNONE"\n')
-    words = [sys.executable, "-m", "flows.cli.main", "survey", str(file), "--out", str(tmp_path / "archive")]
-    ended = subprocess.run(words, capture_output=True, text=True, check=False, cwd=Path(__file__).parents[3])
-    assert ended.returncode == 1
-    assert ended.stderr.count("/dev/ttyNONE") == 1
-    assert ended.stderr.splitlines()[-1].startswith("error: there is no port /dev/ttyNONE")
-    assert not {"Traceback", "ERROR", "Task run"} & set(re.findall(r"Traceback|ERROR|Task run", ended.stderr))
+    ended = command_line("survey", file, "--out", tmp_path / "archive")
+    assert (ended.code, ended.err.count("/dev/ttyNONE")) == (1, 1)
+    assert ended.err.splitlines()[-1].startswith("error: there is no port /dev/ttyNONE")
+    assert not re.findall(r"Traceback|ERROR|Task run", ended.err)
 
 
 def test_port_in_use_and_camera_unreachable(command_line: CommandLine, tmp_path: Path):
