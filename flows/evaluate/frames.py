@@ -22,7 +22,7 @@ from flows.training.look import observe_scene
 from models.network.dead_pixels import patches_of
 from models.reading.inference import CoarseLook, Glance, glance_of_columns
 from models.training.examples import normalised
-from models.weights.files import AnyWeights, Description, Weights, content_key, describe_weights, load_any_weights
+from models.weights.files import AnyWeights, Description, Weights, content_key, describe_weights
 from pipeline.errors import PipelineError, SceneError, SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
@@ -40,9 +40,10 @@ class Candidate:
     described: Description
     key: str
 
-    def load(self) -> AnyWeights:
-        """Read the tensors."""
-        return load_any_weights(self.path)
+    @staticmethod
+    def of(path: Path) -> Candidate:
+        """Describe a file; WeightsError where it cannot be read. None of its tensors is read yet."""
+        return Candidate(path, describe_weights(path), content_key(path)[:16])
 
     @property
     def camera(self) -> LineCamera:
@@ -114,13 +115,13 @@ def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
     """
     if not paths:
         raise SettingsError("evaluate needs --weights FILE; train some with: spectralzoom train DATASET -o FILE")
-    found = [Candidate(path, describe_weights(path), file_key(path)) for path in paths]
+    found = [Candidate.of(path) for path in paths]
     first = found[0].described
-    for one in found:
-        if one.described.config.preset != "two-scale":
+    for other in found:
+        if other.described.config.preset != "two-scale":
             raise SettingsError(
-                f"{one.path} holds the control {one.described.config.preset!r}; give it as --control, beside --weights "
-                "of two scales"
+                f"{other.path} holds the control {other.described.config.preset!r}; give it as --control, beside"
+                " --weights of two scales"
             )
     for other in found[1:]:
         if other.camera != found[0].camera:
@@ -133,15 +134,9 @@ def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
                 f"{other.path} differs from {found[0].path} in sizes or classes; several --weights are seeds of one "
                 "training: evaluate different ones one by one"
             )
-    keys = [one.key for one in found]
-    if len(set(keys)) < len(keys):
+    if len({one.key for one in found}) < len(found):
         raise SettingsError("the same weights are given twice in --weights, which would count as two seeds")
     return found
-
-
-def file_key(path: Path) -> str:
-    """Name weights by what they hold; WeightsError where they cannot be read."""
-    return content_key(path)[:16]
 
 
 def open_frames(

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.evaluate.frames import Candidate, Look, Sight, file_key
+from flows.evaluate.frames import Candidate, Look, Sight
 from flows.evaluate.series import Record, Runs, seeds_of
 from models.evaluation.boundary import boundary_counts
 from models.evaluation.metrics import confusion
@@ -27,7 +27,7 @@ from models.policies.free_seats import RANDOM_DRAWS
 from models.policies.policies import score_seats
 from models.reading.control_maps import control_multiply_adds, draw_with_control
 from models.reading.inference import Glance, segment
-from models.weights.files import AnyWeights, Weights, describe_weights
+from models.weights.files import AnyWeights, Weights
 from pipeline.errors import SettingsError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.planning.savings import BYTES_PER_SAMPLE
@@ -173,7 +173,7 @@ def open_controls(paths: tuple[Path, ...], weights: list[Candidate]) -> list[Can
         files of one design that differ in sizes, or one file twice.
     WeightsError : a file that cannot be read.
     """
-    found = [Candidate(path, describe_weights(path), file_key(path)) for path in paths]
+    found = [Candidate.of(path) for path in paths]
     first: dict[str, Candidate] = {}
     for one in found:
         name = design_of(one)

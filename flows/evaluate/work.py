@@ -31,7 +31,7 @@ from flows.evaluate.rows import (
 from flows.evaluate.series import Record
 from flows.terminal.figures import format_seconds
 from flows.training.data import TrainingData
-from models.weights.files import AnyWeights, Weights
+from models.weights.files import AnyWeights, Weights, load_any_weights
 from pipeline.errors import ArchiveError
 from pipeline.geometry.camera import LineCamera
 from pipeline.planning.line_blocks import WIDTHS
@@ -255,5 +255,5 @@ class Work:
 
     def _load(self, one: Candidate) -> AnyWeights:
         if one.key not in self._weights:
-            self._weights[one.key] = one.load()
+            self._weights[one.key] = load_any_weights(one.path)
         return self._weights[one.key]
