@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -124,6 +126,22 @@ def survey_png(scene_files: Path, weights: Path) -> Survey:
         return run_survey(load_settings(None, given | flags), console or Console(quiet=True))
 
     return survey
+
+
+@pytest.fixture(scope="session")
+def surveyed_png(survey_png: Survey, tmp_path_factory: pytest.TempPathFactory) -> Survey:
+    """Copy the session's one undisturbed survey of scene.png into a folder: what ``survey_png(out)`` leaves there."""
+    made: list[tuple[Path, Published]] = []
+
+    def copy(out: Path) -> Published:
+        if not made:
+            root = tmp_path_factory.mktemp("surveyed") / "archive"
+            made.append((root, survey_png(root)))
+        root, published = made[0]
+        shutil.copytree(root, out, dirs_exist_ok=True)
+        return replace(published, folder=out / published.folder.relative_to(root))
+
+    return copy
 
 
 @pytest.fixture(scope="session")

@@ -10,24 +10,18 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from flows.evaluate.budgets import summarise_equal_time, summarise_rig
-from flows.evaluate.controls import design_of, open_controls
 from flows.evaluate.costs import Prices
-from flows.evaluate.curve import REFERENCE
-from flows.evaluate.files import publish_evaluation
-from flows.evaluate.frames import Candidate, open_candidates, open_frames
-from flows.evaluate.jobs import Jobs, Show, sort_frames
-from flows.evaluate.kept_results import writing
+from flows.evaluate.frames import Candidate, Jobs, Show, open_candidates, open_frames, scene_of, sort_frames
 from flows.evaluate.request import COST, EvaluateRequest, checked_request
-from flows.evaluate.rows import known_or_none
-from flows.evaluate.series import Record, seeds_of
-from flows.evaluate.summary import summarise
+from flows.evaluate.rows import design_of, known_or_none, open_controls
+from flows.evaluate.series import REFERENCE, Record, seeds_of
+from flows.evaluate.summary import summarise, summarise_equal_time, summarise_rig
 from flows.evaluate.table import print_evaluation
-from flows.evaluate.work import Judged, Work
+from flows.evaluate.work import Made, Work, writing
 from flows.terminal.progress import StageProgress
 from flows.terminal.shown_text import on_stdout
 from models.evaluation.bootstrap import LEVEL
-from models.evaluation.metrics import agreement, false_pixels, iou_per_class
+from models.evaluation.metrics import agreement, false_pixels, iou_per_class, mean_iou
 from models.network.process import keep_freed_memory
 from models.weights.files import describe_weights, unsealed_note
 from storage.archive.whole_files import to_json
@@ -67,9 +61,9 @@ def evaluate_weights(request: EvaluateRequest, show: Show = lambda what, done, w
             request.out.mkdir(parents=True, exist_ok=True)  # before minutes are spent on what cannot be kept
     jobs = sort_frames(request, data, candidates, controls, show)
     work = Work(request, data, candidates, controls)
-    judged = work.judge(jobs, show)
-    content = {"dataset": data.law, **_files(candidates, controls, jobs), **_figures(request, work, judged)}
-    content["files"] = publish_evaluation(work, content, judged.runs, show)
+    made = work.judge(jobs, show)
+    content = {"dataset": data.law, **_files(candidates, controls, jobs), **_figures(request, work, made)}
+    content["files"] = publish_evaluation(work, content, made["frame"], show)
     return content
 
 
@@ -92,20 +86,30 @@ def _files(candidates: Sequence[Candidate], controls: Sequence[Candidate], jobs:
     }
 
 
-def _figures(request: EvaluateRequest, work: Work, judged: Judged) -> dict[str, Any]:
+def _figures(request: EvaluateRequest, work: Work, made: Made) -> dict[str, Any]:
     trial = {"shares": request.shares, "policies": request.policies, "seed": request.seed, "draws": request.draws}
     camera, names = asdict(work.camera), work.candidates[0].described.class_names
     designs = [design_of(one) for one in work.controls]
-    prices = Prices(judged.timed, judged.captured)
+    runs, rig, prices = made["frame"], made["rig"], Prices(made["time"][0], made["capture"][0])
     return {
         "settings": {**trial, "level": LEVEL, "mode": "frame", "camera": camera, "cost_model": asdict(COST)},
-        "seeds": [[work.candidates[number].path.name for number in one] for one in seeds_of(judged.runs)],
-        **summarise(judged.runs, names, trial, prices, judged.controls, designs),
-        "rig": summarise_rig(judged.rig, trial) if request.rig else {"rows": [], "left_out": []},
-        "equal_time": summarise_equal_time(judged.equal, judged.runs, judged.rig, trial) if request.equal_time else [],
-        "timed": judged.timed,
-        "captured": judged.captured,
-        "per_frame": _per_frame(judged.runs),
+        "seeds": [[work.candidates[number].path.name for number in one] for one in seeds_of(runs)],
+        **summarise(runs, names, trial, prices, made["control"], designs),
+        "rig": summarise_rig(rig, trial) if request.rig else {"rows": [], "left_out": []},
+        "equal_time": summarise_equal_time(made["equal"], runs, rig, trial) if request.equal_time else [],
+        "timed": prices.timed,
+        "captured": prices.captured,
+        "per_frame": [
+            {
+                "frame": record["frame"],
+                "weights": number,
+                "seats": record["seats"],
+                "positive_seats": record["positive_seats"],
+                "rows": [_of_frame(row) for row in record["rows"]],
+            }
+            for number, records in enumerate(runs)
+            for record in records
+        ],
         "notes": NOTES,
         "files": [],
     }
@@ -133,22 +137,7 @@ NOTES = {
 }
 
 
-def _per_frame(runs: list[list[Record]]) -> list[Record]:
-    return [
-        {
-            "frame": record["frame"],
-            "weights": number,
-            "seats": record["seats"],
-            "positive_seats": record["positive_seats"],
-            "rows": [_of_frame(row) for row in record["rows"]],
-        }
-        for number, records in enumerate(runs)
-        for record in records
-    ]
-
-
 def _of_frame(row: Record) -> Record:
-    """The figures of a frame alone, over the classes of its own labels."""
     counts = np.array(row["counts"])
     return {
         **{name: row[name] for name in ("policy", "draw", "share", "seats")},
@@ -156,3 +145,53 @@ def _of_frame(row: Record) -> Record:
         "per_class_iou": [known_or_none(iou) for iou in iou_per_class(counts)],
         "false_pixels": false_pixels(counts).tolist(),
     }
+
+
+SHOWN_SHARE = 0.10  # of the seats, or the nearest one tried: what the pictures show
+
+
+def publish_evaluation(work: Work, content: dict[str, Any], runs: list[list[Record]], show: Show) -> list[str]:
+    """Write figures, plots and pictures into the folder, where there is one; names of the files."""
+    out = work.request.out
+    if out is None:
+        return []
+    from flows.evaluate.plots import evaluation_figure, frame_figure, rig_figure, save_png  # matplotlib
+
+    policies, shares = work.trial.policies, work.trial.shares
+    shown = ("none", 0.0)
+    if policies and shares:
+        shown = policies[0], min(shares, key=lambda share: abs(share - SHOWN_SHARE))
+    files = [out / "evaluation.json", out / "evaluation.png"]
+    with writing(out):
+        save_png(evaluation_figure(content), files[1])
+        if content["rig"]["rows"]:
+            files.append(out / "rig.png")
+            save_png(rig_figure(content), files[-1])
+        for title, name, index in ends(runs, *shown):
+            show("drawing", len(files) / 6, title)
+            path, scene = out / f"{title}.png", scene_of(work.data, name)
+            look = work.look(scene, name, index)
+            save_png(frame_figure(f"{title} frame", look, work.loaded(index), *shown), path)
+            files.append(path)
+        content["files"] = [str(path) for path in files]
+        temporary = files[0].with_name("evaluation.json.part")
+        temporary.write_text(to_json(content), encoding="utf-8")
+        temporary.replace(files[0])
+    show("drawing", 1.0, "")
+    return [str(path) for path in files]
+
+
+def ends(runs: list[list[Record]], policy: str, share: float) -> list[tuple[str, str, int]]:
+    """Title, frame and weights of the lowest and the highest mIoU of a frame's own; one frame alone is the worst."""
+    judged: dict[str, tuple[float, int]] = {}
+    for number, records in enumerate(runs):
+        for record in records:
+            row = next(row for row in record["rows"] if (row["policy"], row["share"]) == (policy, share))
+            own = mean_iou(np.array(row["counts"]))
+            if not np.isnan(own):
+                judged.setdefault(record["frame"], (own, number))
+    if not judged:
+        return []
+    worst, best = (choose(judged, key=lambda name: judged[name][0]) for choose in (min, max))
+    named = [("worst", worst)] if worst == best else [("worst", worst), ("best", best)]
+    return [(title, name, judged[name][1]) for title, name in named]

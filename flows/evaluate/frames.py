@@ -1,8 +1,13 @@
-"""Which frames `spectralzoom evaluate` judges weights on, and what the weights see of them: what training saw."""
+"""Which frames `spectralzoom evaluate` judges which weights on, and what the weights see of them: what training saw.
+
+Each frame is judged by those that never saw its labels. Of frames left out in turn each file is judged on its own: what
+it kept for validation is held out by another of them.
+"""
 
 from __future__ import annotations
 
 import zlib
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,16 +15,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flows.evaluate.request import EvaluateRequest
 from flows.survey.scene import check_labels, judged_labels
 from flows.training.data import TrainingData, farm_test_data, open_training_data
 from flows.training.look import observe_scene
 from models.network.dead_pixels import patches_of
 from models.reading.inference import CoarseLook, Glance, glance_of_columns
 from models.training.examples import normalised
-from models.weights.files import AnyWeights, Description, Weights, content_key, describe_weights, load_any_weights
+from models.weights.files import AnyWeights, Description, Weights, content_key, describe_weights
 from pipeline.errors import PipelineError, SceneError, SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES
 from pipeline.simulator.scenes.scene import RasterScene
 
@@ -34,9 +40,10 @@ class Candidate:
     described: Description
     key: str
 
-    def load(self) -> AnyWeights:
-        """Read the tensors."""
-        return load_any_weights(self.path)
+    @staticmethod
+    def of(path: Path) -> Candidate:
+        """Describe a file; WeightsError where it cannot be read. None of its tensors is read yet."""
+        return Candidate(path, describe_weights(path), content_key(path)[:16])
 
     @property
     def camera(self) -> LineCamera:
@@ -108,13 +115,13 @@ def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
     """
     if not paths:
         raise SettingsError("evaluate needs --weights FILE; train some with: spectralzoom train DATASET -o FILE")
-    found = [Candidate(path, describe_weights(path), file_key(path)) for path in paths]
+    found = [Candidate.of(path) for path in paths]
     first = found[0].described
-    for one in found:
-        if one.described.config.preset != "two-scale":
+    for other in found:
+        if other.described.config.preset != "two-scale":
             raise SettingsError(
-                f"{one.path} holds the control {one.described.config.preset!r}; give it as --control, beside --weights "
-                "of two scales"
+                f"{other.path} holds the control {other.described.config.preset!r}; give it as --control, beside"
+                " --weights of two scales"
             )
     for other in found[1:]:
         if other.camera != found[0].camera:
@@ -127,15 +134,9 @@ def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
                 f"{other.path} differs from {found[0].path} in sizes or classes; several --weights are seeds of one "
                 "training: evaluate different ones one by one"
             )
-    keys = [one.key for one in found]
-    if len(set(keys)) < len(keys):
+    if len({one.key for one in found}) < len(found):
         raise SettingsError("the same weights are given twice in --weights, which would count as two seeds")
     return found
-
-
-def file_key(path: Path) -> str:
-    """Name weights by what they hold; WeightsError where they cannot be read."""
-    return content_key(path)[:16]
 
 
 def open_frames(
@@ -148,17 +149,13 @@ def open_frames(
     SettingsError : a choice that does not go with the data set.
     SceneError : no scene, or a name that it has not.
     """
-    if dataset not in FARM_NAMES:
-        data = open_training_data(dataset, 0, scenes, camera, **choices)
-        return _only(dataset, data, frames)
-    open_training_data(dataset, 0, 1, camera, **choices)  # refuses choices that are for files
-    count = FARM_TEST_SCENES if scenes is None else scenes
-    if count < 1:
-        raise SettingsError(f"--scenes must be at least 1, got {count}")
-    return _only(dataset, farm_test_data(count, camera), frames)
-
-
-def _only(dataset: str, data: TrainingData, frames: tuple[str, ...]) -> TrainingData:
+    built_in = dataset in FARM_NAMES
+    data = open_training_data(dataset, 0, 1 if built_in else scenes, camera, **choices)
+    if built_in:
+        count = FARM_TEST_SCENES if scenes is None else scenes
+        if count < 1:
+            raise SettingsError(f"--scenes must be at least 1, got {count}")
+        data = farm_test_data(count, camera)
     unknown = [name for name in frames if name not in data.train]
     if unknown:
         raise SceneError(f"{dataset} has no frame {', '.join(unknown)}; it has {', '.join(data.train)}")
@@ -166,25 +163,11 @@ def _only(dataset: str, data: TrainingData, frames: tuple[str, ...]) -> Training
     return TrainingData(data.law, names, (), (), data.camera, data.files)
 
 
-def check_frame(scene: RasterScene, described: Description) -> None:
-    """Refuse a frame that these weights cannot be judged on.
-
-    Raises
-    ------
-    SceneError : no labels, or of a class that the weights do not know.
-    """
-    if scene.labels is None:
-        raise SceneError(
-            f"frame {scene.name} has no labels, and a map is judged by labels: give --labels or a scene.toml"
-        )
-    check_labels(scene, described)
-
-
 def look_at(scene: RasterScene, name: str, weights: Weights, camera: LineCamera, seed: int) -> Look:
     """Look at a frame with the camera of the training, and glance at it with the weights."""
     sight = sight_of(scene, name, weights, camera, seed)
     seen = glance_of_columns(weights, sight.seen.columns, sight.seen.grid)
-    return Look(name, seen, sight.fine, sight.labels, sight.bands, sight.picture)
+    return Look(**(vars(sight) | {"seen": seen}))
 
 
 def sight_of(scene: RasterScene, name: str, weights: AnyWeights, camera: LineCamera, seed: int) -> Sight:
@@ -196,7 +179,7 @@ def sight_of(scene: RasterScene, name: str, weights: AnyWeights, camera: LineCam
     _, reached = weights.basis.matrix(scene.wavelength_nm)
     example = normalised(observed, weights.normalisation, reached)
     labels = judged_labels(scene, Description(config, weights.basis, weights.class_names, weights.record))
-    assert labels is not None  # check_frame
+    assert labels is not None  # sort_frames
     return Sight(
         name,
         CoarseLook(grid, np.ascontiguousarray(example.coarse, np.float32)),
@@ -205,3 +188,108 @@ def sight_of(scene: RasterScene, name: str, weights: AnyWeights, camera: LineCam
         len(scene.wavelength_nm),
         observed.fine[: grid.height, : grid.width],
     )
+
+
+Show = Callable[[str, float, str], None]
+
+
+@dataclass(frozen=True)
+class Job:
+    """A frame, and the numbers of the weights and of the controls that it says something of."""
+
+    name: str
+    weights: tuple[int, ...]
+    controls: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class Jobs:
+    """Frames to judge, and those that all of the weights were trained on."""
+
+    frames: list[Job]
+    left_out: list[str]
+
+    def covered(self, number: int, *, control: bool = False) -> list[str]:
+        """Frames that one of the weights, or one of the controls, is judged on."""
+        return [job.name for job in self.frames if number in (job.controls if control else job.weights)]
+
+
+def scene_of(data: TrainingData, name: str) -> RasterScene:
+    """Make one scene of the data."""
+    return next(data.scenes((name,)))
+
+
+def sort_frames(
+    request: EvaluateRequest,
+    data: TrainingData,
+    weights: Sequence[Candidate],
+    controls: Sequence[Candidate],
+    show: Show,
+) -> Jobs:
+    """Look at every frame for who was trained on it.
+
+    Raises
+    ------
+    SceneError : no frame or no labelled pixel is left, a frame that was asked for by name has no weights left, a
+        control has no frame left, or a frame that cannot be judged.
+    SettingsError : files that were trained on different pixels of one frame.
+    """
+    jobs, labelled = Jobs([], []), False
+    chosen = any(request.choices.get(what) is not None for what in ("bands", "wavelengths"))
+    for number, name in enumerate(data.train):
+        show("looking for frames", number / len(data.train), name)
+        scene = scene_of(data, name)
+        if scene.labels is None:
+            raise SceneError(
+                f"frame {scene.name} has no labels, and a map is judged by labels: give --labels or a scene.toml"
+            )
+        for one in weights:
+            check_labels(scene, one.described)
+        job = Job(name, *(_fit(some, scene, name, data.law, chosen) for some in (weights, controls)))
+        fit = [*(weights[at] for at in job.weights), *(controls[at] for at in job.controls)]
+        for one in fit[1:]:
+            if one.pixels_of(scene) != fit[0].pixels_of(scene):
+                raise SettingsError(
+                    f"{one.path} and {fit[0].path} were trained on different pixels of {scene.name}, so that others "
+                    "are left to judge each of them on; evaluate them one by one"
+                )
+        if not job.weights:
+            jobs.left_out.append(name)
+            continue
+        jobs.frames.append(job)
+        labels = judged_labels(scene, weights[job.weights[0]].described)
+        labelled = labelled or (labels is not None and bool((labels != UNLABELLED).any()))
+    show("looking for frames", 1.0, f"{len(jobs.frames)} of {len(data.train)}")
+    _check_left(request, jobs, weights, controls)
+    if not labelled:
+        raise SceneError(f"no labelled pixel is left on the {len(jobs.frames)} frames of {request.dataset} to judge by")
+    return jobs
+
+
+def _fit(some: Sequence[Candidate], scene: RasterScene, name: str, law: str, chosen: bool) -> tuple[int, ...]:
+    in_turn = len({one.held_out for one in some}) > 1
+    return tuple(
+        number
+        for number, one in enumerate(some)
+        if not one.trained_on(scene, name, law, bands_chosen=chosen) and not (in_turn and one.validated_on(name, law))
+    )
+
+
+def _check_left(
+    request: EvaluateRequest, jobs: Jobs, weights: Sequence[Candidate], controls: Sequence[Candidate]
+) -> None:
+    files = ", ".join(str(one.path) for one in weights)
+    told = (
+        "frames trained on are refused: judge by others, or train with some held out: spectralzoom train ... --hold-out"
+        " NAMES"
+    )
+    if not jobs.frames:
+        raise SceneError(f"{files} was trained on all {len(jobs.left_out)} frames of {request.dataset}, and {told}")
+    if request.frames and jobs.left_out:
+        raise SceneError(
+            f"no weights are left for {', '.join(jobs.left_out)} of --frames: {files} was trained on "
+            f"{'it' if len(jobs.left_out) == 1 else 'them'}, and {told}"
+        )
+    for number, one in enumerate(controls):
+        if not jobs.covered(number, control=True):
+            raise SceneError(f"the control {one.path} was trained on all {len(jobs.frames)} frames judged, and {told}")

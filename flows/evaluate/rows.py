@@ -1,26 +1,39 @@
-"""One frame judged by one set of weights: every policy at every share of the seats, as counts that add up."""
+"""One frame judged by one set of weights or a control: every policy at each share of the seats, as counts that add up.
+
+Controls are networks of other designs, trained for themselves: the paper's reads the seats that the Sobel policy
+chooses at each share, the others read the whole frame once. Pooled rows have one threshold for the scores of all
+frames: bare frames buy fewer seats, rich ones more, together the same share. That takes a second pass, for the scores
+of all frames are needed first. Frames left out in turn are scored by different weights; these scores are nats on every
+frame, whoever gave them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.evaluate.frames import Look, Sight
+from flows.evaluate.frames import Candidate, Look, Sight
+from flows.evaluate.series import Record, Runs, seeds_of
 from models.evaluation.boundary import boundary_counts
 from models.evaluation.metrics import confusion
 from models.evaluation.placement_metrics import average_precision, gain_sums, oracle_gain, rank_correlation, top_seats
 from models.network.cost import MultiplyAdds, multiply_adds
 from models.policies.free_seats import RANDOM_DRAWS
 from models.policies.policies import score_seats
-from models.reading.inference import segment
-from models.weights.files import Weights
+from models.reading.control_maps import control_multiply_adds, draw_with_control
+from models.reading.inference import Glance, segment
+from models.weights.files import AnyWeights, Weights
+from pipeline.errors import SettingsError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.planning.prices import BYTES_PER_SAMPLE
 from pipeline.planning.selection import frame_seats
+from pipeline.planning.savings import BYTES_PER_SAMPLE
+from pipeline.planning.selection import frame_seats, select_seats
 
 ORACLE = "oracle"
 Seats = NDArray[np.intp]
@@ -61,7 +74,7 @@ def judge_frame(
     grid = look.seen.grid
     valid = grid.valid_seats()
     placed = placings(trial, look, weights)
-    gain = placed[-1].scores
+    gain, scores_of = placed[-1].scores, {(one.policy, one.draw): one.scores for one in placed}
     wanted = list(wanted_rows(trial, placed, look))
     rows = []
     for number, (policy, draw, share, seats) in enumerate(wanted):
@@ -70,7 +83,8 @@ def judge_frame(
         row |= judge_map(look, drawn, seats, weights.config.classes)
         row |= cost_of_seats(look, weights, seats, policy)
         row["gain"], row["best_gain"] = gain_sums(gain, seats, valid)
-        row["ap_top"] = _ap_top(placed, policy, draw, gain, seats, valid)
+        scores, best = scores_of.get((policy, draw)), top_seats(gain[valid], len(seats))  # as many of the oracle's best
+        row["ap_top"] = None if scores is None else known_or_none(average_precision(scores[valid], best))
         rows.append(row)
         report((number + 1) / len(wanted))
     return {
@@ -78,7 +92,15 @@ def judge_frame(
         "shape": [grid.height, grid.width],
         "seats": len(valid),
         "rows": rows,
-        "ranking": [_ranking(one, gain, valid) for one in placed],
+        "ranking": [
+            {
+                "policy": one.policy,
+                "draw": one.draw,
+                "ap_gain": known_or_none(average_precision(one.scores[valid], gain[valid] > 0)),
+                "spearman": known_or_none(rank_correlation(one.scores[valid], gain[valid])),
+            }
+            for one in placed
+        ],
         "positive_seats": int((gain[valid] > 0).sum()),
     }
 
@@ -116,10 +138,10 @@ def cost_of_seats(look: Look, weights: Weights, seats: Seats, policy: str) -> di
     """Samples with those of the coarse pass, their bytes, and multiply-adds (`none` and `all`: the map alone)."""
     known = {"none": None, "all": None, ORACLE: "random"}.get(policy, policy)  # the oracle scores by labels
     adds = multiply_adds(weights.config, look.seen.grid, len(seats), look.bands, known)
-    return cost_of(look, float(np.prod(look.seen.grid.coarse_shape)) + fine_samples(look, seats), adds)
+    return _cost_of(look, float(np.prod(look.seen.grid.coarse_shape)) + fine_samples(look, seats), adds)
 
 
-def cost_of(look: Sight, samples: float, adds: MultiplyAdds) -> dict[str, Any]:
+def _cost_of(look: Sight, samples: float, adds: MultiplyAdds) -> dict[str, Any]:
     """Samples, their bytes before compression, and multiply-adds, also told apart by what they are for."""
     return {
         "samples": samples,
@@ -134,25 +156,185 @@ def fine_samples(look: Sight, seats: Seats) -> float:
     return float(look.seen.grid.valid_share().ravel()[seats].sum() * look.seen.grid.patch**2)
 
 
-def _ap_top(
-    placed: list[Placing], policy: str, draw: int, gain: NDArray[np.float64], seats: Seats, valid: Seats
-) -> float | None:
-    """Average precision of the scores against as many of the oracle's best seats."""
-    one = next((one for one in placed if (one.policy, one.draw) == (policy, draw)), None)
-    return (
-        None if one is None else known_or_none(average_precision(one.scores[valid], top_seats(gain[valid], len(seats))))
-    )
-
-
-def _ranking(one: Placing, gain: NDArray[np.float64], valid: Seats) -> dict[str, Any]:
-    return {
-        "policy": one.policy,
-        "draw": one.draw,
-        "ap_gain": known_or_none(average_precision(one.scores[valid], gain[valid] > 0)),
-        "spearman": known_or_none(rank_correlation(one.scores[valid], gain[valid])),
-    }
-
-
 def known_or_none(value: float) -> float | None:
     """Turn NaN into None, which JSON knows."""
     return None if np.isnan(value) else float(value)
+
+
+DENSE = "dense"  # the control that may be the baseline
+BUYS_SEATS = "paper"
+POLICY = "sobel"  # of the paper's network
+
+
+def open_controls(paths: tuple[Path, ...], weights: list[Candidate]) -> list[Candidate]:
+    """Describe the controls; none of their tensors is read yet.
+
+    Raises
+    ------
+    SettingsError : weights of two scales, of other classes or another camera than the weights they stand beside, two
+        files of one design that differ in sizes, or one file twice.
+    WeightsError : a file that cannot be read.
+    """
+    found = [Candidate.of(path) for path in paths]
+    first: dict[str, Candidate] = {}
+    for one in found:
+        name = design_of(one)
+        if name == "two-scale":
+            raise SettingsError(f"{one.path} is of two scales, and no control; judge it by itself, with --weights")
+        if one.described.class_names != weights[0].described.class_names:
+            raise SettingsError(f"the control {one.path} has other classes than {weights[0].path}")
+        if one.camera != weights[0].camera:
+            raise SettingsError(f"the control {one.path} was trained through another camera than {weights[0].path}")
+        other = first.setdefault(name, one)
+        if one.described.config != other.described.config:
+            raise SettingsError(
+                f"the controls {one.path} and {other.path} are both {name} and differ in sizes; several of one design "
+                "are seeds of one training"
+            )
+    if len({one.key for one in found}) < len(found):
+        raise SettingsError("the same weights are given twice in --control, which would count as two seeds")
+    return found
+
+
+def design_of(control: Candidate) -> str:
+    """Name of the kind of network: what its rows are called."""
+    return str(control.described.config.preset)
+
+
+def control_shares(design: str, shares: tuple[float, ...]) -> tuple[float, ...]:
+    """Shares of the seats at which a control is judged: the paper's at each, the others as a whole."""
+    return shares if design == BUYS_SEATS else (0.0,) if design == "upsampled" else (1.0,)
+
+
+def seats_of_control(sight: Sight, design: str, share: float) -> Seats:
+    """Seats that a control reads."""
+    grid = sight.seen.grid
+    if design != BUYS_SEATS:
+        return grid.valid_seats() if share else np.empty(0, np.intp)
+    return frame_seats(score_by_image(sight), share, grid.valid_share().ravel() > 0).seats
+
+
+def score_by_image(sight: Sight) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Scores of the paper's policy, which asks the coarse image alone."""
+    seen = sight.seen
+    return score_seats(POLICY, Glance(seen.grid, seen.columns, np.empty((0, 0, 0), np.float32)))
+
+
+def judge_control(
+    trial: Trial, sight: Sight, weights: AnyWeights, report: Callable[[float], None] = lambda done: None
+) -> dict[str, Any]:
+    """Judge a control's map of a frame at each of its shares; a record like `judge_frame`'s, without placement."""
+    design, rows = weights.config.preset, []
+    shares = control_shares(design, trial.shares)
+    for number, share in enumerate(shares):
+        seats = seats_of_control(sight, design, share)
+        drawn = draw_with_control(weights, sight.seen, sight.fine[seats], seats).classes
+        row = {"policy": design, "draw": 0, "share": share, "seats": len(seats)}
+        row |= judge_map(sight, drawn, seats, weights.config.classes)
+        row |= _control_cost(sight, weights, design, seats)
+        rows.append(row | {"gain": None, "best_gain": None, "ap_top": None})
+        report((number + 1) / len(shares))
+    grid = sight.seen.grid
+    return {
+        "frame": sight.name,
+        "shape": [grid.height, grid.width],
+        "seats": len(grid.valid_seats()),
+        "rows": rows,
+        "ranking": [],
+        "positive_seats": None,
+    }
+
+
+def _control_cost(sight: Sight, weights: AnyWeights, design: str, seats: Seats) -> dict[str, Any]:
+    """Its camera takes coarse samples, fine ones of the seats, or those of a grid coarser by two."""
+    config, grid = weights.config, sight.seen.grid
+    samples = 0.0 if design == DENSE else float(np.prod(grid.coarse_shape))
+    samples += fine_samples(sight, seats)
+    if design == "coarser":
+        samples = float(-(-grid.height // 2) * -(-grid.width // 2))
+    adds = control_multiply_adds(config, grid, len(seats), sight.bands)
+    if design == BUYS_SEATS:
+        adds = replace(adds, score=adds.score + multiply_adds(config, grid, 0, sight.bands, POLICY).score)
+    return _cost_of(sight, samples, adds)
+
+
+POOLED = ("gain", "entropy")  # scores that mean the same on every frame [nat]
+POOLED_MARK = ", pooled"
+Bought = dict[tuple[int, str], list[Record]]  # (weights, frame) -> policy, share, seats, threshold
+
+
+def is_pooled(name: str) -> bool:
+    """Whether rows of this name have one threshold for all frames."""
+    return name.endswith(POOLED_MARK)
+
+
+def own_policy(name: str) -> str:
+    """Give the policy whose scores a row goes by."""
+    return name.removesuffix(POOLED_MARK)
+
+
+def pooled_policies(policies: Sequence[str]) -> tuple[str, ...]:
+    """Give those of the policies that are judged with one threshold for all frames as well."""
+    return tuple(policy for policy in policies if policy in POOLED)
+
+
+def score_frame(policies: Sequence[str], look: Look) -> Record:
+    """Scores of a frame's valid seats by every policy that is pooled."""
+    valid = look.seen.grid.valid_seats()
+    scores = {policy: score_seats(policy, look.seen)[valid].tolist() for policy in pooled_policies(policies)}
+    return {"frame": look.name, "scores": scores}
+
+
+def buy_together(scores: Sequence[Record], shares: Sequence[float]) -> list[list[Record]]:
+    """Of each frame, how many seats it buys where the best of all frames together are bought, at each share of them.
+
+    Equal scores go to the earlier frame, and there to the lowest number. ``threshold`` is the last score bought.
+    """
+    found: list[list[Record]] = [[] for _ in scores]
+    for policy in scores[0]["scores"]:
+        each = [np.array(record["scores"][policy], np.float64) for record in scores]
+        together = np.concatenate(each)
+        of_frame = np.repeat(np.arange(len(each)), [len(own) for own in each])
+        for share in shares:
+            bought = frame_seats(together, share).seats
+            threshold = known_or_none(together[bought[-1]]) if len(bought) else None
+            counts = np.bincount(of_frame[bought], minlength=len(each)).tolist()
+            for own, count in zip(found, counts, strict=True):
+                own.append({"policy": policy, "share": share, "seats": count, "threshold": threshold})
+    return found
+
+
+def buy_by_seed(scores: Runs, shares: Sequence[float]) -> Bought:
+    """Let the frames of each seed of the training buy together. ``scores``: of each weights, those of its frames."""
+    found: Bought = {}
+    for members in seeds_of(scores):
+        frames = [(number, record) for number in members for record in scores[number]]
+        bought = buy_together([record for _, record in frames], shares)
+        found |= {(number, record["frame"]): own for (number, record), own in zip(frames, bought, strict=True)}
+    return found
+
+
+def judge_pooled(
+    bought: Sequence[Record], look: Look, weights: Weights, report: Callable[[float], None] = lambda done: None
+) -> dict[str, Any]:
+    """Judge the map of every number of seats that a frame buys; rows like `judge_frame`'s, without placement."""
+    allowed = look.seen.grid.valid_share().ravel() > 0
+    rows = []
+    for number, one in enumerate(bought):
+        seats = select_seats(score_seats(one["policy"], look.seen), one["seats"], allowed).seats
+        drawn = segment(weights, look.seen, look.fine[seats], seats).classes
+        row = {**one, "policy": one["policy"] + POOLED_MARK, "draw": 0}
+        row |= judge_map(look, drawn, seats, weights.config.classes)
+        row |= cost_of_seats(look, weights, seats, one["policy"])
+        rows.append(row | {"gain": None, "best_gain": None, "ap_top": None})
+        report((number + 1) / len(bought))
+    return {"frame": look.name, "rows": rows}
+
+
+def joined_rows(runs: Runs, pooled: Runs) -> list[list[Record]]:
+    """Give the records of all weights with the rows that were pooled among their own."""
+    joined = []
+    for records, more in zip(runs, pooled, strict=True):
+        further = {record["frame"]: record["rows"] for record in more}
+        joined.append([{**one, "rows": [*one["rows"], *further.get(one["frame"], [])]} for one in records])
+    return joined

@@ -1,13 +1,13 @@
 """Records of several weights as rows of counts: which weights make up one seed, and which run judged which frame.
 
 Weights of frames left out in turn have no frame in common; together they are one seed of the training, judged on all
-of their frames. Weights that share a frame are different seeds.
+of their frames. Weights that share a frame are different seeds. And what a whole curve of mIoU over cost comes to.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -123,3 +123,59 @@ def mean_or_none(values: Sequence[float | None]) -> float | None:
     """Mean of what is known; None where nothing is."""
     known = [value for value in values if value is not None]
     return float(np.mean(known)) if known else None
+
+
+ENOUGH = 0.95  # of the mIoU of K = all
+LEAST_GAP = 0.01  # of mIoU between none and all, for a share of it to be said
+REFERENCE = "cost of K = all, mIoU of K = 0"
+Point = tuple[float, float]  # cost, mIoU
+
+
+@dataclass(frozen=True)
+class CurveFigures:
+    """Figures of one policy's curve."""
+
+    auc_gap: float | None  # mean of the gap closed over the logarithm of cost, from none to all
+    hypervolume: float | None  # mIoU x share of the cost that the curve dominates, from the reference
+    cost_to_enough: float | None  # least cost tried that reaches 95 % of the mIoU of all, over that of all
+
+
+def curve_figures(none: Point, points: Sequence[Point], every: Point) -> CurveFigures:
+    """Sum up a curve from ``none`` by its points to ``every``.
+
+    ``auc_gap`` goes straight from point to point in the logarithm of cost; 1 would be all of the gap closed at no cost
+    more than none's, and None where the gap is under one point. The hypervolume counts what lies below the best point
+    of at most that cost: reference (cost of all, mIoU of none), costs over that of all.
+    """
+    if not 0 < none[0] < every[0]:
+        return CurveFigures(None, None, None)
+    curve = sorted([none, *points, every])
+    reached = [cost / every[0] for cost, miou in curve if miou >= ENOUGH * every[1]]
+    gap, auc_gap = every[1] - none[1], None
+    if gap >= LEAST_GAP:
+        cost, miou = np.array([one for one in curve if none[0] <= one[0] <= every[0]]).T
+        place = np.log(cost)
+        auc_gap = float(np.trapezoid((miou - none[1]) / gap, place) / (place[-1] - place[0]))
+    volume, best, before = 0.0, none[1], 0.0
+    for share, reaches in ((cost / every[0], miou) for cost, miou in curve if cost <= every[0]):
+        volume += (best - none[1]) * (share - before)
+        best, before = max(best, reaches), share
+    return CurveFigures(auc_gap, volume, min(reached, default=None))
+
+
+def summarise_curves(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Give the figures of every policy, the oracle's among them, and of a control that buys seats."""
+
+    def point(row: dict[str, Any]) -> Point | None:
+        cost = row["cost"]["multiply_adds"]["done"]
+        return None if cost is None or row["miou"] is None else (cost, row["miou"])
+
+    ends = {row["policy"]: point(row) for row in rows if row["policy"] in ("none", "all")}
+    none, every = ends["none"], ends["all"]
+    found = []
+    for policy in dict.fromkeys(row["policy"] for row in rows if row["policy"] not in ends and not row["control"]):
+        points = [point(row) for row in rows if row["policy"] == policy]
+        known = [one for one in points if one is not None]
+        if none is not None and every is not None and known:
+            found.append({"policy": policy, **asdict(curve_figures(none, known, every))})
+    return found

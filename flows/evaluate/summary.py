@@ -6,13 +6,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flows.evaluate.controls import DENSE
 from flows.evaluate.costs import Prices, row_cost
-from flows.evaluate.curve import summarise_curves
-from flows.evaluate.pooled import is_pooled, own_policy, pooled_name, pooled_policies
-from flows.evaluate.rows import ORACLE
+from flows.evaluate.rig_plans import BUDGETS, PLANNED, RANDOM, UNIFORM, plan_name
+from flows.evaluate.rows import DENSE, ORACLE, POOLED_MARK, is_pooled, own_policy, pooled_policies
 from flows.evaluate.series import (
     Record,
     Row,
@@ -23,6 +20,7 @@ from flows.evaluate.series import (
     frame_names,
     mean_of,
     mean_or_none,
+    summarise_curves,
 )
 from models.evaluation.boundary import boundary_iou, mean_boundary_iou
 from models.evaluation.metrics import (
@@ -55,21 +53,14 @@ def summarise(
 ) -> Record:
     """Give the figures of every row, against the baseline: the better of `all` and the dense control.
 
-    Parameters
-    ----------
-    runs
-        Of each weights, the records of `judge_frame`.
-    trial
-        ``shares``, ``policies``, ``seed``, ``draws`` (of the bootstrap).
-    prices
-        Times and capture seconds of some frames.
-    controls, designs
-        Of each control, the records of `judge_control`, and which design it is.
+    ``runs`` are of each weights the records of `judge_frame`, ``controls`` those of `judge_control` with the design of
+    each; ``trial`` has ``shares``, ``policies``, ``seed`` and ``draws`` (of the bootstrap).
     """
     rows = _rows(runs, trial, controls, designs)
     whole, none = rows["all", 1.0], rows["none", 0.0]
     known = (mean_of(none.over_runs(mean_iou)), mean_of(whole.over_runs(mean_iou)))
     base, why = choose_baseline(rows, trial)
+    support = whole.counts.sum(axis=3).max(axis=0).sum(axis=0)  # labelled pixels of each class, each frame once
     table = []
     for (policy, share), row in rows.items():
         control = policy in designs
@@ -86,7 +77,7 @@ def summarise(
         table.append(figures)
     return {
         "rows": table,
-        "support": dict(zip(class_names, _support(whole).tolist(), strict=True)),
+        "support": dict(zip(class_names, support.tolist(), strict=True)),
         "baseline": {"policy": base.policy, "share": base.share, "why": why},
         "curves": summarise_curves(table),
     }
@@ -95,7 +86,7 @@ def summarise(
 def _rows(runs: Runs, trial: Record, controls: Runs, designs: Sequence[str]) -> dict[Key, Row]:
     """Every row: none, policies, pooled ones and the oracle at every share, controls, all."""
     names, seeds = frame_names(runs), by_seed(runs)
-    pooled = (pooled_name(policy) for policy in pooled_policies(trial["policies"]))
+    pooled = (policy + POOLED_MARK for policy in pooled_policies(trial["policies"]))
     every = [(policy, share) for policy in (*trial["policies"], *pooled, ORACLE) for share in trial["shares"]]
     found = {key: collect_row(seeds, *key, names) for key in [("none", 0.0), *every]}
     for design in dict.fromkeys(designs):
@@ -120,15 +111,10 @@ def choose_baseline(rows: dict[Key, Row], trial: Record) -> tuple[Row, str]:
     return (dense if better else whole), words
 
 
-def _support(row: Row) -> NDArray[np.int64]:
-    """Labelled pixels of each class over all frames, each frame once."""
-    total: NDArray[np.int64] = row.counts.sum(axis=3).max(axis=0).sum(axis=0)
-    return total
-
-
 def _accuracy(row: Row, class_names: Sequence[str]) -> dict[str, Any]:
     each = row.over_runs(mean_iou)
-    seeds = np.array([mean_of(each[row.of_seed == number]) for number in np.unique(row.of_seed)])
+    draws = [each[row.of_seed == number] for number in np.unique(row.of_seed)]
+    seeds = np.array([mean_of(some) for some in draws])
     classes = row.over_runs(iou_per_class)
     false = row.over_runs(false_pixels).mean(axis=0).tolist()  # of a run
     near = list(zip(row.boundary.sum(axis=1), row.over_runs(labelled_classes).astype(bool), strict=True))
@@ -138,7 +124,7 @@ def _accuracy(row: Row, class_names: Sequence[str]) -> dict[str, Any]:
         "miou": mean_of(each),
         "miou_of_shown_classes": mean_of(row.over_runs(miou_of_shown_classes)),
         "spread": float(seeds.std(ddof=1)) if len(seeds) > 1 else None,
-        "draws_spread": _draws_spread(row, each),
+        "draws_spread": mean_of([some.std(ddof=1) for some in draws]) if len(draws[0]) > 1 else None,
         "by_seed": seeds.tolist(),
         "classes_averaged": int((~np.isnan(classes)).any(axis=0).sum()),
         "miou_i": mean_of([miou_over_frames(run) for run in judged]),
@@ -156,12 +142,6 @@ def _accuracy(row: Row, class_names: Sequence[str]) -> dict[str, Any]:
         "inside_miou": mean_of(row.over_runs(mean_iou, "inside")),
         "outside_miou": mean_of(outside),
     }
-
-
-def _draws_spread(row: Row, each: NDArray[np.float64]) -> float | None:
-    """Spread of a placement's draws, the mean over the seeds of the training."""
-    groups = [each[row.of_seed == number] for number in np.unique(row.of_seed)]
-    return mean_of([group.std(ddof=1) for group in groups]) if len(groups[0]) > 1 else None
 
 
 def _pooled(row: Row, rows: dict[Key, Row], trial: Record) -> Record:
@@ -185,4 +165,76 @@ def _placement(row: Row, runs: Runs, *, judged: bool) -> Record:
         "ap_top": mean_or_none([part["ap_top"] for part in row.parts]),
         "spearman": mean_or_none([one["spearman"] for one in ranks]),
         "undefined_scenes": sum(one["ap_gain"] is None for one in ranks),
+    }
+
+
+PLANS = (*PLANNED, UNIFORM, RANDOM)
+
+
+def summarise_rig(runs: Runs, trial: Record) -> dict[str, Any]:
+    """Give mIoU, seconds and lines of every plan at every budget, and our plans against the two without a model.
+
+    A budget at which a frame has no plan is judged on the other frames, in every row alike; their number is said.
+    """
+    names, seeds = frame_names(runs), by_seed(runs)
+    rows = {
+        (plan, budget): row
+        for plan in PLANS
+        for budget in BUDGETS
+        if (row := collect_row(seeds, plan, budget, names)) is not None
+    }
+    table = []
+    for (plan, budget), row in rows.items():
+        figures = _figures(row, "budget")
+        for other, name in ((UNIFORM, "against_uniform"), (RANDOM, "against_random")):
+            figures[name] = difference(row, rows[other, budget], trial) if plan in PLANNED else None
+        table.append(figures)
+    left_out = {  # a matter of the frame and the rig: of several weights the same
+        (record["frame"], one["budget"]): {"frame": record["frame"], **one}
+        for records in runs
+        for record in records
+        for one in record["left_out"]
+    }
+    return {"rows": table, "left_out": list(left_out.values())}
+
+
+def summarise_equal_time(runs: Runs, judged: Runs, rig: Runs, trial: Record) -> list[dict[str, Any]]:
+    """Give the rows with the exposure of equal time, against `all` and against the same row at equal exposure.
+
+    ``rig`` holds the plans of lines at equal exposure; without them their differences are None. Of random placements
+    the first draw stands for all in ``runs``, and is what it is compared with.
+    """
+    names, seeds, plans = frame_names(judged), by_seed(runs), by_seed(rig)
+    usual = [
+        [{**record, "rows": [row for row in record["rows"] if row["draw"] == 0]} for record in records]
+        for records in by_seed(judged)
+    ]
+    whole = collect_row(usual, "all", 1.0, names)
+    wanted = [(policy, share, policy, usual) for policy in trial["policies"] for share in trial["shares"]]
+    wanted += [(plan_name(policy), budget, policy, plans) for policy in PLANNED for budget in BUDGETS]
+    found = []
+    for name, share, policy, beside in wanted:
+        row, same = collect_row(seeds, name, share, names), collect_row(beside, policy, share, names)
+        if row is None or whole is None:
+            continue
+        figures = _figures(row, "share") | {"exposure": mean_of([part["exposure"] for part in row.parts])}
+        figures["against_all"] = difference(row, whole, trial)
+        figures["against_equal_exposure"] = None if same is None else difference(row, same, trial)
+        figures["equal_exposure_miou"] = None if same is None else mean_of(same.over_runs(mean_iou))
+        found.append(figures)
+    return found
+
+
+def _figures(row: Row, name: str) -> dict[str, Any]:
+    def mean_part(name: str) -> float | None:
+        return mean_or_none([part[name] for part in row.parts if name in part])
+
+    return {
+        "policy": row.policy,
+        name: row.share,
+        "miou": mean_of(row.over_runs(mean_iou)),
+        "miou_of_shown_classes": mean_of(row.over_runs(miou_of_shown_classes)),
+        "pixel_accuracy": mean_of(row.over_runs(overall_accuracy)),
+        "frames": int(row.judged.sum()),
+        **{part: mean_part(part) for part in ("seconds", "full_s", "lines", "full_lines", "seats")},
     }

@@ -2,33 +2,43 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import time
 import zlib
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
-from flows.evaluate.controls import design_of, judge_control
-from flows.evaluate.costs import capture_seconds
-from flows.evaluate.equal_time import judge_equal_time
-from flows.evaluate.frames import Candidate, Look, Sight, look_at, sight_of
-from flows.evaluate.jobs import Job, Jobs, Show, scene_of
-from flows.evaluate.kept_results import KeptResults
-from flows.evaluate.pooled import Bought, buy_by_seed, joined_rows, judge_pooled, pooled_policies, score_frame
+from flows.evaluate.costs import capture_seconds, time_frame
+from flows.evaluate.frames import Candidate, Job, Jobs, Look, Show, Sight, look_at, scene_of, sight_of
 from flows.evaluate.request import COST, EvaluateRequest
-from flows.evaluate.rig_plans import BUDGETS, judge_rig
-from flows.evaluate.rows import Trial, judge_frame
-from flows.evaluate.timing import Rounds, time_frame
+from flows.evaluate.rig_plans import BUDGETS, judge_equal_time, judge_rig
+from flows.evaluate.rows import (
+    Bought,
+    Trial,
+    buy_by_seed,
+    design_of,
+    joined_rows,
+    judge_control,
+    judge_frame,
+    judge_pooled,
+    pooled_policies,
+    score_frame,
+)
+from flows.evaluate.series import Record
 from flows.terminal.figures import format_seconds
 from flows.training.data import TrainingData
-from models.weights.files import AnyWeights, Weights
+from models.weights.files import AnyWeights, Weights, load_any_weights
+from pipeline.errors import ArchiveError
 from pipeline.geometry.camera import LineCamera
 from pipeline.planning.line_blocks import WIDTHS
 from pipeline.simulator.scenes.scene import RasterScene
 
-Record = dict[str, Any]
-Report = Callable[[float], None]
-UNITS = {  # rough shares of time
+KEPT_VERSION = 2  # of what a kept result says
+UNITS = {  # kinds of results, with rough shares of time
     "frame": 1.0,
     "time": 3.0,
     "capture": 0.5,
@@ -38,20 +48,40 @@ UNITS = {  # rough shares of time
     "scores": 0.05,
     "pooled": 0.4,
 }
+Made = dict[str, list[list[Record]]]  # kind -> of each file its records; those of "time" and "capture" in one list
 
 
-@dataclass
-class Judged:
-    """Records of every kind; those of weights and controls apart, in the order of the files."""
+@contextmanager
+def writing(folder: Path) -> Iterator[None]:
+    """Turn a folder that cannot be written to into an error that says so."""
+    try:
+        yield
+    except OSError as error:
+        raise ArchiveError(f"cannot write to {folder}: {error.strerror}; choose another --out") from error
 
-    runs: list[list[Record]]
-    controls: list[list[Record]]
-    rig: list[list[Record]]
-    equal: list[list[Record]]
-    scores: list[list[Record]]
-    pooled: list[list[Record]]
-    timed: list[Record] = field(default_factory=list)
-    captured: list[Record] = field(default_factory=list)
+
+@dataclass(frozen=True)
+class KeptResults:
+    """A folder of results by what they follow from: a run that was killed goes on. Without a folder nothing is kept."""
+
+    folder: Path | None
+
+    def made(self, what: str, follows_from: Record, make: Callable[[], Record | None]) -> Any:
+        """Give the result that was kept, or make it and keep it: whole or not at all. A damaged one is made again."""
+        if self.folder is None:
+            return make()
+        text = json.dumps([KEPT_VERSION, what, follows_from], sort_keys=True)
+        path = self.folder / f"{what}-{hashlib.sha256(text.encode()).hexdigest()[:20]}.json"
+        try:
+            return json.loads(path.read_text(encoding="utf-8"))["result"]
+        except (OSError, ValueError, LookupError, TypeError):
+            result = make()
+        with writing(self.folder):
+            self.folder.mkdir(parents=True, exist_ok=True)
+            temporary = path.with_name(path.name + ".part")
+            temporary.write_text(json.dumps({"follows_from": follows_from, "result": result}), encoding="utf-8")
+            temporary.replace(path)
+        return result
 
 
 @dataclass(frozen=True)
@@ -80,27 +110,40 @@ class Work:
         self.kept = KeptResults(None if request.out is None else request.out / "frames")
         self._weights: dict[str, AnyWeights] = {}
         self._last: tuple[str, str, Look] | None = None
-        self._scene: RasterScene | None = None
-        self._last_name = ""
+        self._scene: tuple[str, RasterScene] | None = None
         self._bought: Bought = {}
         self._total, self._done = 0.0, 0.0  # units
         self._spent, self._made = 0.0, 0.0  # seconds, and units made in them
 
-    def tasks(self, jobs: Jobs) -> list[Task]:
+    def judge(self, jobs: Jobs, show: Show) -> Made:
+        """Make every record; one threshold for all frames takes a second pass, once all are scored."""
+        made: Made = {kind: [[] for _ in self._files(kind)] for kind in UNITS}
+        first, second = self._tasks(jobs), self._pooled_tasks(jobs)
+        self._total, self._done = sum(UNITS[task.kind] for task in (*first, *second)), 0.0
+        self._make(first, made, show)
+        self._bought = buy_by_seed(made["scores"], self.request.shares)
+        self._make(second, made, show)
+        made["frame"] = joined_rows(made["frame"], made["pooled"])
+        show("judging frames", 1.0, f"{len(jobs.frames)} frames")
+        return made
+
+    def _files(self, kind: str) -> Sequence[Candidate]:
+        return self.controls if kind == "control" else self.candidates
+
+    def _tasks(self, jobs: Jobs) -> list[Task]:
         """Everything to make of single frames; a frame's results of one weights follow each other."""
-        found, pooled = [], bool(self.pooled_tasks(jobs))
+        asked = {"scores": bool(self._pooled_tasks(jobs)), "rig": self.request.rig, "equal": self.request.equal_time}
+        found = []
         for number, job in enumerate(jobs.frames):
             for index in job.weights:
-                found.append(Task("frame", job.name, index))
-                found += [Task("scores", job.name, index)] if pooled else []
-                found += [Task("rig", job.name, index)] if self.request.rig else []
-                found += [Task("equal", job.name, index)] if self.request.equal_time else []
+                kinds = ("frame", *(kind for kind, wanted in asked.items() if wanted))
+                found += [Task(kind, job.name, index) for kind in kinds]
                 if number < self.request.timed_frames and index == job.weights[0]:
                     found += [Task("time", job.name, index, self._first_of_each(job)), Task("capture", job.name, index)]
             found += [Task("control", job.name, index) for index in job.controls]
         return found
 
-    def pooled_tasks(self, jobs: Jobs) -> list[Task]:
+    def _pooled_tasks(self, jobs: Jobs) -> list[Task]:
         """What is made of frames once all are scored; of one frame alone nothing."""
         pooled = self.request.pooled and self.request.shares and pooled_policies(self.request.policies)
         if not pooled or len(jobs.frames) < 2:
@@ -108,35 +151,12 @@ class Work:
         return [Task("pooled", job.name, index) for job in jobs.frames for index in job.weights]
 
     def _first_of_each(self, job: Job) -> tuple[int, ...]:
-        """A control of each design."""
         first: dict[str, int] = {}
         for index in job.controls:
             first.setdefault(design_of(self.controls[index]), index)
         return tuple(first.values())
 
-    def judge(self, jobs: Jobs, show: Show) -> Judged:
-        """Make every record."""
-        own = self.candidates
-        runs, rig, equal, scores, pooled = (_empty(own) for _ in range(5))
-        judged = Judged(runs, _empty(self.controls), rig, equal, scores, pooled)
-        first, second = self.tasks(jobs), self.pooled_tasks(jobs)
-        self._total, self._done = sum(UNITS[task.kind] for task in (*first, *second)), 0.0
-        self._make(first, judged, show)
-        self._bought = buy_by_seed(scores, self.request.shares)
-        self._make(second, judged, show)
-        judged.runs = joined_rows(runs, pooled)
-        show("judging frames", 1.0, f"{len(jobs.frames)} frames")
-        return judged
-
-    def _make(self, tasks: Sequence[Task], judged: Judged, show: Show) -> None:
-        places = {
-            "frame": judged.runs,
-            "control": judged.controls,
-            "rig": judged.rig,
-            "equal": judged.equal,
-            "scores": judged.scores,
-            "pooled": judged.pooled,
-        }
+    def _make(self, tasks: Sequence[Task], made: Made, show: Show) -> None:
         for task in tasks:
 
             def report(part: float, task: Task = task) -> None:
@@ -144,40 +164,27 @@ class Work:
                 show("judging frames", reached / self._total, self._words(task, self._total - reached))
 
             report(0.0)
-            record = self._record(task, report)
+            record = self._kept_or_made(task, report)
             if record is not None:
-                kind = {"time": judged.timed, "capture": judged.captured}
-                (kind[task.kind] if task.kind in kind else places[task.kind][task.index]).append(record)
+                made[task.kind][0 if task.kind in ("time", "capture") else task.index].append(record)
             self._done += UNITS[task.kind]
 
     def _words(self, task: Task, left: float) -> str:
         """Frame, file where there are several, and about how long the rest will take."""
-        files = self.controls if task.kind == "control" else self.candidates
+        files = self._files(task.kind)
         named = task.name if len(files) == 1 else f"{task.name}, {files[task.index].path.name}"
         what = {"frame": "", "control": "control, "}.get(task.kind, f"{task.kind}, ")
         rest = f", about {format_seconds(left * self._spent / self._made)} left" if self._made else ""
         return f"{what}{named}{rest}"
 
-    def _record(self, task: Task, report: Report) -> Record | None:
-        if self._scene is None or self._last_name != task.name:
-            self._scene, self._last_name = scene_of(self.data, task.name), task.name
-        scene, makers = (
-            self._scene,
-            {
-                "frame": self._frame,
-                "time": self._time,
-                "capture": self._capture,
-                "control": self._control,
-                "rig": self._rig,
-                "equal": self._equal,
-                "scores": self._scores,
-                "pooled": self._pooled,
-            },
-        )
+    def _kept_or_made(self, task: Task, report: Callable[[float], None]) -> Record | None:
+        if self._scene is None or self._scene[0] != task.name:
+            self._scene = task.name, scene_of(self.data, task.name)
+        scene = self._scene[1]
 
         def make() -> Record | None:
             start = time.monotonic()
-            made = makers[task.kind](scene, task, report)
+            made = self._record(scene, task, report)
             self._spent, self._made = self._spent + time.monotonic() - start, self._made + UNITS[task.kind]
             return made
 
@@ -187,9 +194,8 @@ class Work:
     def _follows_from(self, scene: RasterScene, task: Task) -> Record:
         """All that a result depends on; the farm's labels follow from its key and are not drawn for this."""
         labels = None if self.data.files is None or scene.labels is None else zlib.crc32(scene.labels.tobytes())
-        one = (self.controls if task.kind == "control" else self.candidates)[task.index]
         own: Record = {
-            "weights": one.key,
+            "weights": self._files(task.kind)[task.index].key,
             "frame": task.name,
             "scene": scene.key,
             "labels": labels,
@@ -208,35 +214,26 @@ class Work:
             own |= {"runs": self.request.timed_runs, "controls": [self.controls[index].key for index in task.beside]}
         return own
 
-    def _frame(self, scene: RasterScene, task: Task, report: Report) -> Record:
-        return judge_frame(self.trial, self.look(scene, task.name, task.index), self.loaded(task.index), report)
-
-    def _scores(self, scene: RasterScene, task: Task, report: Report) -> Record:
-        return score_frame(self.trial.policies, self.look(scene, task.name, task.index))
-
-    def _pooled(self, scene: RasterScene, task: Task, report: Report) -> Record:
-        bought = self._bought[task.index, task.name]
-        return judge_pooled(bought, self.look(scene, task.name, task.index), self.loaded(task.index), report)
-
-    def _rig(self, scene: RasterScene, task: Task, report: Report) -> Record:
-        look = self.look(scene, task.name, task.index)
-        return judge_rig(look, self.loaded(task.index), self.camera, COST, self.request.seed, report)
-
-    def _equal(self, scene: RasterScene, task: Task, report: Report) -> Record | None:
-        look = self.look(scene, task.name, task.index)
-        return judge_equal_time(self.trial, scene, look, self.loaded(task.index), self.camera, COST, report)
-
-    def _time(self, scene: RasterScene, task: Task, report: Report) -> Record:
+    def _record(self, scene: RasterScene, task: Task, report: Callable[[float], None]) -> Record | None:
+        trial, camera = self.trial, self.camera
+        if task.kind == "control":
+            return judge_control(trial, *self._control_sight(scene, task.name, task.index), report)
         beside = [self._control_sight(scene, task.name, index) for index in task.beside]
-        look, rounds = self.look(scene, task.name, task.index), Rounds(self.request.timed_runs)
-        return time_frame(self.trial, look, self.loaded(task.index), rounds, beside)
-
-    def _capture(self, scene: RasterScene, task: Task, report: Report) -> Record | None:
-        look = self.look(scene, task.name, task.index)
-        return capture_seconds(self.trial, look, self.loaded(task.index), self.camera, COST)
-
-    def _control(self, scene: RasterScene, task: Task, report: Report) -> Record:
-        return judge_control(self.trial, *self._control_sight(scene, task.name, task.index), report)
+        look, weights = self.look(scene, task.name, task.index), self.loaded(task.index)
+        match task.kind:
+            case "scores":
+                return score_frame(trial.policies, look)
+            case "pooled":
+                return judge_pooled(self._bought[task.index, task.name], look, weights, report)
+            case "rig":
+                return judge_rig(look, weights, camera, COST, self.request.seed, report)
+            case "equal":
+                return judge_equal_time(trial, scene, look, weights, camera, COST, report)
+            case "time":
+                return time_frame(trial, look, weights, self.request.timed_runs, beside)
+            case "capture":
+                return capture_seconds(trial, look, weights, camera, COST)
+        return judge_frame(trial, look, weights, report)
 
     def _control_sight(self, scene: RasterScene, name: str, index: int) -> tuple[Sight, AnyWeights]:
         weights = self._load(self.controls[index])
@@ -258,9 +255,5 @@ class Work:
 
     def _load(self, one: Candidate) -> AnyWeights:
         if one.key not in self._weights:
-            self._weights[one.key] = one.load()
+            self._weights[one.key] = load_any_weights(one.path)
         return self._weights[one.key]
-
-
-def _empty(files: Sequence[Candidate]) -> list[list[Record]]:
-    return [[] for _ in files]

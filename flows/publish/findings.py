@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 
 from flows.survey.run import SurveyRun
-from flows.survey.stages.attention import load_plan
+from flows.survey.stages.attention import load_orientation, load_plan
 from flows.survey.stages.class_map import strange_pixels
 from flows.survey.stages.ground import STORE
-from flows.survey.stages.orientation import load_orientation
 from flows.survey.stages.placement import line_facts, seen_shares
 from flows.survey.stages.registration import load_registration
 from flows.survey.survey import Products

@@ -21,7 +21,7 @@ from flows.publish.quicklook import QuicklookData, draw_quicklook
 from flows.publish.receipt import AccuracyIs, Header, Receipt, build_receipt, check_receipt, with_accuracy
 from flows.publish.report import Picture, write_report
 from flows.settings.load import anchor_paths
-from flows.survey.model_work import work_done, work_of_map
+from flows.survey.extent import work_done, work_of_map
 from flows.survey.run import SurveyRun, now
 from flows.survey.stages.accuracy import load_accuracy
 from flows.survey.stages.attention import load_plan

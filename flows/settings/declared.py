@@ -89,7 +89,6 @@ class Declared:
 
 
 def _declared(make: type[Any]) -> dict[str, Declared]:
-    """Every field of a dataclass."""
     own = {datetime: Annotated[datetime, PlainValidator(parse_moment)]}
     hints = get_type_hints(make, include_extras=True)
     found = {}

@@ -3,29 +3,27 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import MISSING
 from pathlib import Path
 from typing import Any
 
 from flows.settings.declared import SURVEY, TABLES, Declared
-from flows.settings.rules import check_together, place_of
-from flows.settings.survey_settings import BUILT_IN_SCENES, PATHS, REPLACED, RIG_FIELD, Settings
+from flows.settings.survey_settings import BUILT_IN_SCENES, PATHS, REPLACED, RIG_FIELD, MapChoice, Settings
+from models.network.vgg_sizes import TRAINED_VGG_FROM, VGG_FROM
 from pipeline.errors import PoseError, SettingsError
 from pipeline.simulator.scenes.farm.farm_scene import REMOVED_LAW
 from storage.archive.staging import read_toml
+from pipeline.rig.mirror.mirror_settings import MOST_PAIRS
+from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, REMOVED_LAW
+from storage.archive.toml_files import read_toml
 
 
 def load_settings(path: str | Path | None = None, flags: Mapping[str, object] | None = None) -> Settings:
-    """Read the file, lay the flags over it and check the whole.
+    """Read the TOML file (None: defaults and flags alone), lay the flags over it and check the whole.
 
-    Parameters
-    ----------
-    path
-        TOML file; None for defaults and flags alone. Relative paths in it start at its folder, those of flags at the
-        current folder.
-    flags
-        Keys as in the file, ``camera.exposure_ms`` for one in a table; None means not given.
+    Relative paths in the file start at its folder, those of flags at the current one. Flags are keys as in the file,
+    ``camera.exposure_ms`` for one in a table; None means not given.
 
     Raises
     ------
@@ -51,19 +49,14 @@ def load_settings(path: str | Path | None = None, flags: Mapping[str, object] | 
 
 
 def parse_settings(table: Mapping[str, object], origin: Mapping[str, str] | None = None) -> Settings:
-    """Check a table of settings and fill in the defaults.
+    """Check a table of settings, with tables in it as in the file, and fill in the defaults; None means not given.
 
-    Parameters
-    ----------
-    table
-        Keys and values as in the file, ``camera``, ``cost``, ``pose`` and the like being tables themselves; None in
-        them means not given.
-    origin
-        Where each (dotted) key came from, for the messages: a file's name or ``flag``.
+    ``origin`` says where each (dotted) key came from, for the messages: a file's name or ``flag``.
     """
     origin = origin or {}
     settings = Settings(**_check_table(table, SURVEY, "", origin))
-    check_together(settings, origin)
+    for wrong in _wrongs(settings, origin):
+        raise SettingsError(wrong)
     return settings
 
 
@@ -87,7 +80,6 @@ def _check_table(
 
 
 def _parse_table(key: str, value: object, place: str, origin: Mapping[str, str]) -> object:
-    """One of the tables that stand for a dataclass."""
     if not isinstance(value, Mapping):
         raise SettingsError(f"{place} must be a table, [{key}] with keys below it; got {value!r}")
     given = _check_table(value, TABLES[key], f"{key}.", origin)
@@ -141,3 +133,62 @@ def anchor_paths(table: dict[str, object], folder: Path) -> dict[str, object]:
         if isinstance(value, str) and value and value not in named and "://" not in value:
             anchored[key] = str(folder / Path(value).expanduser())
     return anchored
+
+
+IN_NAT = ("gain", "entropy")  # policies whose scores are gains, or the most that these can be
+_VGG_FROM = {"vgg-static": VGG_FROM, "vgg-trained": TRAINED_VGG_FROM}  # policies that read a file of VGG19
+
+
+def _wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]:
+    policy, scene, air, camera = settings.policy, settings.scene, settings.air, settings.camera
+    if (policy == "mask") != (settings.mask is not None):
+        wants = "policy 'mask' needs a mask file" if settings.mask is None else "a mask is used by policy 'mask' only"
+        yield f"{wants}: got policy = {policy!r}, mask = {settings.mask!r}; give both or neither"
+    vgg_from = _VGG_FROM.get(policy)
+    if vgg_from is not None and settings.vgg is None:
+        yield f"policy {policy!r} needs --vgg FILE, {vgg_from}"
+    if vgg_from is None and settings.vgg is not None:
+        wanted = " or ".join(map(repr, _VGG_FROM))
+        yield f"a vgg file is for policy {wanted}, got policy = {policy!r}; leave --vgg out"
+    if settings.threshold is not None and policy not in IN_NAT:
+        yield (
+            f"threshold is a gain [nat], and policy {policy!r} scores in a unit of its own: leave --threshold out, or "
+            f"take --policy {' or '.join(IN_NAT)} (entropy is the most that a look can gain)"
+        )
+    bands, wavelengths = settings.bands, settings.wavelengths
+    if bands is not None and wavelengths is not None and len(bands) != len(wavelengths):
+        place = place_of("wavelengths", origin.get("wavelengths"))
+        yield f"{place} must have one value for each of the {len(bands)} bands, got {len(wavelengths)}"
+    if scene == RIG_FIELD and settings.source != "rig":
+        yield f"scene {RIG_FIELD!r} is what stands before a rig: give --source rig, or a file"
+    if settings.size is not None and scene not in (*BUILT_IN_SCENES, RIG_FIELD):
+        yield f"size is for built-in scenes ({', '.join(BUILT_IN_SCENES)}); {scene} has its own"
+    for name, value in {"day": settings.day, "hour": settings.hour}.items():
+        if value is not None and scene not in BUILT_IN_SCENES:
+            yield (
+                f"{place_of(name, origin.get(name))} = {value:g} is for the scene {FARM_LAW}, whose fields grow; "
+                f"{scene} is as it is: leave it out"
+            )
+    if camera.dark_dn >= camera.full_scale_dn:
+        yield (
+            f"camera.dark_dn = {camera.dark_dn:g} leaves no room below the {camera.full_scale_dn} DN of {camera.bits} "
+            "bits; use a smaller dark level"
+        )
+    for name, metres in {"nearest_m": air.nearest_m, "farthest_m": air.farthest_m}.items():
+        if metres is not None and air.distance_m is None:
+            yield f"air.{name} = {metres:g} needs air.distance_m, how far the middle of the scene is"
+    distances = settings.simulated_rig.distances_m
+    if distances is not None and distances[0] > distances[1]:
+        yield f"air.nearest_m = {distances[0]:g} lies beyond air.farthest_m = {distances[1]:g}"
+    pairs = settings.cost.vector_pairs
+    if settings.source == "rig" and not 2 <= pairs <= MOST_PAIRS:
+        yield f"cost.vector_pairs = {pairs}: the mirror's vector memory takes 2 to {MOST_PAIRS} pairs; give what it has"
+    if settings.pose is None and settings.map != MapChoice():
+        yield "[map] says how to draw the ground, which needs to know where the rig stands: give [pose]"
+
+
+def place_of(key: str, origin: str | None) -> str:
+    """How a message names a setting: as a flag (without the table that holds it), or in its file."""
+    if origin == "flag":
+        return "--" + key.rpartition(".")[2].replace("_", "-")
+    return f"'{key}'" + (f" in {origin}" if origin else "")

@@ -46,7 +46,6 @@ class _Maker:
     spent: dict[str, float | None] = field(default_factory=dict)  # CPU seconds by stage; None where it was there
 
     def __call__(self, name: str, stage: Stage, wanted: Wanted) -> StageRef:
-        """Find or make the store that a stage wants."""
         began = time.process_time()
         self.progress.show(name, 0.0)
         ref, built = stage.produce(self.run.archive, wanted)
@@ -85,25 +84,21 @@ def run_simulate(
         effects = make("effects", choose_effects, choose_effects.needed(make.watching("effects")))
         raw = make("capture", capture_coarse, sweeps_wanted(make.watching("capture"), sweeps, [effects]))
         record = _record(run, sweeps, effects, raw, make.spent)
-        found = None if picture is None else _compare(make, sweeps, effects, console)
+        found = None
+        if picture is not None:
+
+            def say(words: str) -> None:
+                console.print(f"[dim]everything on, exact: {escape(words)}[/]", highlight=False)
+
+            progress.show("comparison", 0.0)
+            found = compare_with_everything(make.watching("comparison"), sweeps, effects, say)
+            progress.show("comparison", 1.0, ended=True)
     _print(record, console)
     if picture is None or found is None:
         return record
     _draw(picture, found, settings)
     _print_comparison(found, picture, console)
     return record | {"comparison": {**found.record(), "picture": str(picture)}}
-
-
-def _compare(make: _Maker, sweeps: Sequence[Sweep], effects: StageRef, console: Console) -> Comparison:
-    """Take the lines with everything on as well."""
-
-    def say(words: str) -> None:
-        console.print(f"[dim]everything on, exact: {escape(words)}[/]", highlight=False)
-
-    make.progress.show("comparison", 0.0)
-    found = compare_with_everything(make.watching("comparison"), sweeps, effects, say)
-    make.progress.show("comparison", 1.0, ended=True)
-    return found
 
 
 def _check_picture(path: Path) -> None:
@@ -127,7 +122,7 @@ def _unwritable(path: Path, error: OSError) -> ArchiveError:
 
 
 def _draw(path: Path, found: Comparison, settings: Settings) -> None:
-    from flows.simulate.effect_picture import Words, draw_comparison
+    from flows.simulate.effect_picture import Words, draw_comparison  # matplotlib
 
     try:
         draw_comparison(path, found, Words(f"{Path(settings.scene).stem}, seed {settings.seed}", settings.effects))
@@ -143,8 +138,16 @@ def open_simulation(settings: Settings, *, coarse: bool = False) -> tuple[Captur
     if refused is not None:
         raise SettingsError(refused)
     scene, notes = open_scene(settings)
-    if scene.filled_px:
-        raise SceneError(_gap(settings))
+    if scene.filled_px:  # a survey goes on without; a simulation would have to invent light
+        file = load_scene_file(settings.scene, bands=settings.bands, wavelengths=settings.wavelengths)
+        missing = ~np.isfinite(file.values)
+        row, column, band = (int(one) for one in np.unravel_index(int(missing.argmax()), missing.shape))
+        number = band if settings.bands is None else settings.bands[band]
+        raise SceneError(
+            f"{settings.scene} has no finite value at row {row}, column {column}, band {number} (pixels without:"
+            f" {int(missing.any(axis=2).sum())}), and a simulation invents no light; fill or crop it, or choose other"
+            " --bands"
+        )
     _, coarse_pass, full = lay_out_sweeps(settings, SceneGrid(*scene.shape, PATCH, FACTOR))
     simulated = make_source(scene, settings)
     run = CaptureRun(
@@ -156,19 +159,6 @@ def open_simulation(settings: Settings, *, coarse: bool = False) -> tuple[Captur
         planned=(*coarse_pass, *full),
     )
     return run, coarse_pass if coarse else full, notes
-
-
-def _gap(settings: Settings) -> str:
-    """Where a file first has no value. A survey goes on without; a simulation would have to invent light."""
-    file = load_scene_file(settings.scene, bands=settings.bands, wavelengths=settings.wavelengths)
-    missing = ~np.isfinite(file.values)
-    row, column, band = (int(one) for one in np.unravel_index(int(missing.argmax()), missing.shape))
-    number = band if settings.bands is None else settings.bands[band]
-    pixels = int(missing.any(axis=2).sum())
-    return (
-        f"{settings.scene} has no finite value at row {row}, column {column}, band {number} (pixels without: {pixels}),"
-        " and a simulation invents no light; fill or crop it, or choose other --bands"
-    )
 
 
 def _record(

@@ -96,8 +96,6 @@ class Comparison:
 
 @dataclass
 class _ChangeSums:
-    """What blocks add up to."""
-
     exact_cpu_s: float = 0.0
     cpu_s: float = 0.0
     greatest: float = -1.0
@@ -112,16 +110,13 @@ class _ChangeSums:
 
 @dataclass(frozen=True)
 class _Both:
-    """A block both ways: expected electrons with those of the dark, as means over the samples summed; raw numbers.
-
-    ``alike_raw`` is exact light with the noise and the digits of the effects chosen.
-    """
+    """A block both ways: expected electrons with those of the dark, as means over the samples summed; raw numbers."""
 
     exact: NDArray[np.floating]
     chosen: NDArray[np.floating]
     exact_raw: Raw
     chosen_raw: Raw
-    alike_raw: Raw
+    alike_raw: Raw  # of exact light with the noise and the digits of the effects chosen
     exact_cpu_s: float
     cpu_s: float
 
@@ -146,7 +141,11 @@ def compare_with_everything(
     total = load_manifest(effects)["total"]
     bound = math.inf if total["bound"] is None else total["bound"]
     ways = _Ways(replace(chosen, chosen=everything(effects)), chosen, total["unit"], bound)
-    blocks = _blocks(sweeps)
+    blocks = [  # all lines, as they are rendered at a time
+        (sweep, range(first, min(first + BLOCK_LINES, sweep.lines)))
+        for sweep in sweeps
+        for first in range(0, sweep.lines, BLOCK_LINES)
+    ]
     taken = _affordable(ways, blocks, say)
     sums = _ChangeSums()
     for number, (sweep, lines) in enumerate(taken):
@@ -156,15 +155,6 @@ def compare_with_everything(
     _check(found, sums)
     run.report(1.0)
     return found
-
-
-def _blocks(sweeps: Sequence[Sweep]) -> list[tuple[Sweep, range]]:
-    """All lines of a scan, as they are rendered at a time."""
-    return [
-        (sweep, range(first, min(first + BLOCK_LINES, sweep.lines)))
-        for sweep in sweeps
-        for first in range(0, sweep.lines, BLOCK_LINES)
-    ]
 
 
 def _affordable(
@@ -191,23 +181,13 @@ def _count(blocks: Sequence[tuple[Sweep, range]]) -> int:
     return sum(len(lines) for _, lines in blocks)
 
 
-@dataclass(frozen=True)
-class _LinesTaken:
-    """A block one way: expected electrons without and with those of the dark, raw numbers of all samples."""
-
-    light: Light
-    shown: Light
-    raw: Raw
-    cpu_s: float
-
-
-def _taken(source: SimulatedSource, block: SweepBlock) -> _LinesTaken:
+def _taken(source: SimulatedSource, block: SweepBlock) -> tuple[Light, Light, Raw, float]:
+    """A block one way: expected electrons without and with those of the dark, raw numbers, seconds of the processor."""
     began = time.process_time()
     light = expected_light(source.scene, block, source.choice)
     raw = read_out(light, block, source.choice)
     spent = time.process_time() - began
-    shown = light + dark_frame(block, source.choice) * np.float32(block.rig.camera.electrons_per_dn)
-    return _LinesTaken(light, shown, raw, spent)
+    return light, light + dark_frame(block, source.choice) * np.float32(block.rig.camera.electrons_per_dn), raw, spent
 
 
 @dataclass(frozen=True)
@@ -221,22 +201,18 @@ class _Ways:
 
     def take(self, sweep: Sweep, lines: range) -> _Both:
         """Render some lines both ways."""
-        exact, chosen = (_taken(source, source.block(sweep, lines)) for source in (self.exact, self.chosen))
-        alike = read_out(exact.light, self.chosen.block(sweep, lines), self.chosen.choice)
-        exact_raw, chosen_raw, alike_raw = (bin_samples(raw, sweep.binning) for raw in (exact.raw, chosen.raw, alike))
-        shown, other = (stored_mean(one.shown, sweep.binning) for one in (exact, chosen))
-        return _Both(shown, other, exact_raw, chosen_raw, alike_raw, exact.cpu_s, chosen.cpu_s)
+        light, shown, raw, exact_s = _taken(self.exact, self.exact.block(sweep, lines))
+        block = self.chosen.block(sweep, lines)
+        _, other, other_raw, chosen_s = _taken(self.chosen, block)
+        alike = read_out(light, block, self.chosen.choice)
+        exact_mean, chosen_mean = (stored_mean(one, sweep.binning) for one in (shown, other))
+        exact_raw, chosen_raw, alike_raw = (bin_samples(one, sweep.binning) for one in (raw, other_raw, alike))
+        return _Both(exact_mean, chosen_mean, exact_raw, chosen_raw, alike_raw, exact_s, chosen_s)
 
     def change(self, both: _Both, sweep: Sweep) -> NDArray[np.float64]:
         """By how much the stored light differs, in the unit of the tolerance, (line, binned sample, band)."""
         difference: NDArray[np.float64] = (both.chosen.astype(np.float64) - both.exact) / self._unit(both, sweep)
         return difference
-
-    def _arithmetic(self, both: _Both, sweep: Sweep, lines: range) -> NDArray[np.float64]:
-        """What of a difference arithmetic may have made, (line or 1, binned sample, band). [e-]"""
-        share = misplaced_share(dict(self.exact.choice.effects), dict(self.chosen.choice.effects))
-        contrast = contrast_about(self.exact.block(sweep, lines), partial(expected_light, self.exact.scene))
-        return misplaced_electrons(both.exact, stored_mean(contrast, sweep.binning), share)
 
     def _unit(self, both: _Both, sweep: Sweep) -> NDArray[np.floating]:
         return unit_at(both.exact, self.exact.rig, self.unit, sweep.binning)
@@ -254,8 +230,11 @@ class _Ways:
         if change[line, sample, band] > sums.greatest:
             sums.greatest = float(change[line, sample, band])
             sums.place = ViewPlace(sweep.name, lines[line], sample * sweep.binning, band)
-        if change.max() > self.bound:
-            change -= self._arithmetic(both, sweep, lines) / self._unit(both, sweep)
+        if change.max() > self.bound:  # what of it arithmetic may have made
+            share = misplaced_share(dict(self.exact.choice.effects), dict(self.chosen.choice.effects))
+            contrast = contrast_about(self.exact.block(sweep, lines), partial(expected_light, self.exact.scene))
+            misplaced = misplaced_electrons(both.exact, stored_mean(contrast, sweep.binning), share)
+            change -= misplaced / self._unit(both, sweep)
         sums.unexplained = max(sums.unexplained, float(change.max()))
         apart = np.abs(both.chosen_raw.astype(np.int32) - both.alike_raw)
         sums.unequal += int(np.count_nonzero(apart))
@@ -275,14 +254,14 @@ def _compared(
         raise BoundError("there is no line to compare; give a scene that the rig sees")
     total, place = load_manifest(effects)["total"], sums.place
     sweep = next(sweep for sweep, _ in blocks if sweep.name == place.sweep)
-    left_out, cheaper = _inexact(effects)
+    exact, chosen = everything(effects), chosen_effects(effects)
     return Comparison(
         lines=_count(taken),
         of_lines=_count(blocks),
         exact_cpu_s=sums.exact_cpu_s,
         cpu_s=sums.cpu_s,
-        effects_exact=len(everything(effects)),
-        effects_on=len(chosen_effects(effects)),
+        effects_exact=len(exact),
+        effects_on=len(chosen),
         unit=total["unit"],
         tolerance=total["tolerance"],
         bound=total["bound"],
@@ -291,18 +270,10 @@ def _compared(
         place=place,
         raw_unequal=sums.unequal / sums.raw_numbers,
         raw_most_dn=sums.most_dn,
-        left_out=left_out,
-        cheaper=cheaper,
+        left_out=tuple(one.name for one in exact if one not in chosen),
+        cheaper=tuple(f"{one.name} as {variant}" for one, variant in chosen.items() if variant != one.variants[0]),
         view=_view(run, ways, sweep, place),
     )
-
-
-def _inexact(effects: StageRef) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """What is left out of all that the rig has, and what is computed more cheaply than exactly."""
-    exact, chosen = everything(effects), chosen_effects(effects)
-    left_out = tuple(effect.name for effect in exact if effect not in chosen)
-    cheaper = tuple(f"{one.name} as {variant}" for one, variant in chosen.items() if variant != one.variants[0])
-    return left_out, cheaper
 
 
 def _view(run: CaptureRun, ways: _Ways, sweep: Sweep, place: ViewPlace) -> View:
@@ -319,7 +290,9 @@ def _view(run: CaptureRun, ways: _Ways, sweep: Sweep, place: ViewPlace) -> View:
         both = ways.take(sweep, range(first, min(first + BLOCK_LINES, lines.stop)))
         for kept, raw in ((exact, both.exact_raw), (chosen, both.chosen_raw)):
             kept.append(raw[:, samples.start : samples.stop, list(bands)])
-        changes.append(_strongest(ways.change(both, sweep)[:, samples.start : samples.stop]))
+        change = ways.change(both, sweep)[:, samples.start : samples.stop]
+        strongest = np.abs(change).argmax(axis=2)[..., None]
+        changes.append(np.take_along_axis(change, strongest, axis=2)[..., 0])
     white = np.maximum(run.scene.panel_electrons[list(bands)] / camera.electrons_per_dn, np.float32(1e-6))
     dark = np.float32(binning * camera.dark_dn)
     shown = [(np.concatenate(kept).astype(np.float32) - dark) / (binning * white) for kept in (exact, chosen)]
@@ -331,12 +304,6 @@ def _about(middle: int, count: int, most: int) -> range:
     count = min(count, most)
     first = max(0, min(middle - count // 2, most - count))
     return range(first, first + count)
-
-
-def _strongest(change: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Of each sample the change of the band that changes most, with its sign."""
-    band = np.abs(change).argmax(axis=2)[..., None]
-    return np.take_along_axis(change, band, axis=2)[..., 0]
 
 
 def _check(found: Comparison, sums: _ChangeSums) -> None:

@@ -11,7 +11,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import Normalize, SymLogNorm
+from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.patches import Circle
@@ -72,7 +72,9 @@ def _compose(found: Comparison, words: Words) -> Figure:
     figure = Figure(figsize=(_PAGE_IN, page), dpi=_DPI)
     figure.text(_MARGIN_IN / _PAGE_IN, 1 - 0.45 / page, words.scene, size=22, weight="bold", va="center")
     right = 1 - _MARGIN_IN / _PAGE_IN
-    figure.text(right, 1 - 0.45 / page, _title_line(found), size=12.5, color=MUTED, va="center", ha="right")
+    which = "all" if found.lines == found.of_lines else f"{format_count(found.lines)} of"
+    over = f"times and figures over {which} {format_count(found.of_lines)} lines"
+    figure.text(right, 1 - 0.45 / page, over, size=12.5, color=MUTED, va="center", ha="right")
     gap = (_PAGE_IN - 2 * _MARGIN_IN - 3 * wide) / 2
     axes = [
         figure.add_axes(
@@ -85,27 +87,16 @@ def _compose(found: Comparison, words: Words) -> Figure:
     exact = f"{found.effects_exact} effects, {format_seconds(found.exact_cpu_s)} of CPU"
     _caption(axes[0], "Everything on, exact", exact)
     _draw_lines(axes[1], view.chosen, view)
-    _caption(axes[1], _chosen_title(found, words.asked), f"{found.effects_on} effects, {spent} of CPU: {less}")
+    sign, asked = UNIT_SIGNS[found.unit], words.asked if len(words.asked) <= 12 else "As asked"
+    title = f"{asked}, " + ("any tolerance" if found.tolerance is None else f"tolerance {found.tolerance:g} {sign}")
+    _caption(axes[1], title, f"{found.effects_on} effects, {spent} of CPU: {less}")
     image = _draw_change(axes[2], found)
-    sign = UNIT_SIGNS[found.unit]
     bound = "without a bound" if found.bound is None else f"bound {found.bound:.2g} {sign}"
     most = f"at most {found.measured:.2g} {sign} (circle)" if found.measured else "none at all"
     _caption(axes[2], "Difference of their light", f"{most}; {bound}")
     _draw_key(figure, axes[2], image, found)
     _draw_foot(figure, found, page)
     return figure
-
-
-def _title_line(found: Comparison) -> str:
-    which = "all" if found.lines == found.of_lines else f"{format_count(found.lines)} of"
-    return f"times and figures over {which} {format_count(found.of_lines)} lines"
-
-
-def _chosen_title(found: Comparison, asked: str) -> str:
-    name = asked if len(asked) <= 12 else "As asked"
-    if found.tolerance is None:
-        return f"{name}, any tolerance"
-    return f"{name}, tolerance {found.tolerance:g} {UNIT_SIGNS[found.unit]}"
 
 
 def _draw_lines(axes: Axes, image: NDArray[np.float32], view: View) -> None:
@@ -117,10 +108,16 @@ def _draw_lines(axes: Axes, image: NDArray[np.float32], view: View) -> None:
 
 def _draw_change(axes: Axes, found: Comparison) -> AxesImage:
     """Of each sample the band that differs most, coloured up to the tolerance; the greatest is circled."""
-    view = found.view
-    colours = mpl.colormaps["RdBu_r"]
+    view, most = found.view, _most(found)
+    # even near 0, logarithmic up to the tolerance; up to what was found where any or none is allowed
+    norm = SymLogNorm(_LINEAR * most, linscale=0.5, vmin=-most, vmax=most)
     image = axes.imshow(
-        view.change, cmap=colours, norm=_norm(found), interpolation="nearest", aspect="auto", extent=_extent(view)
+        view.change,
+        cmap=mpl.colormaps["RdBu_r"],
+        norm=norm,
+        interpolation="nearest",
+        aspect="auto",
+        extent=_extent(view),
     )
     axes.set(xticks=[], yticks=[])
     place = found.place
@@ -139,18 +136,10 @@ def _draw_change(axes: Axes, found: Comparison) -> AxesImage:
 
 
 def _extent(view: View) -> tuple[float, float, float, float]:
-    """Left, right, bottom and top of the view, in px of the camera."""
     return view.samples.start, view.samples.stop, len(view.lines) * view.sweep.step, 0.0
 
 
-def _norm(found: Comparison) -> Normalize:
-    """Even near 0, logarithmic up to the tolerance; up to what was found where any or none is allowed."""
-    most = _most(found)
-    return SymLogNorm(_LINEAR * most, linscale=0.5, vmin=-most, vmax=most)
-
-
 def _most(found: Comparison) -> float:
-    """Where colours end."""
     return found.tolerance or found.measured or 1.0
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -82,23 +81,21 @@ def run_check(request: CheckRequest, console: Console, *, as_json: bool = False)
             rows += check_camera(HeadwallCamera.at(rig.camera, rig.files), rig.files)
     good = [works(rows, device) for device, is_asked in asked.items() if is_asked]
     code = DONE if all(good) else PARTLY if any(good) else FAILED
-    if as_json:
-        print_json(_record(request, rows, code))
-    else:
+    if not as_json:
         _print(rows, on_stdout())
+        return code
+    print_json(
+        {
+            "port": rig.port if request.mirror else None,
+            "camera": f"{rig.host}:{rig.control_port}" if request.camera else None,
+            "move": request.move,
+            "rows": [row.record() for row in rows],
+            "failed": sum(row.verdict == "fail" for row in rows),
+            "warned": sum(row.verdict == "warn" for row in rows),
+            "exit_code": code,
+        }
+    )
     return code
-
-
-def _record(request: CheckRequest, rows: Sequence[CheckRow], code: int) -> dict[str, Any]:
-    return {
-        "port": request.rig.port if request.mirror else None,
-        "camera": f"{request.rig.host}:{request.rig.control_port}" if request.camera else None,
-        "move": request.move,
-        "rows": [row.record() for row in rows],
-        "failed": sum(row.verdict == "fail" for row in rows),
-        "warned": sum(row.verdict == "warn" for row in rows),
-        "exit_code": code,
-    }
 
 
 def _print(rows: Sequence[CheckRow], console: Console) -> None:

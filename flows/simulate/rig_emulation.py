@@ -103,10 +103,12 @@ def run_emulate(
 
 
 def _tell(request: EmulateRequest, served: ServedRig, console: Console, *, as_json: bool) -> None:
-    """Say how to connect, and write the file that was asked for."""
-    table = _rig_table(served) | _mounting_table(request.settings.rig)
+    table = _rig_table(served, request.settings.rig)
     if request.out is not None:
-        _write(request.out, _survey_toml(request.settings, table))
+        try:
+            request.out.write_text(_survey_toml(request.settings, table), encoding="utf-8")
+        except OSError as error:
+            raise SettingsError(f"cannot write {request.out}: {error.strerror}; choose another --out") from error
         console.print(f"survey it with: spectralzoom survey {escape(str(request.out))}", highlight=False)
     if as_json:
         faults = list(request.faults)
@@ -117,8 +119,10 @@ def _tell(request: EmulateRequest, served: ServedRig, console: Console, *, as_js
     console.print("emulating a rig; Ctrl-C ends it", highlight=False)
 
 
-def _rig_table(served: ServedRig) -> dict[str, object]:
+def _rig_table(served: ServedRig, rig: SurveyRig) -> dict[str, object]:
+    """How to reach it, and how the mirror is mounted, where that is not straight."""
     panel = served.rig.camera.view.source.scene.panel
+    mounted = ("mirror_axes", "mirror_clocking_deg", "mirror_offset_x", "mirror_offset_y")
     return {
         "port": served.port,
         "host": served.host,
@@ -127,30 +131,16 @@ def _rig_table(served: ServedRig) -> dict[str, object]:
         "pulses": served.rig.camera.wired,
         "panel": round(float(panel.mean()), 6),
         "provenance": "emulated",
+        **{name: getattr(rig, name) for name in mounted if rig.mounting != STRAIGHT},
     }
-
-
-def _mounting_table(rig: SurveyRig) -> dict[str, object]:
-    """How the mirror is mounted, where that is not straight."""
-    names = ("mirror_axes", "mirror_clocking_deg", "mirror_offset_x", "mirror_offset_y")
-    return {name: getattr(rig, name) for name in names if rig.mounting != STRAIGHT}
 
 
 def _survey_toml(settings: Settings, table: dict[str, object]) -> str:
     """A survey of the emulated rig: the scene says how large the field is, and what is true there."""
     size = None if settings.size is None else f"{settings.size[0]}x{settings.size[1]}"
-    wanted = {
-        "scene": settings.scene,
-        "size": size,
-        "day": settings.day,
-        "hour": settings.hour,
-        "bands": settings.bands,
-        "wavelengths": settings.wavelengths,
-        "seed": settings.seed,
-        "effects": settings.effects,
-        "tol": str(settings.tol),
-        "source": "rig",
-    }
+    names = ("scene", "size", "day", "hour", "bands", "wavelengths", "seed", "effects", "tol", "source")
+    wanted = {name: getattr(settings, name) for name in names}
+    wanted |= {"size": size, "tol": str(settings.tol), "source": "rig"}
     given = [f"{key} = {_toml_value(value)}" for key, value in wanted.items() if value is not None]
     return "\n".join(
         ["# A survey of an emulated rig, for as long as that runs.", *given, "", _toml_table("rig", table)]
@@ -167,15 +157,7 @@ def _toml_value(value: object) -> str:
     return f"[{', '.join(map(_toml_value, value))}]" if isinstance(value, tuple) else str(value)
 
 
-def _write(path: Path, text: str) -> None:
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise SettingsError(f"cannot write {path}: {error.strerror}; choose another --out") from error
-
-
 def _state(rig: EmulatedRig) -> str:
-    """What both devices do, in a line."""
     seen = rig.seen()
     x, y = seen.position
     last = f", last: {seen.last}" if seen.last else ""

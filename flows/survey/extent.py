@@ -1,16 +1,21 @@
-"""How much there is to do in a survey, in the units that its stages' costs grow with."""
+"""How much there is to do in a survey: in the units that its stages' costs grow with, and in multiply-adds."""
 
 from __future__ import annotations
 
 from bisect import bisect_right
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from math import ceil
 
+import numpy as np
+from numpy.typing import NDArray
+
 from flows.survey.field_work import SHARD
+from flows.survey.run import SurveyRun
 from flows.survey.stage import Unit
-from models.network.cost import multiply_adds
+from models.network.cost import MultiplyAdds, multiply_adds
 from models.network.sizes import SegmenterConfig
-from models.reading.regions import plan_regions, whole_field
+from models.policies.policies import IMAGE_POLICIES, NETWORK_POLICIES, SEEING_POLICIES
+from models.reading.regions import Region, plan_regions, whole_field
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, CostModel
@@ -74,9 +79,9 @@ class Extent:
             case "patch values":
                 return self._fine_pixels * self.bands
             case "operations of the map":
-                return self._map_operations
-            case "operations of a glance":
-                return self._glance_operations
+                return self._map_operations()
+            case "operations of a glance":  # of reading the coarse patches of the whole field alone
+                return float(multiply_adds(self.config, whole_field(self.grid).grid, 0, self.bands, None).total)
             case "surveys":  # what is the same for every field
                 return 1
 
@@ -86,7 +91,6 @@ class Extent:
         across = self.grid.width if self.along == "x" else self.grid.height
         return (self.fine_lines or 0) * min(self.camera.samples, across)
 
-    @property
     def _map_operations(self) -> float:
         """Multiply-adds of reading coarse and fine patches together, region by region, seats spread evenly."""
         if self.fine_lines is None:
@@ -99,7 +103,30 @@ class Extent:
             total += multiply_adds(self.config, read, seats, self.bands, None).total
         return float(total)
 
-    @property
-    def _glance_operations(self) -> float:
-        """Multiply-adds of reading the coarse patches of the whole field alone."""
-        return float(multiply_adds(self.config, whole_field(self.grid).grid, 0, self.bands, None).total)
+
+def work_done(run: SurveyRun, seats: NDArray[np.integer]) -> MultiplyAdds:
+    """Count the scores of the field, and the map drawn with fine patches at these seats.
+
+    Stages keep nothing of the model for each other, so that each reads the coarse look anew: ``glance`` holds what map
+    and scores took for it.
+    """
+    policy, regions = run.settings.policy, plan_regions(run.grid, SHARD)
+    drawn = work_of_map(run, seats)
+    looks = 2 if policy in SEEING_POLICIES and policy not in NETWORK_POLICIES else 1
+    scored = [whole_field(run.grid)] if policy in IMAGE_POLICIES else regions
+    score = sum(_of_region(run, region, 0, policy).score for region in scored)
+    return replace(drawn, glance=looks * drawn.glance, score=score)
+
+
+def work_of_map(run: SurveyRun, seats: NDArray[np.integer]) -> MultiplyAdds:
+    """Count the map drawn with fine patches at these seats of the field."""
+    regions = plan_regions(run.grid, SHARD)
+    counts = [int(np.count_nonzero(region.numbers_here(seats) >= 0)) for region in regions]
+    parts = [astuple(_of_region(run, region, count, None)) for region, count in zip(regions, counts, strict=True)]
+    return MultiplyAdds(*(sum(part) for part in zip(*parts, strict=True)))
+
+
+def _of_region(run: SurveyRun, region: Region, seats: int, policy: str | None) -> MultiplyAdds:
+    channels = 3 if run.vgg is None else run.vgg.channels
+    bands = len(run.scene.wavelength_nm)
+    return multiply_adds(run.described.config, region.grid, seats, bands, policy, channels=channels)

@@ -53,7 +53,8 @@ def survey_with_prefect(runner: StageRunner, finish: Callable[[Step, Products], 
     PipelineError : from a stage, as with the plain engine.
     """
     if inside_flow():
-        return _survey(runner, finish)
+        step = _task_step(runner)
+        return finish(step, survey(step))
     with _prefect_home(runner.run.archive.root):
         try:
             from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
@@ -88,19 +89,20 @@ def inside_flow() -> bool:
 
 
 def _task_step(runner: StageRunner) -> Step:
-    """What runs a stage as a Prefect task of the flow that it is called in."""
     from prefect import task
     from prefect.cache_policies import NO_CACHE
+
+    def ref_of(uri: str) -> StageRef:
+        return runner.run.archive.ref(*uri.split("/")[1:])
 
     before: list[dict[str, str]] = []  # what the last task returned: by this very object Prefect knows it again
 
     def stage(name: str, inputs: dict[str, str], after: list[dict[str, str]]) -> dict[str, str] | None:
         """One stage of the survey: addresses and keys in, an address and a key out; ``after`` draws the time line."""
-        ref = runner(name, *(_ref(runner, uri) for uri in inputs))
+        ref = runner(name, *map(ref_of, inputs))
         return None if ref is None else {"uri": ref.uri, "key": ref.key}
 
     def step(name: str, /, *inputs: StageRef) -> StageRef | None:
-        """Run a stage as a task that comes after the last one."""
         one = task(
             name=name,
             task_run_name=f"{name}-{runner.run.name}",
@@ -114,15 +116,9 @@ def _task_step(runner: StageRunner) -> Step:
         if found is None:
             return None
         before[:] = [found]
-        return _ref(runner, found["uri"])
+        return ref_of(found["uri"])
 
     return step
-
-
-def _survey(runner: StageRunner, finish: Callable[[Step, Products], Left]) -> Left:
-    """Run the stages as tasks of the flow that this is called in."""
-    step = _task_step(runner)
-    return finish(step, survey(step))
 
 
 def _run_flow(runner: StageRunner, finish: Callable[[Step, Products], Left]) -> Left:
@@ -137,7 +133,8 @@ def _run_flow(runner: StageRunner, finish: Callable[[Step, Products], Left]) -> 
         """Sweep coarsely, look again where it changes the map, draw the map."""
         started.append(True)
         with _stopping(stopped):
-            left.append(_survey(runner, finish))
+            step = _task_step(runner)
+            left.append(finish(step, survey(step)))
 
     settings = runner.run.settings
     try:
@@ -172,13 +169,7 @@ def _stopping(stopped: list[KeyboardInterrupt]) -> Iterator[None]:
 
 def _may_help(task: Any, run: Any, state: Any) -> bool:
     """A device or disk may answer the second time; wrong input will not."""
-    error = state.result(raise_on_failure=False)
-    return isinstance(error, OSError)
-
-
-def _ref(runner: StageRunner, uri: str) -> StageRef:
-    _, stage, key = uri.split("/")
-    return runner.run.archive.ref(stage, key)
+    return isinstance(state.result(raise_on_failure=False), OSError)
 
 
 @contextmanager

@@ -148,11 +148,17 @@ def open_run(settings: Settings, *, planning: bool = False) -> SurveyRun:
     if settings.mask is not None:
         check_mask(settings.mask, scene.shape)
     sealing = () if described.sealed else (unsealed_note(path),)
-    vgg_notes = _check_vgg(settings, None if planning else load)
+    vgg = _vgg_file(settings)
+    vgg_notes: tuple[str, ...] = ()
+    if vgg is not None and not planning:
+        vgg.saliency(load())  # refuses one that does not go with the weights
+        vgg_notes = (f"VGG19 from {vgg.path.name}: {vgg.report()}",)
     simulated, planned = make_source(scene, settings), (*plan.coarse, *plan.full)
     source = field_source(scene, settings, simulated, planned)
     check_memory(settings, simulated, grid, plan)
-    _check_pose(settings, scene.shape)
+    if settings.pose is not None:  # one from which there is ground to map
+        view = GroundView(settings.pose, settings.camera.ifov_rad)
+        ground_grid(view, scene.shape, epsg=settings.map.epsg, resolution_m=settings.map.resolution_m)
     key = content_key(path)
     return SurveyRun(
         settings=settings,
@@ -176,7 +182,9 @@ def make_source(scene: RasterScene, settings: Settings) -> SimulatedSource:
 
     Where a rig takes the lines it stands for the plan of them alone: sizes, paths and memory.
     """
-    pointing = _pointing(settings) if settings.source == "sim" else None
+    pointing = None
+    if settings.source == "sim" and settings.pointing_px:
+        pointing = PointingErrors(offset_px=settings.pointing_px, jitter_px=0.0, seed=settings.seed)
     return SimulatedSource(scene, settings.simulated_rig, settings.seed, {}, name=settings.source, pointing=pointing)
 
 
@@ -184,29 +192,6 @@ def _vgg_file(settings: Settings) -> VggFile | None:
     if settings.vgg is None:
         return None
     return VggFile.found(Path(settings.vgg), trained=settings.policy == "vgg-trained")
-
-
-def _check_vgg(settings: Settings, load: Once[Weights] | None) -> tuple[str, ...]:
-    """Refuse a VGG19 that does not go with the weights (without these: one that is not there); say what was taken."""
-    file = _vgg_file(settings)
-    if file is None or load is None:
-        return ()
-    file.saliency(load())
-    return (f"VGG19 from {file.path.name}: {file.report()}",)
-
-
-def _pointing(settings: Settings) -> PointingErrors | None:
-    """What the simulated mirror gets wrong, where the settings allow it to: nothing otherwise."""
-    if not settings.pointing_px:
-        return None
-    return PointingErrors(offset_px=settings.pointing_px, jitter_px=0.0, seed=settings.seed)
-
-
-def _check_pose(settings: Settings, shape: tuple[int, int]) -> None:
-    """Refuse a pose from which there is no ground to map, before anything is captured."""
-    if settings.pose is not None:
-        view = GroundView(settings.pose, settings.camera.ifov_rad)
-        ground_grid(view, shape, epsg=settings.map.epsg, resolution_m=settings.map.resolution_m)
 
 
 def weights_path(settings: Settings) -> Path:

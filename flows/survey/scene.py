@@ -41,7 +41,12 @@ def open_scene(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
         settings.scene, labels=settings.labels, bands=settings.bands, wavelengths=settings.wavelengths
     )
     scene = scene_of_file(file, settings.camera)
-    return scene, (*file.provenance, *_gap_note(scene))
+    if not scene.filled_px:
+        return scene, file.provenance
+    void = 0 if scene.missing is None else int(np.count_nonzero(scene.missing))
+    unclassed = f"; {void} without most of their bands have no class in the map" if void else ""
+    gaps = f"{scene.filled_px} pixels without a value were given their band's median{unclassed}"
+    return scene, (*file.provenance, gaps)
 
 
 def _field_before_rig(settings: Settings) -> RasterScene:
@@ -71,15 +76,6 @@ def _field_before_rig(settings: Settings) -> RasterScene:
         panel=np.full(bands, settings.rig.panel, np.float32),
         wavelength_nm=np.array(settings.wavelengths, np.float64),
     )
-
-
-def _gap_note(scene: RasterScene) -> tuple[str, ...]:
-    """What became of pixels that came without a value."""
-    if not scene.filled_px:
-        return ()
-    void = 0 if scene.missing is None else int(np.count_nonzero(scene.missing))
-    unclassed = f"; {void} without most of their bands have no class in the map" if void else ""
-    return (f"{scene.filled_px} pixels without a value were given their band's median{unclassed}",)
 
 
 def _open_farm(settings: Settings) -> RasterScene:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 from flows.settings.survey_settings import Settings
 from pipeline.geometry.mirror import STRAIGHT
@@ -15,17 +15,11 @@ from pipeline.geometry.scan import Sweep, sweep_positions
 from pipeline.rig.camera.camera_files import KeptInMemory
 from pipeline.rig.device_settings import CameraLimits, check_times
 from pipeline.rig.devices import SYSTEM_CLOCK, Clock
+from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.effect import Effect
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Source
-from storage.arrays.fetched_files import FetchedFiles
-
-if TYPE_CHECKING:
-    from pipeline.rig.capture.capture_runner import RigDevices
-    from pipeline.rig.capture.rig_source import RigSource
-
-FETCHED = "camera"  # folder within a capture's spool
 
 
 class FieldSource(Protocol):
@@ -61,110 +55,30 @@ class SimulatedField:
 
     @property
     def name(self) -> str:
-        """What the receipt calls it."""
         return self.source.name
 
     def key(self, field: str) -> dict[str, Any]:
-        """Nothing more."""
         return {}
 
     def saying(self, say: Callable[[str], None]) -> SimulatedField:
-        """The same: lines come all the time."""
-        return self
+        return self  # lines come all the time
 
     def lit(self, chosen: Mapping[Effect, str], clock: Mapping[str, float]) -> SimulatedField:
-        """The same with effects and clock."""
         return SimulatedField(replace(self.source, chosen=chosen, clock=clock))
 
     def opened(self, spool: Path) -> AbstractContextManager[Source]:
-        """The simulation, which keeps nothing."""
         return nullcontext(self.source)
-
-
-@dataclass(frozen=True)
-class RigField:
-    """The rig that the settings name. Its effects are its own."""
-
-    rig: RigSource
-    name = "rig"
-    simulates = False
-
-    def key(self, field: str) -> dict[str, Any]:
-        """Which field, and how the mirror is mounted where it is not straight."""
-        mounting = self.rig.rig.mounting
-        return {"field": field} | ({} if mounting == STRAIGHT else {"mounting": asdict(mounting)})
-
-    def saying(self, say: Callable[[str], None]) -> RigField:
-        """The same, telling of paths going up, captures and files."""
-        return RigField(self.rig.saying(say))
-
-    def lit(self, chosen: Mapping[Effect, str], clock: Mapping[str, float]) -> RigField:
-        """The same: nothing is simulated."""
-        return self
-
-    @contextmanager
-    def opened(self, spool: Path) -> Iterator[Source]:
-        """The rig with its devices held on to; what its camera gives is kept beside the lines and goes with them."""
-        source = self.rig.keeping(FetchedFiles(spool / FETCHED))
-        with source.session():
-            yield source
 
 
 def field_source(
     scene: RasterScene, settings: Settings, simulated: SimulatedSource, planned: Sequence[Sweep]
 ) -> FieldSource:
-    """Give who looks, as the settings say. Of a rig nothing is connected before its first line.
-
-    Raises
-    ------
-    SettingsError : exposure and frame period are nothing that the camera takes.
-    PoseError : the mirror, as mounted, does not reach all of the planned sweeps.
-    """
+    """Give who looks, as the settings say; raises what `flows.survey.rig_field.rig_field` does."""
     if settings.source != "rig":
         return SimulatedField(simulated)
-    from pipeline.rig.capture.rig_source import RigSource  # drivers load pyserial, which others do without
+    from flows.survey.rig_field import rig_field  # drivers load pyserial and scipy, which others do without
 
-    camera = settings.camera
-    check_times(camera.exposure_ms, camera.frame_ms, CameraLimits(most_rate_hz=camera.max_rate_hz))
-    if settings.rig.mounting != STRAIGHT:
-        for sweep in planned:
-            settings.rig.mounting.to_device(sweep_positions(sweep, camera))
-    return RigField(
-        RigSource(
-            camera,
-            scene.wavelength_nm,
-            scene.shape,
-            lambda: open_devices(settings),
-            KeptInMemory(),
-            rig=settings.rig,
-            vector_pairs=settings.cost.vector_pairs,
-        )
-    )
-
-
-def open_devices(settings: Settings, clock: Clock = SYSTEM_CLOCK) -> RigDevices:
-    """Connect to mirror and camera; nothing moves.
-
-    Raises
-    ------
-    DeviceGone : no such port, in use, not permitted, or the camera is not there. DeadlinePassed : nothing answers.
-    RigError : another device does.
-    """
-    from pipeline.rig.camera.headwall_camera import HeadwallCamera
-    from pipeline.rig.capture.capture_runner import RigDevices
-    from pipeline.rig.mirror.mirror_controller import open_mirror
-
-    rig = settings.rig
-    mirror = open_mirror(rig.mirror(settings.cost.vector_pairs), clock, known=True)
-    limits = CameraLimits(most_rate_hz=settings.camera.max_rate_hz)
-    camera = HeadwallCamera.at(rig.camera, rig.files, limits=limits, clock=clock)
-    devices = RigDevices(mirror, camera, clock)
-    try:
-        camera.is_capturing()
-    except BaseException:
-        devices.close()
-        raise
-    return devices
+    return rig_field(scene, settings, planned)
 
 
 def for_rig(settings: Settings) -> Settings:

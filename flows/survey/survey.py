@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import resource
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -72,7 +72,6 @@ class StageRunner:
     records: dict[str, StageRecord] = field(default_factory=dict)
 
     def __call__(self, stage: str, /, *inputs: StageRef) -> StageRef | None:
-        """Run one of ``STAGES`` by its name."""
         self.watch(stage, "running", 0.0)
         meter, reached = _Meter(), 0.0
 
@@ -88,19 +87,14 @@ class StageRunner:
             self.watch(stage, "failed", reached)
             raise
         state: State = "skipped" if ref is None else "ran" if built else "cached"
-        self.records[stage] = self._record(stage, ref, state, meter, inputs)
-        self.watch(stage, state, 1.0)
-        return ref
-
-    def _record(
-        self, stage: str, ref: StageRef | None, state: State, meter: _Meter, inputs: Sequence[StageRef]
-    ) -> StageRecord:
-        size = self.run.archive.stored_bytes
         wall, cpu, peak = meter.read() if state == "ran" else (None, None, None)
+        size = self.run.archive.stored_bytes
         bytes_in = sum(size(given) for given in inputs)
         key, bytes_out = ("", 0) if ref is None else (ref.key, size(ref))
         known = None if ref is None else self.run.archive.manifest_hash(ref)
-        return StageRecord(stage, key, state, wall, cpu, peak, bytes_in, bytes_out, known)
+        self.records[stage] = StageRecord(stage, key, state, wall, cpu, peak, bytes_in, bytes_out, known)
+        self.watch(stage, state, 1.0)
+        return ref
 
 
 class _Meter:

@@ -7,16 +7,66 @@ settings alike and ratios hold. The results name machine, load, threads and vers
 from __future__ import annotations
 
 import math
+import os
+import platform
 import statistics
+import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from importlib import metadata
 from typing import Any, Generic, TypeVar
 
-from flows.tradeoff.machine import Copying, describe_machine, mean_load, one_thread
+import numpy as np
+from numpy.typing import NDArray
+
 from pipeline.errors import SettingsError
 
+COPIED_BYTES = 1 << 26  # beyond any cache
+
+
+@contextmanager
+def one_thread() -> Iterator[int]:
+    """Hold torch, where a stage has loaded it, to one thread; gives the number of threads in use."""
+    # Stages own torch; flows must neither import it nor pay for it where no stage needs it.
+    torch = sys.modules.get("torch")
+    if torch is None:
+        yield 1
+        return
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield torch.get_num_threads()
+    finally:
+        torch.set_num_threads(before)
+
+
+def describe_machine(threads: int) -> dict[str, object]:
+    """Processor, cores, system, threads in use and versions of what computes."""
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as lines:  # noqa: PTH123
+            names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+            processor = next(names, "unknown")
+    except OSError:
+        processor = platform.processor() or "unknown"
+    return {
+        "processor": processor,
+        "cores": os.cpu_count(),
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        "threads": threads,
+        "versions": {name: metadata.version(name) for name in ("numpy", "scipy", "torch")},
+    }
+
+
+def mean_load() -> float | None:
+    """Mean number of running processes over the last minute; None where the system does not say."""
+    return round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None
+
+
 Setting = str | float
+Clocks = list[tuple[float, float]]  # processor and wall seconds by round
 State = TypeVar("State")
 Output = TypeVar("Output")
 
@@ -61,12 +111,12 @@ class Point:
     setting: Setting
     error: float
     work: float
-    cpu_min_s: float
-    cpu_median_s: float
-    wall_min_s: float
-    wall_median_s: float
-    ratio: float  # of the price to the first setting's; of processor time its median over the rounds
-    modelled_s: float | None
+    cpu_min_s: float = math.nan
+    cpu_median_s: float = math.nan
+    wall_min_s: float = math.nan
+    wall_median_s: float = math.nan
+    ratio: float = math.nan  # of the price to the first setting's; of processor time its median over the rounds
+    modelled_s: float | None = None
     pareto: bool = False
     beside: Mapping[str, float] = field(default_factory=dict, hash=False)  # more figures, by name
 
@@ -100,17 +150,15 @@ class Result:
     def to_dict(self) -> dict[str, object]:
         """Plain values for JSON, which has no NaN and no infinity: they become None."""
         points = [
-            _finite({**asdict(point), "price_s": point.price_s, "ns_per_unit": point.ns_per_unit})
+            _finite(asdict(point) | {"price_s": point.price_s, "ns_per_unit": point.ns_per_unit})
             for point in self.points
         ]
         return {**asdict(self), "machine": dict(self.machine), "points": points}
 
 
-def _finite(values: Mapping[str, object]) -> dict[str, object]:
-    return {key: _finite(v) if isinstance(v, Mapping) else _known(v) for key, v in values.items()}
-
-
-def _known(value: object) -> object:
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _finite(one) for key, one in value.items()}
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
@@ -147,87 +195,79 @@ def measure_tradeoff(tradeoff: Tradeoff[State, Output], *, repeats: int = 5, see
     if repeats < 1:
         raise SettingsError(f"repeats must be at least 1, got {repeats}")
     state = tradeoff.prepare(seed)
-    copying = None if tradeoff.moved_bytes is None else Copying()
     with one_thread() as threads:
         load_before = mean_load()
         judged = [_judge(tradeoff, state, setting) for setting in tradeoff.settings]
-        clocks = _time_in_turn(tradeoff, state, repeats, copying)
+        clocks, floor = _time_in_turn(tradeoff, state, repeats)
         machine = describe_machine(threads) | {"load_before": load_before, "load_after": mean_load()}
-    points = [_point(tradeoff, state, number, judged, clocks) for number in range(len(tradeoff.settings))]
+    points = [_timed(point, own, judged[0], clocks[0]) for point, own in zip(judged, clocks, strict=True)]
     named = (tradeoff.stage, tradeoff.knob, tradeoff.error, tradeoff.unit, tradeoff.reference)
     levels = () if tradeoff.levels is None else tradeoff.levels(state)
-    floor = None if copying is None else copying.ns_per_byte * (tradeoff.moved_bytes or 0)
     return Result(*named, repeats, seed, machine, mark_pareto(points), levels, floor)
 
 
-def _judge(
-    tradeoff: Tradeoff[State, Output], state: State, setting: Setting
-) -> tuple[float, float | None, dict[str, float]]:
-    """Error, modelled seconds and further figures of one setting."""
+def _judge(tradeoff: Tradeoff[State, Output], state: State, setting: Setting) -> Point:
+    """One setting without its times."""
     output = tradeoff.run(state, setting)
-    modelled = None if tradeoff.modelled_s is None else tradeoff.modelled_s(state, setting, output)
-    beside = {name: float(tell(state, setting, output)) for name, tell in tradeoff.beside.items()}
-    return float(tradeoff.judge(state, setting, output)), modelled, beside
+    return Point(
+        setting,
+        error=float(tradeoff.judge(state, setting, output)),
+        work=tradeoff.work(state, setting),
+        modelled_s=None if tradeoff.modelled_s is None else tradeoff.modelled_s(state, setting, output),
+        beside={name: float(tell(state, setting, output)) for name, tell in tradeoff.beside.items()},
+    )
 
 
-def _time_in_turn(
-    tradeoff: Tradeoff[State, Output], state: State, repeats: int, copying: Copying | None
-) -> list[list[tuple[float, float]]]:
-    """(processor, wall) seconds by setting and round; every round starts at another setting."""
-    count = len(tradeoff.settings)
-    clocks: list[list[tuple[float, float]]] = [[] for _ in range(count)]
+def _time_in_turn(tradeoff: Tradeoff[State, Output], state: State, repeats: int) -> tuple[list[Clocks], float | None]:
+    """Seconds by setting and round, and the least time of copying a unit's bytes [ns].
+
+    Every round starts at another setting, with one copy of memory before it.
+    """
+    count, moved = len(tradeoff.settings), tradeoff.moved_bytes
+    source: NDArray[np.uint8] = np.ones(0 if moved is None else COPIED_BYTES, np.uint8)
+    target, copies = np.zeros_like(source), []
+    clocks: list[Clocks] = [[] for _ in range(count)]
     for turn in range(repeats):
-        if copying is not None:
-            copying.run()
+        if moved is not None:
+            start = time.process_time()
+            np.copyto(target, source)
+            copies.append(time.process_time() - start)
         for offset in range(count):
             number = (turn + offset) % count
             wall, cpu = time.perf_counter(), time.process_time()
             tradeoff.run(state, tradeoff.settings[number])
             clocks[number].append((time.process_time() - cpu, time.perf_counter() - wall))
-    return clocks
+    return clocks, None if moved is None else 1e9 * min(copies) / (2 * COPIED_BYTES) * moved  # read and written
 
 
-def _point(
-    tradeoff: Tradeoff[State, Output],
-    state: State,
-    number: int,
-    judged: Sequence[tuple[float, float | None, dict[str, float]]],
-    clocks: Sequence[Sequence[tuple[float, float]]],
-) -> Point:
-    cpu, wall = zip(*clocks[number], strict=True)
-    (error, modelled, beside), first_modelled = judged[number], judged[0][1]
-    prices = zip(cpu, (first for first, _ in clocks[0]), strict=True)
-    if modelled is not None and first_modelled is not None:
-        prices = zip((modelled,), (first_modelled,), strict=True)
-    ratios = [own / first for own, first in prices if first > 0]
-    return Point(
-        setting=tradeoff.settings[number],
-        error=error,
-        work=tradeoff.work(state, tradeoff.settings[number]),
+def _timed(point: Point, clocks: Clocks, first: Point, first_clocks: Clocks) -> Point:
+    cpu, wall = zip(*clocks, strict=True)
+    prices = zip(cpu, (cpu_s for cpu_s, _ in first_clocks), strict=True)
+    if point.modelled_s is not None and first.modelled_s is not None:
+        prices = zip((point.modelled_s,), (first.modelled_s,), strict=True)
+    ratios = [own / other for own, other in prices if other > 0]
+    return replace(
+        point,
         cpu_min_s=min(cpu),
         cpu_median_s=statistics.median(cpu),
         wall_min_s=min(wall),
         wall_median_s=statistics.median(wall),
         ratio=statistics.median(ratios) if ratios else math.nan,
-        modelled_s=modelled,
-        beside=beside,
     )
 
 
 def mark_pareto(points: Sequence[Point]) -> tuple[Point, ...]:
     """Mark the points that no other beats: none is at least as good in error and price and better in one."""
-    return tuple(Point(**{**asdict(point), "pareto": not _beaten(point, points)}) for point in points)
 
+    def beaten(point: Point) -> bool:
+        return not math.isfinite(point.error) or any(
+            other.error <= point.error
+            and other.price_s <= point.price_s
+            and (other.error < point.error or other.price_s < point.price_s)
+            for other in points
+        )
 
-def _beaten(point: Point, points: Sequence[Point]) -> bool:
-    if not math.isfinite(point.error):
-        return True
-    return any(
-        other.error <= point.error
-        and other.price_s <= point.price_s
-        and (other.error < point.error or other.price_s < point.price_s)
-        for other in points
-    )
+    return tuple(replace(point, pareto=not beaten(point)) for point in points)
 
 
 def cheapest_within(result: Result, error: float) -> Point | None:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.tradeoff.entries import Level, Setting, Tradeoff, register
-from flows.tradeoff.simulated_lines import look_at_lines
+from flows.tradeoff.simulate import look_at_lines
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.counting import QUANTISATION, READ_NOISE, SATURATION, SHOT
@@ -48,14 +48,6 @@ class Counted:
         return np.stack([np.bincount(one, minlength=self.law.shape[1]) for one in levels]).astype(np.float64)
 
 
-def _bright(seed: int) -> Counted:
-    return _even_light(seed, DIM_E, BRIGHT_SHARE * LineCamera().full_well_e)
-
-
-def _dim(seed: int) -> Counted:
-    return _even_light(seed, 1.0, DIM_E)
-
-
 def _even_light(seed: int, least_e: float, most_e: float) -> Counted:
     rig = Rig(LineCamera())
     electrons = np.geomspace(least_e, most_e, LEVELS)
@@ -70,7 +62,7 @@ def law_of_numbers(electrons: float, rig: Rig) -> Floats:
     """Give how probable each number of the converter is where so many electrons are expected, (DN,): Poisson counts,
     normal read noise, rounding, both ends of the converter. The read noise must not be 0.
     """
-    from scipy.special import ndtr
+    from scipy.special import ndtr  # a second to load, for those who trade noise alone
     from scipy.stats import poisson
 
     camera = rig.camera
@@ -113,13 +105,12 @@ def _by_chance(state: Counted) -> float:
 
 def _bound(state: Counted, variant: Setting, _raw: Raw) -> float:
     """What the effect says of its variants; noise counts twice its total variation."""
-    bound = SHOT.bound(state.probe, state.block.rig, str(variant))
-    return bound.value / 2
+    return SHOT.bound(state.probe, state.block.rig, str(variant)).value / 2
 
 
 def _chi_square(state: Counted, _variant: Setting, raw: Raw) -> float:
     """How probable a chi-square as large is where the law holds, at the worst level."""
-    from scipy.stats import chi2
+    from scipy.stats import chi2  # slow to load
 
     found = []
     for seen, law in zip(state.counts(raw), state.law, strict=True):
@@ -130,23 +121,23 @@ def _chi_square(state: Counted, _variant: Setting, raw: Raw) -> float:
     return min(found)
 
 
+def _moments(state: Counted, raw: Raw) -> tuple[Floats, Floats, Floats]:
+    """Mean seen less the law's, variance seen, variance of the law, (level,) each [DN]."""
+    dn, laws = np.arange(state.law.shape[1]), np.stack([state.counts(raw) / state.draws, state.law])
+    means = laws @ dn
+    seen, law = (laws * (dn - means[..., None]) ** 2).sum(axis=-1)
+    return means[0] - means[1], seen, law
+
+
 def _variance_error(state: Counted, _variant: Setting, raw: Raw) -> float:
-    """Greatest error of the variance, as a share."""
-    (_, seen), (_, wanted) = (_mean_and_variance(one) for one in (state.counts(raw) / state.draws, state.law))
+    _, seen, wanted = _moments(state, raw)
     return float(np.abs(seen / wanted - 1).max())
 
 
 def _mean_error(state: Counted, _variant: Setting, raw: Raw) -> float:
     """Greatest error of the mean, in sigmas of one number."""
-    (seen, _), (wanted, variance) = (_mean_and_variance(one) for one in (state.counts(raw) / state.draws, state.law))
-    off = np.abs(seen - wanted) / np.sqrt(variance)
-    return float(off.max())
-
-
-def _mean_and_variance(law: Floats) -> tuple[Floats, Floats]:
-    dn = np.arange(law.shape[1])
-    mean: Floats = law @ dn
-    return mean, (law * (dn - mean[:, None]) ** 2).sum(axis=1)
+    off, _, variance = _moments(state, raw)
+    return float((np.abs(off) / np.sqrt(variance)).max())
 
 
 NOISE = register(
@@ -157,7 +148,7 @@ NOISE = register(
         unit="px*band",
         reference=f"the law of counts, read noise and rounding, {DIM_E:g} electrons to {BRIGHT_SHARE:g} of full scale",
         settings=(*SHOT.variants, OFF),
-        prepare=_bright,
+        prepare=lambda seed: _even_light(seed, DIM_E, BRIGHT_SHARE * LineCamera().full_well_e),
         run=_run,
         judge=_variation,
         work=lambda state, _variant: float(state.light.size),
@@ -170,6 +161,6 @@ DIM_NOISE = register(
         NOISE,
         knob="shot noise, dim light",
         reference=f"the law of counts, read noise and rounding, 1 to {DIM_E:g} electrons",
-        prepare=_dim,
+        prepare=lambda seed: _even_light(seed, 1.0, DIM_E),
     )
 )

@@ -12,8 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from flows.terminal.progress import StageProgress
-from flows.training.start import print_start
-from flows.training.train import TrainRequest, train_weights
+from flows.training.train import TrainRequest, print_start, train_weights
 from pipeline.errors import SettingsError
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -43,17 +43,12 @@ class TrainingData:
     def scenes(self, names: tuple[str, ...]) -> Iterator[RasterScene]:
         """Make the named scenes in order."""
         for name in names:
-            yield self._farm(name) if self.files is None else self._file(name)
-
-    def _farm(self, name: str) -> RasterScene:
-        seed, day, hour = read_farm_name(name)
-        return farm_scene(seed, FARM_SHAPE, camera=self.camera, day=day, hour=hour)
-
-    def _file(self, name: str) -> RasterScene:
-        if self.files is None:
-            raise SceneError(f"no file holds the scene {name}")
-        wanted = dict(self.files.train()) if self.files.train_mask else {name: self.files.load(name)}
-        return scene_of_file(wanted[name], self.camera)
+            if self.files is None:
+                seed, day, hour = read_farm_name(name)
+                yield farm_scene(seed, FARM_SHAPE, camera=self.camera, day=day, hour=hour)
+            else:
+                file = dict(self.files.train())[name] if self.files.train_mask else self.files.load(name)
+                yield scene_of_file(file, self.camera)
 
 
 def scene_of_file(file: SceneFile, camera: LineCamera) -> RasterScene:
@@ -132,20 +127,18 @@ def open_training_data(
     """
     refuse_removed(dataset)
     if dataset in FARM_NAMES:
-        _refuse_choices(choices)
+        for choice, value in choices.items():
+            if value not in (None, ()):
+                flag = "--" + choice.replace("_", "-")
+                raise SettingsError(
+                    f"{flag} is for scene files; the farm's scenes are drawn by seed and bring their own"
+                )
         return farm_data(scenes, FARM_VALIDATION if validation is None else validation, camera)
     if scenes is not None:
         raise SettingsError(f"--scenes is for the built-in farms; {dataset} has its own scenes")
     files = load_data_set(Path(dataset), **choices)  # type: ignore[arg-type]
     share = min(4, len(files.train_names) // 8)
     return file_data(files, share if validation is None else validation, camera)
-
-
-def _refuse_choices(choices: Mapping[str, object]) -> None:
-    for name, value in choices.items():
-        if value not in (None, ()):
-            flag = "--" + name.replace("_", "-")
-            raise SettingsError(f"{flag} is for scene files; the farm's scenes are drawn by seed and bring their own")
 
 
 def pack_mask(mask: NDArray[np.bool_]) -> str:

@@ -35,24 +35,15 @@ def validate(weights: AnyWeights, examples: Iterable[Example], seed: int, show: 
     two_scale = Weights(
         weights.network, weights.basis, weights.normalisation, weights.class_names, weights.class_colours
     )
-    return _summary([_rows(two_scale, example, seed, show) for example in examples])
-
-
-def _rows(weights: Weights, example: Example, seed: int, show: Show) -> Controls:
-    grid, cells, labels = _parts(weights, example)
-    return run_controls(
-        weights,
-        glance_of_columns(weights, example.coarse, grid),
-        cells,
-        labels,
-        share=CONTROL_SHARE,
-        seed=seed,
-        report=show,
-    )
+    rows = []
+    for example in examples:
+        grid, cells, labels = _parts(two_scale, example)
+        seen = glance_of_columns(two_scale, example.coarse, grid)
+        rows.append(run_controls(two_scale, seen, cells, labels, share=CONTROL_SHARE, seed=seed, report=show))
+    return _summary(rows)
 
 
 def _parts(weights: AnyWeights, example: Example) -> tuple[SceneGrid, Patches, NDArray[np.uint8]]:
-    """The grid of a scene, every fine patch of it, and its labels without the padding."""
     grid = SceneGrid(*example.shape, weights.config.patch, weights.config.factor)
     return grid, patches_of(example.fine, grid.patch).astype(np.float32), example.labels[: grid.height, : grid.width]
 

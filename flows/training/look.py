@@ -60,26 +60,15 @@ def observe_scene(
 ) -> Observation:
     """Look at a labelled scene, and project what was seen onto the basis; the noise follows from ``rng``.
 
+    A built-in farm is surveyed with every line there is, by a seed that ``rng`` draws.
+
     Raises
     ------
     SceneError : the scene has no labels, or a pixel that no line reached.
     """
     if law_of_key(scene.key) is None:
         return observe(scene, camera, grid, basis, rng)
-    return observe_farm(scene, camera, grid, basis, int(rng.integers(2**31)))
-
-
-def observe_farm(
-    scene: RasterScene, camera: LineCamera, grid: SceneGrid, basis: SpectralBasis, seed: int
-) -> Observation:
-    """Survey a labelled scene with every line there is, and project both passes onto the basis.
-
-    ``seed`` is that of a survey: of the noise and all else that is drawn by chance.
-
-    Raises
-    ------
-    SceneError : the scene has no labels, or a pixel that no line reached.
-    """
+    seed = int(rng.integers(2**31))
     if scene.labels is None:
         raise SceneError(f"scene {scene.name} has no labels; training needs them")
     rig, cost = Rig(camera), CostModel()

@@ -108,7 +108,7 @@ def _summarise(tables: dict[str, Sequence[Row]], failed: Sequence[str]) -> None:
 
 def _machine() -> str:
     """Processor, cores, load and versions, on one line."""
-    from flows.tradeoff.machine import describe_machine, mean_load
+    from flows.tradeoff.entries import describe_machine, mean_load
 
     it = describe_machine(threads=1)
     versions = ", ".join(f"{name} {version}" for name, version in it["versions"].items())

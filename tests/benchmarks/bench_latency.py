@@ -140,7 +140,7 @@ def _survey(stack: ExitStack, settings: Settings, moments: Moments) -> None:
     source = make_source(run.scene, settings)
     rig = EmulatedRig(replace(source, chosen=chosen_effects(effects)), ManualClock(10.0))
     line = stack.enter_context(rig.in_process())
-    stack.enter_context(patch("flows.survey.sources.open_devices", _devices(rig, line)))
+    stack.enter_context(patch("flows.survey.rig_field.open_devices", _devices(rig, line)))
     try:
         survey(step)
     except _AskedError:

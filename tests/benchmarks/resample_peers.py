@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.tradeoff.resample import draw_waves
+from flows.tradeoff.rectify import draw_waves
 
 SIDE, BANDS, EDGE = 256, 270, 176  # of the sweep; of the output grid, which lies inside it when turned
 TURN_DEG = 14.0

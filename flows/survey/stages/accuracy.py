@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.survey.full_look import columns_of_all_seats
 from flows.survey.run import SurveyRun
 from flows.survey.stage import Product, Wanted, stage
 from flows.survey.stages.class_map import glance_at, patch_columns
@@ -34,12 +33,16 @@ from models.evaluation.metrics import (
 from models.policies.free_seats import CONTROL_SHARE, Controls, run_controls
 from models.policies.policies import score_seats
 from models.reading.inference import CoarseLook, Glance, glance_of_columns, segment
-from pipeline.geometry.grid import UNLABELLED
+from models.weights.files import Weights
+from pipeline.geometry.grid import UNLABELLED, SceneGrid
+from pipeline.geometry.scan import Sweep
 from pipeline.planning.fine_pass import price_of_seats
 from pipeline.planning.prices import count_lines
 from pipeline.planning.selection import frame_seats
+from pipeline.rectify.region import read_seats
+from pipeline.rectify.resample import Kernel
 from pipeline.simulator.effects.pointing import CommonOffset, PointingErrors
-from pipeline.simulator.simulated import SimulatedSource
+from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 from storage.archive.archive import StageRef
 from storage.archive.keys import array_digest
 from storage.archive.manifests import read_table
@@ -70,12 +73,12 @@ def evaluate(
     if not run.scene.labelled or not run.settings.accuracy:
         return None
     inputs = [mosaic, patches, class_map, effects, *pointing]
-    _wait_for(inputs)
+    for ref in inputs:
+        _ = ref.key  # a plan stops here where one is not known yet: for its own key the labels have to be drawn
     off = _map_offset(run, pointing)
     labels = _moved(run, off)
 
     def build(path: Path) -> None:
-        """Judge the map, the coarse look alone, and with controls other placements."""
         classes = load_class_map(class_map.path / "class_map.zarr").classes
         judged = np.where(classes == UNLABELLED, np.uint8(UNLABELLED), labels)  # what has no class is not
         seen = glance_at(run, mosaic)
@@ -98,12 +101,6 @@ def evaluate(
         **run.source_key(),
     }
     return Wanted(build, params, inputs)
-
-
-def _wait_for(inputs: Sequence[StageRef]) -> None:
-    """Let a plan stop here where a key is not known yet: for its own the labels have to be drawn."""
-    for ref in inputs:
-        _ = ref.key
 
 
 def _map_offset(run: SurveyRun, pointing: Sequence[StageRef]) -> NDArray[np.float64]:
@@ -138,7 +135,6 @@ def _sure_source(run: SurveyRun, off: NDArray[np.float64]) -> SimulatedSource:
 def _controls(
     run: SurveyRun, seen: Glance, patches: StageRef, labels: NDArray[np.uint8], result: dict[str, Any]
 ) -> dict[str, Any]:
-    """`all`, the other placements, and how long either reading takes."""
     columns = columns_of_all_seats(
         run.simulated,
         run.plan.full,
@@ -229,3 +225,43 @@ def _figures(run: SurveyRun, counts: NDArray[np.int64]) -> dict[str, Any]:
 def load_accuracy(evaluated: StageRef) -> dict[str, Any]:
     """Read the figures of an evaluation."""
     return read_table(evaluated.path / RECORD)
+
+
+MEMORY_SHARE = 32  # a band of seats may take this part of the memory
+
+
+def columns_of_all_seats(
+    source: SimulatedSource,
+    full: Sequence[Sweep],
+    grid: SceneGrid,
+    weights: Weights,
+    *,
+    memory: int,
+    kernel: Kernel,
+    report: Callable[[float], None] = lambda done: None,
+) -> NDArray[np.float32]:
+    """Scan the scene in full, a band of seats at a time, and keep the normalised columns only.
+
+    Gives (seat, p, p, column) float32 of the padded grid; seats beyond the scene are 0. ``memory`` is in bytes.
+    """
+    sweeps = [SimulatedSweep(source, sweep) for sweep in full]
+    p, valid = grid.patch, grid.valid_seats()
+    columns = np.zeros((int(np.prod(grid.seat_shape)), p, p, weights.basis.columns), np.float32)
+    band_bytes = memory // MEMORY_SHARE
+    done = 0
+    for seats in _bands_of_seats(grid, full[0].along == "x", band_bytes, len(source.wavelength_nm)):
+        values, _ = read_seats(sweeps, source.camera, grid, seats, kernel)
+        columns[seats] = weights.columns(values, source.wavelength_nm)
+        done += len(seats)
+        report(done / len(valid))
+    return columns
+
+
+def _bands_of_seats(grid: SceneGrid, rows: bool, most_bytes: int, bands: int) -> list[NDArray[np.intp]]:
+    """Valid seats in bands across the scan, as many rows (or columns) a band as fit."""
+    valid = grid.valid_seats()
+    row, column = np.divmod(valid, grid.seat_shape[1])
+    place = row if rows else column
+    one = int(np.count_nonzero(place == 0)) * grid.patch**2 * bands * 4
+    deep = max(1, most_bytes // one)
+    return [valid[place // deep == band] for band in range(int(place.max()) // deep + 1)]

@@ -1,9 +1,10 @@
-"""The stage of attention: a score for every seat, and the sweeps that show the most of it in the time left."""
+"""The stages of attention: a score for every seat, the sweeps that show most of it, and the other way to lay lines."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +15,16 @@ from flows.survey.stage import Product, Wanted, stage
 from models.policies.policies import IMAGE_POLICIES, SEEDED_POLICIES, SEEING_POLICIES, score_seats
 from models.reading.inference import Glance
 from pipeline.geometry.scan import Sweep
+from pipeline.planning.crop_rows import find_rows
 from pipeline.planning.fine_pass import FinePlan, plan_fine
+from pipeline.planning.orientation import compare_orientations
 from storage.archive.archive import StageRef
 from storage.archive.keys import array_digest
 from storage.archive.manifests import read_table, write_table
 from storage.arrays.mosaics import Attention, write_attention
+from storage.archive.stored_tables import read_table, write_table
+from storage.arrays.attention import Attention, load_attention, write_attention
+from storage.arrays.mosaics import mosaic_brightness
 
 ATTENTION = Product("attend", version=7, by_weights=True)
 
@@ -29,7 +35,6 @@ def attend(run: SurveyRun, mosaic: StageRef) -> Wanted:
     settings = run.settings
 
     def build(path: Path) -> None:
-        """Score the seats, and refuse a plan whose map would not fit the memory."""
         work = FieldWork.of(run)
         scores = _scores(run, work, mosaic)
         plan = plan_fine(
@@ -43,7 +48,7 @@ def attend(run: SurveyRun, mosaic: StageRef) -> Wanted:
             full=run.plan.full,
             threshold=settings.threshold,
         )
-        work.check_memory(plan.seats, len(run.scene.wavelength_nm))  # before the rig goes back, not after
+        work.crew_for(plan.seats, len(run.scene.wavelength_nm))  # refuses what does not fit before the rig goes back
         rank = np.full(scores.shape, -1, np.int32)
         rank[plan.seats[np.argsort(-scores[plan.seats], kind="stable")]] = np.arange(len(plan.seats))
         shape = run.grid.seat_shape
@@ -90,3 +95,45 @@ def load_plan(attention: StageRef) -> FinePlan:
     plan = read_table(attention.path / "plan.json")
     kept = {"sweeps": [Sweep(**sweep) for sweep in plan["sweeps"]], "seats": np.array(plan["seats"], np.intp)}
     return FinePlan(**(plan | kept))
+
+
+TURNED = Product("turned", version=1)
+FILE = "orientation.json"
+
+
+@stage(
+    "compare_turned",
+    "the plan with lines along the other axis",
+    TURNED,
+    of=("rectify", "attend"),
+    after=("draw_map",),
+    unit="pixels",
+)
+def compare_turned(run: SurveyRun, mosaic: StageRef, attention: StageRef) -> Wanted:
+    """Plan the scores with lines along the other axis, and find which way crop rows run."""
+    settings = run.settings
+
+    def build(path: Path) -> None:
+        scores = load_attention(attention.path / "attention.zarr").score.ravel()
+        rows = find_rows(mosaic_brightness(mosaic.path / "mosaic.zarr"))
+        turned = compare_orientations(
+            run.grid,
+            run.camera,
+            settings.cost,
+            run.plan.along,
+            scores,
+            budget_s=run.plan.fine_s,
+            plan=load_plan(attention),
+            rows=rows,
+            overlap_px=run.plan.overlap_px,
+            margin_px=run.plan.margin_px,
+            threshold=settings.threshold,
+        )
+        write_table(path / FILE, asdict(turned) | {"sentence": turned.sentence})
+
+    return Wanted(build, {}, [mosaic, attention])  # all it depends on are parameters of attention
+
+
+def load_orientation(turned: StageRef) -> dict[str, Any]:
+    """Read what the other orientation of the line would have shown, and which way crop rows run."""
+    return read_table(turned.path / FILE)

@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
+from threading import Semaphore
 from typing import Any
 
-from flows.survey.rendered_lines import take_lines
 from flows.survey.run import CaptureRun, SurveyRun
 from flows.survey.stage import Product, Wanted, stage
 from flows.survey.stages.attention import load_plan
 from flows.survey.stages.effects import chosen_effects, load_manifest
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.simulated import sweep_starts
+from pipeline.simulator.instrument import BLOCK_LINES
+from pipeline.simulator.simulated import SimulatedSource, sweep_starts
 from pipeline.source import Line, Source
 from storage.archive.archive import StageRef, stage_key
 from storage.archive.manifests import write_table
 from storage.arrays.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_cube
 from storage.arrays.spool import Spool
+from storage.parallel.block_work import run_blocks
+from storage.parallel.crew import Crew
 
 RAW = Product("capture", version=4)
 RIG_RECORD = "rig.json"  # beside the cubes: what a rig's captures were like
@@ -47,23 +50,17 @@ def sweeps_wanted(
     total = sum(sweep.lines for sweep in sweeps) or 1
 
     def build(path: Path) -> None:
-        """Take the sweeps one after the other, each into a cube of its own."""
         before, manifest = 0, load_manifest(inputs[-1]) if run.source.simulates else None
         run.report(0.0)  # a rig is at work long before its first line is here
         lit = run.source.lit(chosen_effects(inputs[-1]), clock)
         with lit.opened(run.archive.spool_folder(key)) as source:
             for sweep in sweeps:
-                done = partial(_report_lines, run, before / total, total)
-                _capture_sweep(run, source, sweep, path, key=key, report=done, effects=manifest)
+                _capture_sweep(run, source, sweep, path, key=key, before=before, total=total, effects=manifest)
                 before += sweep.lines
             if source.record is not None:
                 write_table(path / RIG_RECORD, source.record)
 
     return Wanted(build, params, inputs, then=partial(run.archive.drop_spool, key))
-
-
-def _report_lines(run: CaptureRun, before: float, total: int, lines: int) -> None:
-    run.report(before + lines / total)
 
 
 def _capture_sweep(
@@ -73,7 +70,8 @@ def _capture_sweep(
     path: Path,
     *,
     key: str,
-    report: Callable[[int], None],
+    before: int,
+    total: int,
     effects: Mapping[str, Any] | None,
 ) -> None:
     """Lines into the spool and then the cube, one by one, from where a broken capture stopped.
@@ -93,15 +91,69 @@ def _capture_sweep(
         def take(line: Line) -> None:
             spool.append(line)
             cube.write([line])
-            report(spool.count)
+            run.report((before + spool.count) / total)
 
         spool.mend(source.lines_again(sweep, spool.lost))
         for block in spool.blocks():
             cube.write(block)
-        report(spool.count)
+        run.report((before + spool.count) / total)
         take_lines(source, sweep, take, run.settings.crew, first=spool.count)
 
 
 def captured(ref: StageRef) -> list[RawCube]:
     """Open the sweeps of a capture, in the order of their names."""
     return [open_raw_cube(path) for path in sorted(ref.path.glob("*.zarr"))]
+
+
+Take = Callable[[Line], None]
+
+
+def take_lines(
+    source: Source, sweep: Sweep, take: Take, crew: Crew, *, first: int = 0, at_once: int = BLOCK_LINES
+) -> None:
+    """Give ``take`` the sweep's lines one by one, in order, from line ``first`` on.
+
+    ``take`` is called in this thread while others render. Beside one block of ``at_once`` lines for each worker there
+    is one more, so that nobody waits while lines are taken. Where ``take`` raises, what was rendered ahead is lost.
+    A source that is no simulation gives its lines when it has them.
+    Neither the number of workers nor the size of blocks changes a line.
+
+    Raises
+    ------
+    What ``take`` raises; what the first block that cannot be rendered does, once the lines before it are taken.
+    """
+    workers = Crew("threads", crew.workers)  # whoever else makes blocks, for the scene lies in this process's memory
+    if workers.count == 1 or not isinstance(source, SimulatedSource):
+        for line in source.lines(sweep, first):
+            take(line)
+        return
+    blocks = [range(start, min(start + at_once, sweep.lines)) for start in range(first, sweep.lines, at_once)]
+    make = partial(_rendered, source, sweep, Semaphore(workers.count))
+    run_blocks(make, blocks, replace(workers, workers=workers.count + 1), keep=False, each=_InOrder(take, first))
+
+
+def _rendered(source: SimulatedSource, sweep: Sweep, free: Semaphore, numbers: range) -> list[Line] | Exception:
+    """Lines of one block once a worker is free, or why there are none: to be raised in their turn, not before."""
+    with free:
+        try:
+            return source.lines_of(sweep, numbers)
+        except Exception as error:
+            return error
+
+
+class _InOrder:
+    """Takes blocks as they end, and holds back those that wait for an earlier one."""
+
+    def __init__(self, take: Take, first: int) -> None:
+        self._take, self._next = take, first
+        self._waiting: dict[int, list[Line] | Exception] = {}
+
+    def __call__(self, numbers: range, made: list[Line] | Exception) -> None:
+        self._waiting[numbers.start] = made
+        while self._next in self._waiting:
+            lines = self._waiting.pop(self._next)
+            if isinstance(lines, Exception):
+                raise lines
+            for line in lines:
+                self._take(line)
+            self._next += len(lines)

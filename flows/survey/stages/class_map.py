@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.survey.field_work import FieldWork, region_params
-from flows.survey.region_work import look_at, seat_columns
+from flows.survey.field_work import FieldWork, look_at, region_params, seat_columns
 from flows.survey.run import SurveyRun
 from flows.survey.stage import Product, Wanted, stage
 from models.reading.inference import CoarseLook, Glance, read_glance

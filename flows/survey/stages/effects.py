@@ -22,6 +22,8 @@ from pipeline.simulator.effects.registry import BY_NAME, EFFECTS
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.selection.choice import Decision, decide, list_effects, sum_up
+from pipeline.simulator.selection.choice import Decision, decide
+from pipeline.simulator.selection.manifest import list_effects, sum_up
 from pipeline.simulator.selection.survey_probe import probe_survey
 from pipeline.simulator.selection.verification import candidate_blocks, verify, worst_blocks
 from pipeline.simulator.simulated import SimulatedSource, sweep_block, sweep_starts
@@ -51,8 +53,11 @@ def choose_effects(run: CaptureRun) -> Wanted:
     """
     tolerance, asked = run.settings.tol, run.settings.effects
 
+    def write(path: Path, manifest: dict[str, Any]) -> None:
+        (path / RECORD).write_text(to_json(manifest), encoding="utf-8")
+
     if not run.source.simulates:
-        return Wanted(_write_nothing, {"source": run.source.name})
+        return Wanted(lambda path: write(path, {"effects": [], "total": None}), {"source": run.source.name})
 
     def build(path: Path) -> None:
         rig = run.settings.simulated_rig
@@ -60,8 +65,7 @@ def choose_effects(run: CaptureRun) -> Wanted:
         decision = decide(probes, rig, EFFECTS, tolerance.value, asked)
         run.report(DRAFT)
         measured = _verified(run, decision, probes)
-        manifest = {"effects": list_effects(decision, measured), "total": sum_up(decision, measured)}
-        (path / RECORD).write_text(to_json(manifest), encoding="utf-8")
+        write(path, {"effects": list_effects(decision, measured), "total": sum_up(decision, measured)})
         run.report(VERIFIED)
 
     params = {
@@ -70,21 +74,12 @@ def choose_effects(run: CaptureRun) -> Wanted:
         "asked": asked,
         "tol": str(tolerance),
         "camera": asdict(run.camera),
-        "rig": rig_table(run.settings.simulated_rig),
+        "rig": {
+            name: plain_value(part) for name, part in asdict(run.settings.simulated_rig).items() if name != "camera"
+        },
         "sweeps": [asdict(sweep) for sweep in run.planned],
     }
     return Wanted(build, params)
-
-
-def _write_nothing(path: Path) -> None:
-    """The manifest of a rig, of which nothing is simulated."""
-    (path / RECORD).write_text(to_json({"effects": [], "total": None}), encoding="utf-8")
-
-
-def rig_table(rig: Rig) -> dict[str, Any]:
-    """What a rig is like beyond its camera, as plain tables."""
-    table = {name: plain_value(part) for name, part in asdict(rig).items()}
-    return {name: part for name, part in table.items() if name != "camera"}
 
 
 def load_manifest(effects: StageRef) -> dict[str, Any]:
@@ -134,7 +129,11 @@ def _verified(run: CaptureRun, decision: Decision, probes: Sequence[Probe]) -> d
         run.report(DRAFT + (VERIFIED - DRAFT) * renders / (renders + len(EFFECTS)))  # how many there will be is open
         return expected_light(scene, block, chosen)
 
-    whole = _whole_sweeps(run)
+    clock = sweep_starts(run.planned, run.camera, run.settings.cost)
+    whole = [  # every sweep as one block, each after those before it
+        sweep_block(scene, rig, sweep, range(sweep.lines), seed=run.settings.seed, started_s=clock[sweep.name])
+        for sweep in run.planned
+    ]
     candidates = [
         block
         for probe in probes
@@ -142,12 +141,3 @@ def _verified(run: CaptureRun, decision: Decision, probes: Sequence[Probe]) -> d
     ]
     worst = worst_blocks(candidates, lambda block: expected_light(scene, block, LOOK), units)
     return verify(decision, render, worst, units)
-
-
-def _whole_sweeps(run: CaptureRun) -> list[SweepBlock]:
-    """Every sweep as one block, each after those before it."""
-    scene, rig, clock = run.scene, run.settings.simulated_rig, sweep_starts(run.planned, run.camera, run.settings.cost)
-    return [
-        sweep_block(scene, rig, sweep, range(sweep.lines), seed=run.settings.seed, started_s=clock[sweep.name])
-        for sweep in run.planned
-    ]

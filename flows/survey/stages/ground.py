@@ -15,6 +15,8 @@ from pipeline.ground.view import GroundView
 from storage.archive.archive import StageRef
 from storage.arrays.class_maps import ClassMap, ClassNames, load_class_map
 from storage.arrays.ground_maps import BLOCK, GroundMapWriter
+from storage.arrays.class_maps import load_class_map
+from storage.arrays.ground_maps import BLOCK, ClassNames, GroundMapWriter
 from storage.arrays.layout import SHARD_ROWS, open_group, read_array, read_bands
 from storage.arrays.quicklooks import choose_bands, develop, stretch
 
@@ -35,8 +37,14 @@ def ground(run: SurveyRun, class_map: StageRef, mosaic: StageRef) -> Wanted | No
         colours = coarse_colours(mosaic)
         about = {"rig_pose": asdict(grid.frame.view.pose), "scene_pixels": grid.counts()}
         writer = GroundMapWriter(path / STORE, grid.geobox, ClassNames(found.names, found.colours), about=about)
-        for rows, columns in map_blocks(grid.shape, BLOCK):
-            writer.write_block(rows, columns, *_draw_block(grid, found, colours, run.grid.factor, (rows, columns)))
+        for rows, columns in map_blocks(grid.shape, BLOCK):  # what is not seen is 255, NaN and 0
+            pixels = grid.scene_pixels(rows, columns)
+            classes, confidence = (
+                classes_at(found.classes, pixels),
+                image_at(found.confidence[..., None], pixels)[..., 0],
+            )
+            picture = np.nan_to_num(np.rint(image_at(colours, pixels, factor=run.grid.factor))).astype(np.uint8)
+            writer.write_block(rows, columns, classes, confidence, picture)
             run.report(rows.stop / grid.shape[0])
         writer.finish(grid.class_areas_m2(found.classes, len(found.names)))
 
@@ -69,13 +77,3 @@ def coarse_colours(mosaic: StageRef) -> NDArray[np.float32]:
     tones = develop(values, values) if words.startswith("true colour") else stretch(values)
     picture: NDArray[np.float32] = np.where(np.isfinite(values), 1 + 254 * tones, np.nan).astype(np.float32)
     return picture
-
-
-def _draw_block(
-    grid: GroundGrid, found: ClassMap, colours: NDArray[np.float32], factor: int, place: tuple[slice, slice]
-) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint8]]:
-    """Classes (nearest), confidence and picture (bilinear) of one block of the map; what is not seen is 255, NaN, 0."""
-    pixels = grid.scene_pixels(*place)
-    confidence = image_at(found.confidence[..., None], pixels)[..., 0]
-    picture = image_at(colours, pixels, factor=factor)
-    return classes_at(found.classes, pixels), confidence, np.nan_to_num(np.rint(picture)).astype(np.uint8)

@@ -71,7 +71,6 @@ def rectify(run: SurveyRun, raw: StageRef, lookup: StageRef, *registration: Stag
     """Bring the coarse sweeps onto the scene grid and blend them into one mosaic, tile by tile."""
 
     def build(path: Path) -> None:
-        """Make the tiles, and the picture."""
         grid = PixelGrid.of_scene(run.grid, run.grid.factor)
         recipe = MosaicRecipe(
             raw.path,
@@ -104,8 +103,10 @@ def cut_patches(run: SurveyRun, attention: StageRef, raw: StageRef, *registratio
     """Bring every chosen seat onto the scene grid, one patch a seat; NaN where a mirror off the plan did not look."""
 
     def build(path: Path) -> None:
-        """Read the seats in the order in which lines show them."""
-        ordered = _along_scan(run, load_plan(attention).seats)
+        seats = load_plan(attention).seats
+        row, column = np.divmod(seats, run.grid.seat_shape[1])
+        # as the sweeps pass them, so that a few of them need few lines at a time
+        ordered = seats[np.lexsort((column, row) if run.plan.along == "x" else (row, column))]
         writer = PatchWriter(
             path / "patches.zarr",
             ordered,
@@ -133,14 +134,7 @@ def seen_shares(run: SurveyRun, patches: StageRef) -> NDArray[np.float64]:
     return seen / run.grid.valid_share().ravel()[store.seats]
 
 
-def _along_scan(run: SurveyRun, seats: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Seats in the order in which the sweeps pass them, so that a few of them need few lines at a time."""
-    row, column = np.divmod(seats, run.grid.seat_shape[1])
-    return seats[np.lexsort((column, row) if run.plan.along == "x" else (row, column))]
-
-
 def _only(registration: Sequence[StageRef]) -> StageRef | None:
-    """The registration where there is one."""
     if len(registration) > 1:
         raise ShapeError(f"expected one registration or none, got {len(registration)}")
     return registration[0] if registration else None

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flows.survey.run import SurveyRun
 from flows.survey.stage import Product, Wanted, stage
@@ -111,34 +110,25 @@ def register_fine(run: SurveyRun, raw: StageRef, mosaic: StageRef) -> Wanted | N
         return None
 
     def build(path: Path) -> None:
-        """Find each fine sweep by what the mosaic shows under it."""
         sweeps = sighted(run, raw, None)
         anchors: list[Anchor] = []
         values = load_mosaic(mosaic.path / "mosaic.zarr").values if sweeps else np.empty((0, 0, 0), np.float32)
         for number, one in enumerate(sweeps):
-            under = _broad_mean(values, broad_bands(one.cube.references))
+            under = np.asarray(values[..., broad_bands(one.cube.references)].mean(axis=-1), np.float32)
             broad = BroadSweep.read(one.cube, run.camera, usable=one.usable)
             anchors.append(anchor_sweep(broad, run.camera, run.grid, under, prior_px=2 * prior))
             run.report((number + 1) / len(sweeps))
-        write_table(path / RECORD, _anchors_record(anchors))
+        record = {
+            "method": "mosaic",
+            "reference": "the coarse mosaic",
+            "sweeps": {one.shift.name: _shift_record(one.shift) | {"gain": None} for one in anchors},
+            "untied": [one.shift.name for one in anchors if one.found.status != "found"],
+            "narrow": [],
+            "windows": [{"moving": one.shift.name, "status": one.found.status} for one in anchors],
+        }
+        write_table(path / RECORD, record)
 
     return Wanted(build, {"prior_px": prior, "pass": "fine", "grid": asdict(run.grid)}, [raw, mosaic])
-
-
-def _broad_mean(values: NDArray[np.float32], bands: NDArray[np.intp]) -> NDArray[np.float32]:
-    mean: NDArray[np.float32] = values[..., bands].mean(axis=-1)
-    return mean
-
-
-def _anchors_record(anchors: Sequence[Anchor]) -> dict[str, Any]:
-    return {
-        "method": "mosaic",
-        "reference": "the coarse mosaic",
-        "sweeps": {one.shift.name: _shift_record(one.shift) | {"gain": None} for one in anchors},
-        "untied": [one.shift.name for one in anchors if one.found.status != "found"],
-        "narrow": [],
-        "windows": [{"moving": one.shift.name, "status": one.found.status} for one in anchors],
-    }
 
 
 def load_registration(registration: StageRef) -> dict[str, Any]:

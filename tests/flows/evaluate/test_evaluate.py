@@ -13,17 +13,15 @@ from rich.console import Console
 
 from flows.cli.main import main
 from flows.evaluate import work as benchmark_work
-from flows.evaluate.command import evaluate_weights, run_evaluate
-from flows.evaluate.costs import Prices
-from flows.evaluate.files import ends
+from flows.evaluate.command import ends, evaluate_weights, run_evaluate
+from flows.evaluate.costs import Prices, cpu_seconds, row_seconds
 from flows.evaluate.frames import open_candidates
-from flows.evaluate.kept_results import KeptResults
 from flows.evaluate.request import EvaluateRequest
 from flows.evaluate.rows import ORACLE, Trial, captured_px, judge_frame, placings
 from flows.evaluate.series import collect_row
 from flows.evaluate.summary import summarise
 from flows.evaluate.table import print_evaluation
-from flows.evaluate.timing import Rounds, cpu_seconds, row_seconds
+from flows.evaluate.work import KeptResults
 from flows.training.data import farm_test_data, pack_mask
 from flows.training.train import TrainRequest, train_weights
 from models.evaluation.metrics import average_accuracy, kappa, mean_iou, overall_accuracy
@@ -34,13 +32,10 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.effects.registry import USUAL
 from pipeline.simulator.scenes.farm.farm_plan import CLASSES
 from tests.flows.small_fields import FRAMES, QUICK, looked_at, scene_at, write_field, write_weights
+from pipeline.simulator.instrument import USUAL
+from pipeline.simulator.scenes.farm.canvas import CLASSES
+from tests.flows.small_fields import FRAMES, QUICK, looked_at, scene_at, write_weights
 from tests.models.conftest import make_weights
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of three small frames."""
-    return write_field(tmp_path_factory.mktemp("evaluate") / "field")
 
 
 @pytest.fixture(scope="module")
@@ -389,7 +384,7 @@ def test_everything_timed_goes_in_turn():
     """Whatever slows the machine for a while meets all parts alike; rounds of warming up are not counted."""
     went: list[str] = []
     works = {("segment", name): lambda name=name: went.append(name) for name in ("a", "b")}  # type: ignore[misc]
-    taken = cpu_seconds(works, Rounds(counted=2, warm_up=1))
+    taken = cpu_seconds(works, 2, warm_up=1)
     assert went == ["a", "b"] * 3
     assert all(seconds >= 0 for seconds in taken.values())
 

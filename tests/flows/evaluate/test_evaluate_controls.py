@@ -12,24 +12,18 @@ import pytest
 from rich.console import Console
 
 from flows.evaluate.command import evaluate_weights, run_evaluate
-from flows.evaluate.controls import open_controls
 from flows.evaluate.frames import open_candidates
-from flows.evaluate.plot import evaluation_figure
+from flows.evaluate.plots import evaluation_figure
 from flows.evaluate.request import EvaluateRequest
+from flows.evaluate.rows import open_controls
 from flows.evaluate.series import Row
 from flows.evaluate.summary import choose_baseline
 from models.weights.files import save_weights
 from pipeline.errors import SceneError, SettingsError
-from tests.flows.small_fields import FRAMES, QUICK, scene_at, write_field, write_weights
+from tests.flows.small_fields import FRAMES, QUICK, scene_at, write_weights
 from tests.models.conftest import make_any_weights
 
 DESIGNS = ("paper", "dense", "upsampled", "coarser")
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of three small frames."""
-    return write_field(tmp_path_factory.mktemp("controls") / "field")
 
 
 @pytest.fixture(scope="module")

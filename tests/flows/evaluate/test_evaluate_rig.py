@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from flows.evaluate.budget_table import budget_tables
-from flows.evaluate.budgets import summarise_equal_time, summarise_rig
 from flows.evaluate.costs import plan_seconds
-from flows.evaluate.equal_time import camera_of_equal_time, judge_equal_time
 from flows.evaluate.frames import Look
-from flows.evaluate.rig_plans import BUDGETS, judge_rig
-from flows.evaluate.rig_plot import rig_figure
+from flows.evaluate.plots import rig_figure
+from flows.evaluate.rig_plans import BUDGETS, camera_of_equal_time, judge_equal_time, judge_rig
 from flows.evaluate.rows import Trial, judge_frame
+from flows.evaluate.summary import summarise_equal_time, summarise_rig
+from flows.evaluate.table import budget_tables
 from models.evaluation.metrics import mean_iou
 from models.weights.files import Weights
 from pipeline.geometry.camera import LineCamera

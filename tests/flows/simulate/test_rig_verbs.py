@@ -181,15 +181,6 @@ def test_usage_errors(command_line: CommandLine, words: tuple[str, ...]) -> None
     assert len(ended.errors) == 1
 
 
-def test_unknown_key_of_the_rig_is_refused(command_line: CommandLine, tmp_path: Path) -> None:
-    """With the nearest that there is."""
-    file = tmp_path / "field.toml"
-    file.write_text('[rig]\nprot = "/dev/ttyACM0"\n')
-    ended = command_line("rig", "check", file)
-    assert ended.code == 2
-    assert "rig.port" in ended.errors[0]
-
-
 def test_faults_are_listed(command_line: CommandLine) -> None:
     """All of both devices, for people and programs."""
     ended = command_line("rig", "emulate", "--faults", "list", "--json")

@@ -14,8 +14,6 @@ import xarray as xr
 from rich.console import Console
 
 from flows.publish.effect_table import print_effects
-from flows.survey.stages import effects as effect_choice
-from pipeline.errors import BoundError
 from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource
@@ -111,9 +109,6 @@ def test_a_broken_scan_goes_on_where_it_was(
     ("flags", "message"),
     [
         (["--effects", "smear,turbulance"], "--effects: unknown effect 'turbulance'; did you mean 'turbulence'?"),
-        (["--effects", "auto,smear"], "--effects: 'auto' stands alone, got 'auto,smear'"),
-        (["--effects", "throughput"], "--effects: the effect 'throughput' is now called 'vignetting'"),
-        (["--tol", "-1"], "--tol must be 0 or more"),
         (["--workers", "0"], "--workers must be"),
         (["--size", "64x64"], "size is for built-in scenes"),
     ],
@@ -127,20 +122,6 @@ def test_wrong_words_are_refused(
     assert message in ended.err
     assert len(ended.errors) == 1
     assert not (tmp_path / "none").exists()
-
-
-def test_a_broken_bound_is_one_message(
-    command_line: Any, scene_files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """With what to do about it, and exit code 1."""
-
-    def broken(*_: object) -> None:
-        raise BoundError("smile: what was left out changes light by 3; simulate with --tol 0")
-
-    monkeypatch.setattr(effect_choice, "_verified", broken)
-    ended = command_line(*words(scene_files, tmp_path))
-    assert ended.code == 1
-    assert ended.errors == ["smile: what was left out changes light by 3; simulate with --tol 0"]
 
 
 def test_a_file_with_gaps_is_refused_with_the_first(command_line: Any, tmp_path: Path) -> None:
@@ -165,34 +146,13 @@ def test_a_scene_of_one_band_is_simulated(command_line: Any, tmp_path: Path) -> 
     assert (rows["smile"]["reason"], rows["smear"]["state"]) == ("absent", "on")
 
 
-ROW = {
-    "name": "smile",
-    "state": "on",
-    "variant": "cubic",
-    "bound": 0.0,
-    "measured": None,
-    "cost_s": 0.004,
-    "why": "",
-    "reason": "needed",
-    "left_out": 1.4,
-    "magnitude": "smile: 0.3 nm",
-    "unit": "sigma",
-}
-TOTAL = {
-    "asked": "auto",
-    "tolerance": 0.1,
-    "unit": "sigma",
-    "bound": 0.0,
-    "measured": 0.0,
-    "within": True,
-    "on": 1,
-    "off": 1,
-    "saved_s": 1.0,
-    "saved_cheap_s": 0.5,
-}
+ROW = {"name": "smile", "state": "on", "variant": "cubic", "bound": 0.0, "measured": None, "cost_s": 0.004, "why": ""}
+ROW |= {"reason": "needed", "left_out": 1.4, "magnitude": "smile: 0.3 nm", "unit": "sigma"}
+TOTAL = {"asked": "auto", "tolerance": 0.1, "unit": "sigma", "bound": 0.0, "measured": 0.0, "within": True}
+TOTAL |= {"on": 1, "off": 1, "saved_s": 1.0, "saved_cheap_s": 0.5}
 
 
-@pytest.mark.parametrize("width", [72, 80, 100, 120])
+@pytest.mark.parametrize("width", [72, 99, 100])
 def test_the_table_fits_the_terminal(width: int) -> None:
     """Figures are never broken; words stand in the table where there is room, else below it."""
     said = io.StringIO()

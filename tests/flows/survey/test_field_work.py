@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from flows.settings.load import load_settings
-from flows.survey.field_work import SHARD, FieldWork, region_params
-from flows.survey.region_work import Scoring, WeightsFile
+from flows.survey.field_work import SHARD, FieldWork, Scoring, WeightsFile, region_params
 from flows.survey.run import SurveyRun, open_run
 from models.reading.regions import Region, plan_regions
 from pipeline.errors import SettingsError, WeightsError
@@ -28,11 +27,11 @@ ALL_CELLS = 3  # a halo that reaches over the whole field
 
 @pytest.fixture(scope="module")
 def surveyed(
-    tmp_path_factory: pytest.TempPathFactory, survey_png: Survey, scene_files: Path, weights: Path
+    tmp_path_factory: pytest.TempPathFactory, surveyed_png: Survey, scene_files: Path, weights: Path
 ) -> tuple[SurveyRun, Path]:
     """A survey of scene.png, and the folder of its stages."""
     out = tmp_path_factory.mktemp("field") / "archive"
-    survey_png(out)
+    surveyed_png(out)
     flags = {"scene": str(scene_files / "scene.png"), "weights": str(weights), "out": str(out), "budget": "0.8"}
     return open_run(load_settings(None, flags)), out / "stages"
 
@@ -118,7 +117,7 @@ def test_a_worker_at_regions_keeps_no_tiles(
     """What it held for the mosaic is given back before a region is read: the memory was promised once."""
     run, stages = surveyed
     let_go: list[bool] = []
-    monkeypatch.setattr("flows.survey.region_work.let_tiles_go", lambda: let_go.append(True))
+    monkeypatch.setattr("flows.survey.field_work.let_tiles_go", lambda: let_go.append(True))
     work = _work(run, Crew(workers=1), 1)
     work.score("entropy", _store(stages, "rectify/*/mosaic.zarr"), lambda done: None)
     assert len(let_go) == 2
@@ -133,9 +132,9 @@ def test_too_little_memory_is_refused_before_the_work(
     """The message says what a region takes and the least memory that does, and that much is enough."""
     work = replace(FieldWork.of(surveyed[0]), crew=crew, memory=300 * 2**20)
     with pytest.raises(SettingsError, match=rf"exceeds --memory 300 MiB: .*96 x 128 px.*{words}") as refused:
-        work.check_memory(np.arange(192), 3)
+        work.crew_for(np.arange(192), 3)
     least = int(str(refused.value).split("--memory")[-1].split()[0])
-    replace(work, memory=least * 2**20).check_memory(np.arange(192), 3)
+    replace(work, memory=least * 2**20).crew_for(np.arange(192), 3)
 
 
 def test_no_more_regions_at_a_time_than_memory_holds(surveyed: tuple[SurveyRun, Path]) -> None:

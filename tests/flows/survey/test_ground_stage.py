@@ -16,6 +16,7 @@ from flows.survey.run import SurveyRun
 from flows.survey.stages.ground import STORE, coarse_colours, ground, survey_grid
 from pipeline.errors import PoseError
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
+from pipeline.ground.map_grid import GroundGrid
 from pipeline.ground.view import RigPose, pixel_places
 from storage.archive.archive import Archive, StageRef
 from storage.arrays.class_maps import ClassMap, write_class_map
@@ -79,25 +80,29 @@ def stores(tmp_path: Path) -> tuple[StageRef, StageRef]:
     return StageRef("segment", "m", tmp_path / "map"), StageRef("rectify", "r", tmp_path / "mosaic")
 
 
-def draw(run: Run, stores: tuple[StageRef, StageRef]) -> StageRef | None:
+def draw(run: Run, stores: tuple[StageRef, StageRef]) -> StageRef:
     """Run the stage as an engine would."""
-    wanted = ground(run, *stores)
-    return None if wanted is None else ground.produce(run.archive, wanted)[0]
+    return ground.produce(run.archive, ground.needed(run, *stores))[0]
+
+
+def grid_of(run: Run) -> GroundGrid:
+    """The map's grid."""
+    grid = survey_grid(cast("SurveyRun", run))
+    assert grid is not None
+    return grid
 
 
 def test_without_a_pose_there_is_no_ground(run: Run, stores: tuple[StageRef, StageRef]) -> None:
     """Nothing is written, nothing is looked at."""
-    assert draw(replace(run, settings=Settings()), stores) is None
+    assert ground(replace(run, settings=Settings()), *stores) is None
     assert run.archive.refs() == []
 
 
 def test_the_map_shows_the_class_map_where_the_rays_end(run: Run, stores: tuple[StageRef, StageRef]) -> None:
     """Every scene pixel's class is found again on the map at the place where its ray meets the ground."""
     ref = draw(run, stores)
-    assert ref is not None
     found = load_ground_map(ref.path / STORE)
-    grid = survey_grid(cast("SurveyRun", run))
-    assert grid is not None
+    grid = grid_of(run)
     y, x = pixel_places(SHAPE)
     points = np.stack(np.meshgrid(y[10:-10:9], x[10:-10:9], indexing="ij"), axis=-1).reshape(-1, 2)
     places = grid.frame.ground_to_map(grid.frame.view.scene_to_ground(points))
@@ -112,10 +117,8 @@ def test_the_map_shows_the_class_map_where_the_rays_end(run: Run, stores: tuple[
 def test_hectares_are_those_of_the_pixels_footprints(run: Run, stores: tuple[StageRef, StageRef]) -> None:
     """Each class's area is the sum of its scene pixels' footprints, whatever the map's resolution."""
     ref = draw(replace(run, settings=Settings(pose=POSE, map=MapChoice(resolution_m=0.02))), stores)
-    assert ref is not None
     areas = load_ground_map(ref.path / STORE).areas
-    grid = survey_grid(cast("SurveyRun", run))
-    assert grid is not None
+    grid = grid_of(run)
     exact = grid.frame.view.area_m2(np.stack(np.meshgrid(*pixel_places(SHAPE), indexing="ij"), axis=-1))
     assert areas["weed"]["m2"] == pytest.approx(exact[:, :80].sum(), rel=1e-12)
     assert areas["crop"]["m2"] == pytest.approx(exact[30:, 80:].sum(), rel=1e-12)
@@ -125,7 +128,6 @@ def test_hectares_are_those_of_the_pixels_footprints(run: Run, stores: tuple[Sta
 def test_the_picture_brightens_towards_the_rig(run: Run, stores: tuple[StageRef, StageRef]) -> None:
     """The coarse mosaic's ramp lies on the ground, 1 to 255 where seen, 0 where neither rays nor light were."""
     ref = draw(run, stores)
-    assert ref is not None
     found = load_ground_map(ref.path / STORE)
     tones = coarse_colours(stores[1])
     assert np.nanmin(tones) >= 1
@@ -147,7 +149,7 @@ def test_the_key_follows_pose_and_map(run: Run, stores: tuple[StageRef, StageRef
         run.settings,
     ]
     refs = [draw(replace(run, settings=settings), stores) for settings in changed]
-    keys = [ref.key for ref in refs if ref is not None]
+    keys = [ref.key for ref in refs]
     assert keys[0] == keys[3]
     assert len(set(keys)) == 3
 
@@ -155,7 +157,6 @@ def test_the_key_follows_pose_and_map(run: Run, stores: tuple[StageRef, StageRef
 def test_the_store_says_where_it_was_seen_from(run: Run, stores: tuple[StageRef, StageRef]) -> None:
     """Plain xarray reads pose, counts of pixels and the CRS asked for."""
     ref = draw(replace(run, settings=Settings(pose=POSE, map=MapChoice(epsg=25832))), stores)
-    assert ref is not None
     with xr.open_zarr(ref.path / STORE, consolidated=False) as content:
         assert content.attrs["proj:code"] == "EPSG:25832"
         assert content.attrs["rig_pose"]["tilt_deg"] == 50.0

@@ -41,7 +41,7 @@ def map_of(archive: Archive, published: Published) -> NDArray[np.uint8]:
 
 
 def test_a_rerun_makes_nothing_and_moves_next_to_nothing(
-    bucket: str, survey_png: Survey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    bucket: str, survey_png: Survey, surveyed_png: Survey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The map is that of a folder; here, and on a machine that has nothing yet, a rerun finds every stage."""
     opened: list[Objects] = []
@@ -49,7 +49,7 @@ def test_a_rerun_makes_nothing_and_moves_next_to_nothing(
     monkeypatch.setattr(Objects, "__init__", lambda self, *given: (start(self, *given), opened.append(self))[0])
     first = survey_png(bucket)
     stored = sum(open_archive(bucket).stored_bytes(ref) for ref in open_archive(bucket).refs())
-    beside = map_of(open_archive(tmp_path / "folder"), survey_png(tmp_path / "folder"))
+    beside = map_of(open_archive(tmp_path / "folder"), surveyed_png(tmp_path / "folder"))
     np.testing.assert_array_equal(map_of(open_archive(bucket), first), beside)
     opened.clear()
     again = survey_png(bucket)

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flows.survey.full_look import columns_of_all_seats
 from flows.survey.run import SHIPPED
+from flows.survey.stages.accuracy import columns_of_all_seats
 from models.evaluation.metrics import mean_iou
 from models.policies.free_seats import Controls, run_controls
 from models.reading.inference import glance

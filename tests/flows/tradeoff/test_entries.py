@@ -1,4 +1,4 @@
-"""The entries of the trade-offs: their errors are those known of rectification and planning."""
+"""The entries of the trade-offs: their errors are those known of rectification, planning, segmenting and storing."""
 
 from __future__ import annotations
 
@@ -7,30 +7,53 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
-from flows.tradeoff import budget as tradeoff_budget
-from flows.tradeoff import store as tradeoff_store
-from flows.tradeoff.entries import measure_tradeoff
-from flows.tradeoff.line_model import LINE_MODEL
-from flows.tradeoff.overlap import OVERLAP, Seams
-from flows.tradeoff.resample import RESAMPLE, draw_waves, noise_levels
-from flows.tradeoff.scan_step import SCAN_STEP
-from flows.tradeoff.store import BITS, CODEC, SIZE
-from flows.tradeoff.tie_spacing import TIE_SPACING
+from flows.tradeoff import farm as tradeoff_farm
+from flows.tradeoff.entries import find_tradeoffs, measure_tradeoff
+from flows.tradeoff.farm import (
+    AGREEMENT,
+    BAND_COUNT,
+    BANDS,
+    BITS,
+    BUDGET,
+    CODEC,
+    PRECISION,
+    PRECISIONS,
+    SEATS,
+    SHARES,
+    SIZE,
+    Farm,
+)
+from flows.tradeoff.rectify import (
+    LINE_MODEL,
+    OVERLAP,
+    PERIODS_PX,
+    RESAMPLE,
+    SCAN_STEP,
+    TIE_SPACING,
+    Seams,
+    draw_waves,
+    noise_levels,
+)
+from models.network.segmenter import Segmenter, SegmenterConfig
+from models.network.spectral import Normalisation, SpectralBasis
+from models.weights.files import Weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel
 from pipeline.planning.coverage import cheapest_full
 from pipeline.rectify.registration.shifts import PairShift
+from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 
 
 def test_waves_are_what_they_claim():
     """The analytic scene holds periods of 4 to 40 px only and is the same for the same seed."""
-    waves = draw_waves(3)
+    waves = draw_waves(3, 64, PERIODS_PX)
     period = 1 / np.hypot(*waves.frequency.T)
     assert period.min() >= 4
     assert period.max() <= 40
-    np.testing.assert_array_equal(waves.at(np.ones((1, 2))), draw_waves(3).at(np.ones((1, 2))))
+    np.testing.assert_array_equal(waves.at(np.ones((1, 2))), draw_waves(3, 64, PERIODS_PX).at(np.ones((1, 2))))
 
 
 def test_noise_levels_follow_the_camera():
@@ -93,8 +116,8 @@ def test_fewer_lines_take_less_time_and_show_less():
 
 def test_a_larger_budget_takes_more_seconds_and_draws_a_better_map(monkeypatch):
     """Coarse and fine seconds together keep the budget and nearly use it up; the error is that of the class map."""
-    monkeypatch.setattr(tradeoff_budget, "SHAPE", (256, 640))
-    half, whole = measure_tradeoff(replace(tradeoff_budget.BUDGET, settings=(0.6, 1.0)), repeats=1).points
+    monkeypatch.setattr(tradeoff_farm, "BUDGET_SHAPE", (256, 640))
+    half, whole = measure_tradeoff(replace(BUDGET, settings=(0.6, 1.0)), repeats=1).points
     *_, full_s = cheapest_full(SceneGrid(256, 640, 16, 4), LineCamera(), CostModel())
     assert 0.55 < half.price_s / full_s <= 0.6
     assert 0.95 < whole.price_s / full_s <= 1.0
@@ -103,7 +126,7 @@ def test_a_larger_budget_takes_more_seconds_and_draws_a_better_map(monkeypatch):
 
 def test_fewer_bits_are_smaller_and_change_more_of_the_map(monkeypatch):
     """Kept bits of the mosaic: at eleven hardly a class changes, at three many do, in fewer bytes."""
-    monkeypatch.setattr(tradeoff_store, "SHAPE", (128, 192))
+    monkeypatch.setattr(tradeoff_farm, "STORE_SHAPE", (128, 192))
     state = BITS.prepare(0)
     judged = {kept: BITS.judge(state, kept, BITS.run(state, kept)) for kept in (23.0, 11.0, 3.0)}
     sizes = {kept: SIZE.judge(state, kept, SIZE.run(state, kept)) for kept in judged}
@@ -114,8 +137,77 @@ def test_fewer_bits_are_smaller_and_change_more_of_the_map(monkeypatch):
 
 def test_codecs_give_back_raw_lines_in_fewer_bytes(monkeypatch):
     """Every codec but none stores a sample of uint16 in less than two bytes."""
-    monkeypatch.setattr(tradeoff_store, "SHAPE", (128, 192))
+    monkeypatch.setattr(tradeoff_farm, "STORE_SHAPE", (128, 192))
     state = CODEC.prepare(0)
     sizes = {codec: CODEC.judge(state, codec, CODEC.run(state, codec)) for codec in CODEC.settings}
     assert all(size < 2 for codec, size in sizes.items() if codec != "none")
     assert sizes["zstd-3"] < sizes["lz4-5"] < sizes["none"]
+
+
+SHAPE = (128, 192)
+
+
+@pytest.fixture(scope="module")
+def farm() -> Farm:
+    """A small farm, looked at coarsely and finely."""
+    scene = farm_scene(0, shape=SHAPE)
+    sizes = {"patch": 16, "factor": 4, "width": 8, "coarse_width": 8, "dim": 16, "layers": 1, "heads": 2}
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        model = Segmenter(SegmenterConfig(len(scene.class_names), **sizes)).eval()
+        for parameter in model.parameters():
+            if not parameter.any():
+                torch.nn.init.normal_(parameter, std=0.3)
+    flat = Normalisation(np.full(24, 0.3, np.float32), np.full(24, 0.1, np.float32), np.eye(24, dtype=np.float32))
+    basis = SpectralBasis.spanning(scene.wavelength_nm)
+    weights = Weights(model, basis, flat, scene.class_names, np.asarray(scene.class_colours))
+    kept: list[bool] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tradeoff_farm, "keep_freed_memory", lambda: kept.append(True))
+        patch.setattr(tradeoff_farm, "load_weights", lambda path: weights)
+        patch.setattr(tradeoff_farm, "SEGMENT_SHAPE", SHAPE)
+        prepared: Farm = SEATS.prepare(0)
+    assert kept == [True]  # as surveys do
+    return prepared
+
+
+def errors(farm: Farm, number: int) -> dict[object, float]:
+    """Disagreement of every setting of one knob with the map of everything."""
+    entry = AGREEMENT[number]
+    return {setting: entry.judge(farm, setting, entry.run(farm, setting)) for setting in entry.settings}
+
+
+def test_the_stage_has_its_knobs_against_labels_and_against_everything():
+    """Seats, precision and bands are registered with both errors, the reference's setting first."""
+    assert find_tradeoffs("segment") == (SEATS, PRECISION, BAND_COUNT, *AGREEMENT)
+    assert (SHARES[0], PRECISIONS[0], BANDS[0]) == (1.0, "float32", 270.0)
+
+
+def test_every_seat_is_the_reference_and_fewer_are_not(farm: Farm):
+    """Nothing differs with all seats; with none the map differs most."""
+    found = errors(farm, 0)
+    assert found[1.0] == 0
+    assert 0 < found[0.35] < found[0.0] == max(found.values())
+
+
+def test_half_precision_agrees_nearly_everywhere(farm: Farm):
+    """At most half a percent of the classes change."""
+    found = errors(farm, 1)
+    assert found["float32"] == 0
+    assert 0 <= found["bfloat16"] <= 0.005
+
+
+def test_all_bands_are_the_reference_and_few_differ_most(farm: Farm):
+    """The same pixels in fewer bands change more of the map."""
+    found = errors(farm, 2)
+    assert found[270.0] == 0
+    assert found[90.0] < found[4.0]
+
+
+def test_levels_are_those_of_the_reference_and_of_noise(farm: Farm):
+    """The map of everything captured again differs, and both errs against the labels as they are."""
+    (noise,) = AGREEMENT[0].levels(farm)
+    everything, again = SEATS.levels(farm)
+    assert 0 < noise.error < 0.5
+    assert everything.error == SEATS.judge(farm, 1.0, SEATS.run(farm, 1.0))
+    assert 0 < again.error < 1

@@ -1,7 +1,8 @@
-"""Raw lines lie in an archive once, and pictures of them are drawn without reading them again."""
+"""What a survey leaves in an archive: raw lines once, the same stores by processes, and after lines were lost."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import shutil
 from collections.abc import Iterator
@@ -16,19 +17,24 @@ from rich.console import Console
 from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
+from pipeline.errors import RigError
+from pipeline.source import Line
 from storage.archive.archive import Archive
 from storage.arrays.cubes import RawCube, open_raw_cube
 from storage.arrays.quicklooks import pictures_of
+from storage.arrays.spool import Spool
+from tests.conftest import Survey
+from tests.storage.small_archive import flip
 
 
 @pytest.fixture(scope="module")
 def surveyed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Published]:
     """An archive with one survey, which nobody changes, and what it published."""
     root = tmp_path_factory.mktemp("raw") / "archive"
-    return root, _survey(root)
+    return root, _survey_farm(root)
 
 
-def _survey(root: Path) -> Published:
+def _survey_farm(root: Path) -> Published:
     """A small farm in as many bands as light with a spectrum needs."""
     flags = {
         "scene": "farm",
@@ -108,6 +114,57 @@ def test_the_picture_of_raw_lines_reads_no_raw_line(copied: Path, monkeypatch: p
 
     monkeypatch.setattr(RawCube, "read", read)
     monkeypatch.setattr(RawCube, "read_window", read)
-    assert (_survey(copied).folder / "quicklook.png").stat().st_size > 10_000
+    assert (_survey_farm(copied).folder / "quicklook.png").stat().st_size > 10_000
     stores = [ref.path for stage in ("capture", "rectify") for ref in Archive.open(copied).refs(stage)]
     assert all(pictures_of(store) for store in stores)
+
+
+BROKEN_AT = 21
+
+
+def test_lost_lines_are_rendered_again(
+    survey_png: Any, surveyed_png: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Bits flip in index, header and numbers: verify tells of it, and the same command ends with the same stores."""
+    surveyed_png(tmp_path / "whole")
+    append, appended = Spool.append, [0]
+
+    def breaks(spool: Spool, line: Line) -> None:
+        append(spool, line)
+        appended[0] += 1
+        if appended[0] == BROKEN_AT:
+            raise RigError("unplugged")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Spool, "append", breaks)
+        with pytest.raises(RigError, match="unplugged"):
+            survey_png(tmp_path / "broken")
+    (index,) = (tmp_path / "broken" / "spool").glob("*/*.index")
+    numbers = index.with_suffix(".bil")
+    ends = [at for at, byte in enumerate(index.read_bytes()) if byte == ord("\n")]
+    for path, at in ((index, 40), (index, ends[3] - 30), (index, ends[9]), (numbers, numbers.stat().st_size // 2)):
+        flip(path, at)
+    told = [one for one in Archive.open(tmp_path / "broken").verify_all() if one.problem is not None]
+    assert {(one.uri, one.kind) for one in told} == {(f"spool/{index.parent.name}", "growing")}
+    survey_png(tmp_path / "broken")
+    before, after = (Archive.open(tmp_path / name) for name in ("whole", "broken"))
+    assert [ref.uri for ref in after.refs()] == [ref.uri for ref in before.refs()]
+    for ref in before.refs("capture"):
+        assert after.manifest(after.ref("capture", ref.key))["files"] == before.manifest(ref)["files"]
+    assert {one.kind for one in after.verify_all()} == {"whole"}
+
+
+def test_processes_make_the_same_archive(tmp_path: Path, survey_png: Survey, surveyed_png: Survey) -> None:
+    """A whole survey by two processes publishes the same keys and the same bytes as one by threads."""
+    roots = tmp_path / "threads", tmp_path / "processes"
+    surveyed_png(roots[0])
+    survey_png(roots[1], scheduler="processes", workers=2)
+    kept = [
+        {
+            path.relative_to(root): hashlib.sha256(path.read_bytes()).hexdigest()
+            for path in (root / "stages").rglob("*")
+            if path.is_file() and path.name != "manifest.json"  # times
+        }
+        for root in roots
+    ]
+    assert kept[0] == kept[1]

@@ -1,4 +1,4 @@
-"""Which weights make up one seed of a training, and differences over the frames that two rows share."""
+"""Which weights make up one seed of a training, differences over shared frames, and one number for a curve."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flows.evaluate.series import Row, by_seed, collect_row, difference, seeds_of
+from flows.evaluate.series import Row, by_seed, collect_row, curve_figures, difference, seeds_of
 
 TRIAL = {"draws": 30, "seed": 0}
 
@@ -48,8 +48,50 @@ def test_a_difference_is_taken_where_both_rows_have_a_frame():
     assert (nowhere["difference"], nowhere["frames"]) == (None, 0)
 
 
+def test_every_draw_of_every_seed_is_a_run_of_its_own():
+    """Seeds first, draws within them; counts of no two are added or lost."""
+    seeds = [[_record("a", right), _record("a", right + 1)] for right in (2, 6)]
+    for one, other in seeds:
+        other["rows"][0]["draw"] = 1
+        one["rows"] += other["rows"]
+    row = collect_row([[one] for one, _ in seeds], "none", 0.0)
+    assert row is not None
+    assert row.counts[:, 0, 0, 0].tolist() == [2, 3, 6, 7]
+    assert row.of_seed.tolist() == [0, 0, 1, 1]
+
+
 def test_a_row_that_nobody_has_is_none():
     """And a row without counts inside seats or near borders has zeros for them."""
     folds = [[_record("a", 5)]]
     assert collect_row(folds, "entropy", 0.0) is None
     assert not np.any(_row(folds, ["a"]).inside)
+
+
+def test_a_straight_line_in_the_logarithm_closes_half():
+    """Without a point between, the area is that of the straight way from none to all."""
+    found = curve_figures((1.0, 0.5), [], (100.0, 0.7))
+    assert found.auc_gap == pytest.approx(0.5)
+    assert found.hypervolume == pytest.approx(0)
+    assert found.cost_to_enough == pytest.approx(1)
+
+
+def test_a_curve_by_hand():
+    """A tenth of the cost has all that there is: half of the logarithm at full, half rising to it."""
+    found = curve_figures((1.0, 0.5), [(10.0, 0.7)], (100.0, 0.7))
+    assert found.auc_gap == pytest.approx(0.75)
+    assert found.hypervolume == pytest.approx(0.2 * 0.9)
+    assert found.cost_to_enough == pytest.approx(0.1)
+
+
+def test_more_seats_that_hurt_take_nothing_from_what_is_dominated():
+    """The hypervolume holds the best so far; a point dearer than all adds nothing."""
+    good = [(10.0, 0.8)]
+    assert curve_figures((1.0, 0.5), [*good, (50.0, 0.6)], (100.0, 0.7)).hypervolume == pytest.approx(
+        curve_figures((1.0, 0.5), [*good, (200.0, 0.9)], (100.0, 0.7)).hypervolume or 0
+    )
+
+
+def test_a_gap_under_a_point_has_no_area():
+    """Nor has a scene where none costs as much as all."""
+    assert curve_figures((1.0, 0.5), [(2.0, 0.6)], (9.0, 0.505)).auc_gap is None
+    assert curve_figures((9.0, 0.5), [], (9.0, 0.7)).hypervolume is None

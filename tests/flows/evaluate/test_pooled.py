@@ -15,23 +15,24 @@ from rich.console import Console
 
 from flows.evaluate import work as benchmark_work
 from flows.evaluate.command import evaluate_weights, run_evaluate
-from flows.evaluate.plot import evaluation_figure
-from flows.evaluate.pooled import buy_by_seed, buy_together, judge_pooled, pooled_policies, score_frame
+from flows.evaluate.plots import evaluation_figure
 from flows.evaluate.request import EvaluateRequest
-from flows.evaluate.rows import Trial, judge_frame
+from flows.evaluate.rows import (
+    Trial,
+    buy_by_seed,
+    buy_together,
+    judge_frame,
+    judge_pooled,
+    pooled_policies,
+    score_frame,
+)
 from models.policies.policies import score_seats
 from pipeline.planning.selection import seat_count
-from tests.flows.small_fields import FRAMES, QUICK, looked_at, scene_at, write_field, write_weights
+from tests.flows.small_fields import FRAMES, QUICK, looked_at, scene_at, write_weights
 
 POLICY = "entropy, pooled"
 FAST: dict[str, Any] = {**QUICK, "policies": ("entropy", "random"), "timed_frames": 0}
 scores = st.lists(st.lists(st.floats(-1, 1) | st.sampled_from([0.0, np.nan]), max_size=12), min_size=1, max_size=5)
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of three small frames."""
-    return write_field(tmp_path_factory.mktemp("pooled") / "field")
 
 
 @pytest.fixture(scope="module")

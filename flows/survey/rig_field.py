@@ -1,0 +1,97 @@
+"""The rig that the settings name, before its field. Loaded for surveys through a rig alone: drivers load pyserial."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from flows.settings.survey_settings import Settings
+from pipeline.geometry.mounting import STRAIGHT
+from pipeline.geometry.scan import Sweep, sweep_positions
+from pipeline.rig.camera.camera_files import KeptInMemory
+from pipeline.rig.device_settings import CameraLimits, check_times
+from pipeline.rig.camera.headwall_camera import HeadwallCamera
+from pipeline.rig.capture.capture_runner import RigDevices
+from pipeline.rig.capture.rig_source import RigSource
+from pipeline.rig.devices import SYSTEM_CLOCK, Clock
+from pipeline.rig.mirror.mirror_controller import open_mirror
+from pipeline.simulator.effects.effect import Effect
+from pipeline.simulator.scenes.scene import RasterScene
+from pipeline.source import Source
+from storage.arrays.fetched_files import FetchedFiles
+
+FETCHED = "camera"  # folder within a capture's spool
+
+
+@dataclass(frozen=True)
+class RigField:
+    """A `FieldSource`. Its effects are its own; what its camera gives is kept beside the lines and goes with them."""
+
+    rig: RigSource
+    name = "rig"
+    simulates = False
+
+    def key(self, field: str) -> dict[str, Any]:
+        mounting = self.rig.rig.mounting
+        return {"field": field} | ({} if mounting == STRAIGHT else {"mounting": asdict(mounting)})
+
+    def saying(self, say: Callable[[str], None]) -> RigField:
+        return RigField(self.rig.saying(say))
+
+    def lit(self, chosen: Mapping[Effect, str], clock: Mapping[str, float]) -> RigField:
+        return self
+
+    @contextmanager
+    def opened(self, spool: Path) -> Iterator[Source]:
+        source = self.rig.keeping(FetchedFiles(spool / FETCHED))
+        with source.session():
+            yield source
+
+
+def rig_field(scene: RasterScene, settings: Settings, planned: Sequence[Sweep]) -> RigField:
+    """Give the rig; nothing is connected before its first line.
+
+    Raises
+    ------
+    SettingsError : exposure and frame period are nothing that the camera takes.
+    PoseError : the mirror, as mounted, does not reach all of the planned sweeps.
+    """
+    camera, rig = settings.camera, settings.rig
+    check_times(camera.exposure_ms, camera.frame_ms, CameraLimits(most_rate_hz=camera.max_rate_hz))
+    if rig.mounting != STRAIGHT:
+        for sweep in planned:
+            rig.mounting.to_device(sweep_positions(sweep, camera))
+    source = RigSource(
+        camera,
+        scene.wavelength_nm,
+        scene.shape,
+        lambda: open_devices(settings),
+        KeptInMemory(),
+        rig=rig,
+        vector_pairs=settings.cost.vector_pairs,
+    )
+    return RigField(source)
+
+
+def open_devices(settings: Settings, clock: Clock = SYSTEM_CLOCK) -> RigDevices:
+    """Connect to mirror and camera; nothing moves.
+
+    Raises
+    ------
+    DeviceGone : no such port, in use, not permitted, or the camera is not there. DeadlinePassed : nothing answers.
+    RigError : another device does.
+    """
+    rig = settings.rig
+    mirror = open_mirror(rig.mirror(settings.cost.vector_pairs), clock, known=True)
+    limits = CameraLimits(most_rate_hz=settings.camera.max_rate_hz)
+    camera = HeadwallCamera.at(rig.camera, rig.files, limits=limits, clock=clock)
+    devices = RigDevices(mirror, camera, clock)
+    try:
+        camera.is_capturing()
+    except BaseException:
+        devices.close()
+        raise
+    return devices
