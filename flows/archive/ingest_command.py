@@ -10,7 +10,9 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from flows.terminal.progress import StageProgress
+from flows.cli.app import ArchiveName, AsJson, parse_numbers, stderr
+from flows.terminal.processes import DONE
+from flows.terminal.progress import StageProgress, print_json
 from pipeline.errors import SceneError
 from storage.archive.archive import Archive, StageRef
 from storage.archive.staging import check_name, file_hash
@@ -22,6 +24,38 @@ from storage.remote.opening import open_archive
 STAGE = "ingest"
 VERSION = 2
 TITLES = {"read": "reading the files", STAGE: "storing the cube"}
+
+
+def ingest(
+    source: str,
+    archive: ArchiveName,
+    *,
+    name: str | None = None,
+    dark: str | None = None,
+    white: str | None = None,
+    wavelengths: str | None = None,
+    as_json: AsJson = False,
+) -> int:
+    """Store SOURCE in ARCHIVE as one cube that never changes; the same content is stored once.
+
+    Parameters
+    ----------
+    source
+        ENVI header or data file, folder of a Headwall camera, GeoTIFF, .mat, .npy, PNG, or Zarr store.
+    name
+        What the cube is called; the file's or folder's name by default.
+    dark
+        Dark frame, ENVI or .npy, averaged over its lines; a Headwall folder's own by default.
+    white
+        White frame, likewise.
+    wavelengths
+        Centre wavelengths of all bands [nm], where the files do not say them: 660,800
+    """
+    request = IngestRequest(source, archive, name, dark, white, parse_numbers(wavelengths, "--wavelengths"))
+    record = run_ingest(request, stderr)
+    if as_json:
+        print_json(record)
+    return DONE
 
 
 @dataclass(frozen=True)
@@ -50,7 +84,9 @@ def run_ingest(request: IngestRequest, console: Console) -> dict[str, Any]:
     if request.name is not None:
         check_name(request.name)
     with console.status("opening the source"):
-        source = _opened(request)
+        source = open_cube_source(request.source, dark=request.dark, white=request.white)
+        if request.wavelengths is not None:
+            source = with_wavelengths(source, request.wavelengths)
         archive = open_archive(request.archive)
         archive.reclaim()  # what a killed ingest left half made
     with archive.in_use(), StageProgress(console, TITLES) as progress:
@@ -75,19 +111,11 @@ def hash_files(source: CubeSource, report: Report = lambda done: None) -> list[S
     """Size and SHA-256 of every file that a cube comes from; names are without folders, but those within a store."""
     files: list[SourceFile] = []
     for number, path in enumerate(source.files):
-        name = path.name if source.root is None or not path.is_relative_to(source.root) else _within(path, source.root)
+        root = source.root
+        name = path.relative_to(root).as_posix() if root is not None and path.is_relative_to(root) else path.name
         files.append(SourceFile(name, path.stat().st_size, file_hash(path)))
         report((number + 1) / len(source.files))
     return files
-
-
-def _within(path: Path, root: Path) -> str:
-    return path.relative_to(root).as_posix()
-
-
-def _opened(request: IngestRequest) -> CubeSource:
-    source = open_cube_source(request.source, dark=request.dark, white=request.white)
-    return source if request.wavelengths is None else with_wavelengths(source, request.wavelengths)
 
 
 def _stamps(source: CubeSource) -> list[tuple[int, int]]:

@@ -5,8 +5,6 @@ Nothing of the survey is made again: what it left is read from the archive, and 
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from rich.console import Console
@@ -41,12 +39,6 @@ class JudgeRequest:
     labels: str | None = None
 
 
-def split_address(text: str) -> tuple[str, str] | None:
-    """Archive and run of an address such as ``archive/runs/20261120T101701-farm``; None of anything else."""
-    found = re.fullmatch(r"(.+)/runs/([^/]+)/?", text)
-    return None if found is None else (found[1], found[2])
-
-
 def run_judge(request: JudgeRequest, console: Console) -> Receipt:
     """Judge a run's map and add its accuracy to the run; gives its receipt, as it is where it has what is asked for.
 
@@ -60,7 +52,8 @@ def run_judge(request: JudgeRequest, console: Console) -> Receipt:
     found = find_run(catalogue, request.run)
     receipt = load_receipt(found.folder)
     settings = _settings(found, request, opened.name)
-    if _has(receipt, settings, request):
+    judged = "accuracy" in receipt and request.labels is None
+    if judged and (receipt["accuracy"]["controls"] or not settings.controls):
         console.print(escape(f"{found.uri} has its accuracy already"), highlight=False, soft_wrap=True)
         return receipt
     use_one_thread()
@@ -71,16 +64,11 @@ def run_judge(request: JudgeRequest, console: Console) -> Receipt:
         products = _products(catalogue, found, run)
         _check_same(catalogue, found, products, run)
     with run.archive.in_use(), run.settings.crew.open(), StageProgress(console, TITLES) as progress:
-
-        def watch(stage: str, state: str, done: float) -> None:
-            running = state == "running"
-            progress.show(stage, done, "" if running else state, ended=not running)
-
         draft = run.archive.extend_run(found.folder.name, wait=False)
         if draft is None:
             raise ArchiveError(f"{found.uri} is being judged by another process; it adds the accuracy")
         with draft:
-            runner = StageRunner(run, watch)
+            runner = StageRunner(run, progress.watch)
             judged = judge(runner, products)
             published = add_accuracy(run, draft, judged, runner.records["evaluate"])
     show_published(published, run.archive, console)
@@ -93,13 +81,6 @@ def _settings(found: Run, request: JudgeRequest, archive: str) -> Settings:
     if request.controls is not None:
         settings = for_rig(replace(settings, controls=request.controls))
     return settings if request.labels is None else replace(settings, labels=request.labels)
-
-
-def _has(receipt: Receipt, settings: Settings, request: JudgeRequest) -> bool:
-    """Whether a run's receipt has what is asked for: accuracy, by these labels, and controls where they are wanted."""
-    if "accuracy" not in receipt or request.labels is not None:
-        return False
-    return bool(receipt["accuracy"]["controls"]) or not settings.controls
 
 
 def _products(catalogue: Catalogue, found: Run, run: SurveyRun) -> Products:
@@ -136,16 +117,10 @@ def _check_same(catalogue: Catalogue, found: Run, products: Products, run: Surve
         raise SceneError(
             f"the scene {run.settings.scene} is another than {found.uri} looked at; put that one back, or survey again"
         )
-    drawn_with = _param(catalogue, products.of("draw_map"), "weights")
-    if run.weights_key != drawn_with:
+    if run.weights_key != catalogue.stores[products.of("draw_map").uri].params.get("weights"):
         raise WeightsError(
             f"the weights {run.settings.weights or 'that come with SpectralZoom'} are others than the map of"
             f" {found.uri} was drawn with; put those back, or reprocess with these"
         )
     if not run.scene.labelled:
         raise SceneError(f"there are no labels to judge {found.uri} by; give --labels FILE, on the scene's pixels")
-
-
-def _param(catalogue: Catalogue, ref: StageRef, name: str) -> object:
-    params: Mapping[str, object] = catalogue.stores[ref.uri].params
-    return params.get(name)

@@ -24,8 +24,7 @@ from flows.evaluate.series import Record, seeds_of
 from flows.evaluate.summary import summarise
 from flows.evaluate.table import print_evaluation
 from flows.evaluate.work import Judged, Work
-from flows.terminal.progress import StageProgress
-from flows.terminal.shown_text import on_stdout
+from flows.terminal.progress import StageProgress, on_stdout
 from models.evaluation.bootstrap import LEVEL
 from models.evaluation.metrics import agreement, false_pixels, iou_per_class
 from models.network.process import keep_freed_memory

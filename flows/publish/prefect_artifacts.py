@@ -9,10 +9,9 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, cast
 
-from flows.publish.finding_words import sentences
-from flows.publish.pages import render_markdown
 from flows.publish.receipt import Receipt, Saving
-from flows.publish.receipt_table import COST_LABELS, headline
+from flows.publish.receipt_table import COST_LABELS, headline, sentences
+from flows.publish.report import render_markdown
 from flows.publish.run_folder import Published
 from flows.terminal.figures import format_percent
 

@@ -247,6 +247,13 @@ def is_pending(receipt: Mapping[str, Any]) -> bool:
     return receipt.get("accuracy_is") == "pending"
 
 
+def areas_on_ground(receipt: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """Hectares of each class, where the survey was put on the ground."""
+    ground = receipt.get("ground")
+    areas = ground.get("areas_ha") if isinstance(ground, Mapping) else None
+    return areas if isinstance(areas, Mapping) else None
+
+
 def _check_savings(savings: Mapping[str, Any]) -> None:
     _need(savings, COSTS, "receipt.savings")
     for name in COSTS:

@@ -1,23 +1,73 @@
-"""The report: one HTML page from a receipt and its pictures, for a farmer first and for whoever reruns it below.
+"""Pages for people from the templates beside this file: each one file that opens from disk and loads nothing.
 
-Nothing is loaded from anywhere: styles are inline, pictures are data in the page. It opens from disk and prints.
+Whatever a page shows is escaped here and nowhere else: no markup, and nothing that turns the words beside it round.
 """
 
 from __future__ import annotations
 
 import base64
+import json
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from flows.publish.effect_table import total_words
-from flows.publish.finding_words import sentences
-from flows.publish.pages import render_page
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
 from flows.publish.receipt import Accuracy, Receipt, Savings
-from flows.publish.receipt_table import COST_LABELS, control_seats, headline
+from flows.publish.receipt_table import COST_LABELS, control_seats, format_change, headline, sentences, total_words
 from flows.survey.scores import SHOWN, SHOWN_WORDS, definitions_differ, false_class_words
-from flows.terminal.figures import format_seconds
+from flows.terminal.figures import format_bytes, format_percent, format_points, format_seconds
+from pipeline.visible_text import visible
+
+_MARKDOWN = "\\`*_{}[]<>#|"
+
+
+def render_page(template: str, **facts: Any) -> str:
+    """Fill in an HTML template; every word of ``facts`` that is no `Markup` is escaped."""
+    return visible(_html().get_template(template).render(facts))
+
+
+def render_markdown(template: str, **facts: Any) -> str:
+    """Fill in a Markdown template; in words that are no `Markup` nothing has a meaning of its own."""
+    return visible(_markdown().get_template(template).render(facts))
+
+
+_environment = partial(
+    Environment, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
+)
+
+
+@cache
+def _html() -> Environment:
+    found = _environment(loader=_templates(), autoescape=True)
+    found.filters |= {
+        "bytes": format_bytes,
+        "change": format_change,
+        "percent": format_percent,
+        "points": format_points,
+        "seconds": format_seconds,
+        "json": partial(json.dumps, ensure_ascii=False),
+    }
+    return found
+
+
+@cache
+def _markdown() -> Environment:
+    return _environment(loader=_templates(), finalize=_plain)
+
+
+def _templates() -> PackageLoader:
+    return PackageLoader("flows.publish", "templates")
+
+
+def _plain(value: object) -> object:
+    """Words as Markdown shows them letter by letter."""
+    if isinstance(value, Markup):
+        return value
+    return "".join(f"\\{letter}" if letter in _MARKDOWN else letter for letter in visible(str(value)))
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from flows.schedule.field_schedule import FieldSchedule
-from flows.schedule.ledger_state import Ending
+from flows.schedule.field_schedule import Ending, FieldSchedule
 from flows.schedule.rig_lock import RigLock
 from pipeline.errors import PipelineError
 

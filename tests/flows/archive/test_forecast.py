@@ -12,12 +12,12 @@ from typing import Any
 
 import pytest
 
-from flows.archive.forecast import StageForecast, forecast
-from flows.archive.plan_command import run_plan
+from flows.archive.plan_command import StageForecast, forecast, plan_content, show_plan
 from flows.archive.stage_costs import scaled_cost
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
 from flows.survey.run import open_run
+from flows.terminal.progress import put_out
 from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from pipeline.simulator.simulated import SimulatedSource
 from storage.archive.archive import Archive
@@ -161,6 +161,10 @@ def test_two_records_tell_what_starting_takes() -> None:
     assert scaled_cost([10.0, 30.0], [1.0, 3.5], 0.0) == 0.0
 
 
+def _plan(asked: Settings, *, as_json: bool = False) -> None:
+    put_out(plan_content(asked), show_plan, as_json=as_json)
+
+
 def test_a_field_beyond_this_machine_is_planned_without_drawing_it(
     settings: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -181,9 +185,9 @@ def test_a_field_beyond_this_machine_is_planned_without_drawing_it(
     with pytest.raises(SettingsError, match="this machine has 9; take a smaller one") as refused:
         open_run(asked)
     assert found.refused == str(refused.value)
-    assert run_plan(asked) == 0
+    _plan(asked)
     assert f"refused here: {refused.value}" in capsys.readouterr().out
-    run_plan(asked, as_json=True)
+    _plan(asked, as_json=True)
     assert json.loads(capsys.readouterr().out)["refused"] == str(refused.value)
     assert not list(tmp_path.iterdir())
 
@@ -229,17 +233,17 @@ def test_what_the_survey_refuses_the_plan_refuses(settings: Settings, tmp_path: 
 def test_plan_as_json_and_as_a_table(settings: Settings, archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """One object with the sums of what is ahead; the table names every stage and says what is left to make."""
     asked = replace(settings, out=str(archive), kernel="nearest")
-    assert run_plan(asked, as_json=True) == 0
+    _plan(asked, as_json=True)
     content = json.loads(capsys.readouterr().out)
     ahead = [row for row in content["stages"] if row["state"] in ("to run", "blocked")]
     assert content["to_make"] == content["estimated"] == len(ahead) == 7
     assert content["seconds"] == pytest.approx(sum(row["seconds"] for row in ahead))
     assert content["bytes"] == sum(row["bytes"] for row in ahead)
-    assert run_plan(asked) == 0
+    _plan(asked)
     shown = capsys.readouterr().out
     assert all(row["stage"] in shown for row in content["stages"])
     assert "7 stages to make, about" in shown
-    run_plan(replace(settings, out=str(archive)))
+    _plan(replace(settings, out=str(archive)))
     assert "everything is stored" in capsys.readouterr().out
 
 

@@ -6,8 +6,7 @@ from collections import Counter
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-from flows.schedule.field_schedule import FieldSchedule
-from flows.schedule.ledger_state import ENDINGS, read_moment, read_state
+from flows.schedule.field_schedule import ENDINGS, FieldSchedule, read_moment, read_state
 from flows.schedule.times import Timetable, parse_timetable
 from storage.archive.ledger import Ledger
 

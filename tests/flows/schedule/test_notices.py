@@ -14,10 +14,9 @@ from typing import Any
 import pytest
 
 from flows.schedule.due_runs import Outcome
-from flows.schedule.news import ScheduleNews, Several, together
-from flows.schedule.notices import NAMED_BY, notice_address, send_notice
-from flows.schedule.plain_schedule import serve_plain
+from flows.schedule.notices import NAMED_BY, ScheduleNews, Several, notice_address, send_notice, together
 from flows.schedule.rig_lock import RigLock
+from flows.schedule.serve_command import serve_plain
 from pipeline.errors import PipelineError, SettingsError
 from tests.flows.schedule.schedule_days import NOON, HandClock, field_schedule
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from flows.schedule.due_runs import run_due
-from flows.schedule.ledger_state import moment_words
+from flows.schedule.field_schedule import moment_words
 from flows.schedule.rig_lock import RigLock
 from tests.flows.schedule.schedule_days import NOON, HandClock, accounted, field_schedule
 

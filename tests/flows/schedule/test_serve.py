@@ -19,11 +19,10 @@ import pytest
 from PIL import Image
 
 from flows.publish.prefect_artifacts import MOST_BYTES, artifact_key, savings_rows, small_jpeg, survey_markdown
-from flows.schedule import prefect_schedule as serve_prefect
 from flows.schedule import serve_command
-from flows.schedule.fields import ServedField, alone_on, load_fields
-from flows.schedule.plain_schedule import serve_plain
-from flows.schedule.served import ServeRequest
+from flows.schedule import server as serve_prefect
+from flows.schedule.serve_command import alone_on, load_fields, serve_plain
+from flows.schedule.served import ServedField, ServeRequest
 from flows.schedule.times import parse_timetable
 from flows.settings.survey_settings import Settings
 from pipeline.errors import ArchiveError
@@ -148,7 +147,7 @@ def test_sigterm_stops_a_schedule(
         os.kill(os.getpid(), signal.SIGTERM)
         pytest.fail("SIGTERM was not heard")
 
-    monkeypatch.setattr(serve_command, "_serve_plain", terminated)
+    monkeypatch.setattr(serve_command, "serve_plain", terminated)
     ended = command_line("serve", field_file(), "--every", "30m", "--engine", "plain")
     assert (ended.code, ended.errors) == (0, [])
     assert ended.err.splitlines()[-1].startswith("stopped: nothing is due any more; the same command serves again")

@@ -16,10 +16,9 @@ from prefect.states import Cancelled, Completed, Pending, Running, State
 
 from flows.schedule import watcher as serve_watcher
 from flows.schedule.due_runs import Outcome
-from flows.schedule.field_schedule import FieldSchedule
-from flows.schedule.fields import ServedField, load_fields
-from flows.schedule.ledger_state import moment_words
-from flows.schedule.served import ServeRequest
+from flows.schedule.field_schedule import FieldSchedule, moment_words
+from flows.schedule.serve_command import load_fields
+from flows.schedule.served import ServedField, ServeRequest
 from flows.schedule.times import parse_timetable
 from flows.schedule.watcher import Watcher
 from pipeline.errors import ArchiveError
@@ -392,7 +391,7 @@ def test_who_would_have_to_wait(
     field_file: Callable[..., Path], tmp_path: Path, limit: int, looking: int, reprocessing: int, busy: bool
 ) -> None:
     """A survey waits where all rigs are in use, or as much runs, reprocessing included, as may run at a time."""
-    from flows.schedule.prefect_flows import REPROCESS_LOCK
+    from flows.schedule.watcher import REPROCESS_LOCK
 
     watch, _ = two_rigs(field_file, tmp_path, HandClock(), AClient(), limit)
     with ExitStack() as held:

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from flows.publish.finding_words import sentences
+from flows.publish.receipt_table import sentences
 from flows.publish.run_folder import Published
 from flows.settings.load import load_settings
 from pipeline.errors import SettingsError
