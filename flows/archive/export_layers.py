@@ -78,11 +78,6 @@ class ExportedRun:
         """Where the run's map lies on the earth; None without a pose."""
         return None if self.store("ground_map") is None else load_geobox(self.path("ground_map"))
 
-    @property
-    def software(self) -> str:
-        """Name and version of what made the run."""
-        return f"spectralzoom {self.receipt['versions'].get('spectralzoom', 'of unknown version')}"
-
 
 def open_exported(archive: Archive, name: str | None) -> ExportedRun:
     """Open a run by its name or address, the latest without one.
@@ -129,7 +124,9 @@ def map_layers(run: ExportedRun) -> list[Layer]:
     Attention keeps its grid of seats.
     """
     product = "class_map" if run.geobox is None else "ground_map"
-    legend = _legend(open_image(run.path(product), "classes"))
+    about = open_image(run.path(product), "classes").about
+    colours = np.array(about.get("class_colours", ()), np.uint8).reshape(-1, 3)
+    legend = ClassLegend(tuple(about.get("class_names", ())), colours)
     made = [
         _layer(run, product, "classes", ("class",), nodata=UNLABELLED, legend=legend),
         _layer(run, product, "confidence", ("confidence",), nodata=np.nan),
@@ -148,15 +145,10 @@ def map_layers(run: ExportedRun) -> list[Layer]:
     ]
 
 
-def _legend(stored: StoredImage) -> ClassLegend:
-    names, colours = (stored.about.get(f"class_{word}", ()) for word in ("names", "colours"))
-    return ClassLegend(tuple(names), np.array(colours, np.uint8).reshape(-1, 3))
-
-
 def _tags(run: ExportedRun, product: str, place: Place) -> dict[str, str]:
     """What a file says of where it comes from and where it lies."""
     return {
-        "TIFFTAG_SOFTWARE": run.software,
+        "TIFFTAG_SOFTWARE": f"spectralzoom {run.receipt['versions'].get('spectralzoom', 'of unknown version')}",
         "run": run.id,
         "product": run.receipt["products"][product],
         "surveyed": run.receipt["started"],

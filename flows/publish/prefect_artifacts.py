@@ -7,12 +7,13 @@ import io
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any, cast
+from typing import Any
 
-from flows.publish.receipt import Receipt, Saving
-from flows.publish.receipt_table import COST_LABELS, headline, sentences
+from flows.publish.receipt import Receipt
+from flows.publish.receipt_table import COST_LABELS, cost_rows, headline, sentences
 from flows.publish.report import render_markdown
 from flows.publish.run_folder import Published
+from flows.survey.prefect_engine import inside_flow
 from flows.terminal.figures import format_percent
 
 MOST_BYTES = 100 * 1024  # of the picture, as it stands in the text
@@ -50,19 +51,15 @@ def survey_markdown(published: Published, where: str) -> str:
 
 def savings_rows(receipt: Receipt) -> list[dict[str, str]]:
     """The receipt's savings, a row each, in words."""
-    rows = []
-    for name, (label, show) in COST_LABELS.items():
-        entry = cast("Saving", receipt["savings"][name])  # type: ignore[literal-required]
-        words: Callable[[float | None], str] = show
-        rows.append(
-            {
-                "cost": label,
-                "this survey": words(entry["done"]),
-                "everything": words(entry["full"]),
-                "share": format_percent(entry["ratio"]),
-            }
-        )
-    return rows
+    return [
+        {
+            "cost": row["label"],
+            "this survey": row["done"],
+            "everything": row["full"],
+            "share": format_percent(row["ratio"]),
+        }
+        for row in cost_rows(receipt["savings"])[: len(COST_LABELS)]
+    ]
 
 
 def small_jpeg(png: bytes) -> bytes:
@@ -84,8 +81,6 @@ def small_jpeg(png: bytes) -> bytes:
 
 def progress_shown(field: str) -> Callable[[str, str, float], None]:
     """What shows how far stages are on Prefect's pages: nothing outside of a flow, or where the server is gone."""
-    from flows.survey.prefect_engine import inside_flow
-
     if not inside_flow():
         return lambda stage, state, done: None
     shown = TaskProgress(field, time.monotonic)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from rich.box import SIMPLE_HEAD
@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from flows.publish.receipt import Accuracy, Receipt, Saving, Savings, is_pending
+from flows.publish.receipt import Accuracy, Receipt, Savings, is_pending
 from flows.survey.scores import SHOWN, SHOWN_WORDS, definitions_differ, false_class_words, worst_class_words
 from flows.terminal.figures import DASH, format_bytes, format_count, format_percent, format_points, format_seconds
 from pipeline.simulator.selection.manifest import UNIT_WORDS
@@ -57,12 +57,35 @@ COST_LABELS = {
 }
 
 
+def cost_rows(savings: Savings) -> list[dict[str, Any]]:
+    """What was spent against everything, a row each: `Saving` with ``label``, and ``done`` and ``full`` in words."""
+    entries: Mapping[str, Any] = savings
+    rows = [
+        {**entries[name], "label": label, "done": show(entries[name]["done"]), "full": show(entries[name]["full"])}
+        for name, (label, show) in COST_LABELS.items()
+    ]
+    if "segment_wall_s" in savings:
+        done, full = savings["segment_wall_s"]["done"], savings["segment_wall_s"]["full"]
+        times = {"done": format_seconds(done), "full": format_seconds(full), "full_is": "measured"}
+        rows.append({**times, "label": "time of the model", "ratio": done / full if full else None})
+    return rows
+
+
 def print_table(receipt: Receipt, console: Console) -> None:
     """Print the receipt's three tables to the terminal: savings, accuracy (with labels), stages."""
-    console.print(_savings_table(receipt["savings"]))
+    table = _table("Savings", "cost", "this survey", "everything", "ratio", "everything is")
+    for row in cost_rows(receipt["savings"]):
+        table.add_row(row["label"], row["done"], row["full"], format_percent(row["ratio"]), row["full_is"])
+    console.print(table)
     if "accuracy" in receipt:
         console.print(_accuracy_table(receipt["accuracy"]))
-    console.print(_stages_table(receipt["stages"]))
+    table = _table("Stages", "stage", "state", "wall", "peak memory", "written")
+    colours = {"ran": "green", "cached": "cyan", "skipped": "dim", "failed": "bold red"}
+    for stage in receipt["stages"]:
+        state = f"[{colours[stage['state']]}]{stage['state']}[/]"
+        peak, wrote = format_bytes(stage["peak_rss_bytes"]), format_bytes(stage["bytes_out"])
+        table.add_row(escape(stage["name"]), state, format_seconds(stage["wall_s"]), peak, wrote)
+    console.print(table)
 
 
 def _table(title: str, *columns: str) -> Table:
@@ -73,20 +96,14 @@ def _table(title: str, *columns: str) -> Table:
     return table
 
 
-def _savings_table(savings: Savings) -> Table:
-    table = _table("Savings", "cost", "this survey", "everything", "ratio", "everything is")
-    for name, (label, show) in COST_LABELS.items():
-        entry = cast("Saving", savings[name])  # type: ignore[literal-required]
-        table.add_row(label, show(entry["done"]), show(entry["full"]), format_percent(entry["ratio"]), entry["full_is"])
-    if "segment_wall_s" in savings:
-        done, full = savings["segment_wall_s"]["done"], savings["segment_wall_s"]["full"]
-        ratio = format_percent(done / full) if full else "-"
-        table.add_row("time of the model", format_seconds(done), format_seconds(full), ratio, "measured")
-    return table
-
-
 def _accuracy_table(accuracy: Accuracy) -> Table:
-    rows = score_rows(accuracy)
+    seats = control_seats(accuracy)
+    rows: list[tuple[str, Mapping[str, Any]]] = [
+        ("none: the coarse look alone", accuracy["none"]),
+        ("this survey", accuracy),
+        *((f"{seats} placed by {escape(policy)}", control) for policy, control in accuracy["controls"].items()),
+        ("all: detail everywhere", accuracy["all"]),
+    ]
     before = definitions_differ([score for _, score in rows])
     table = _table("Accuracy against the truth", "seats", "mIoU", "spread", "overall", *([SHOWN] if before else []))
     for label, score in rows:
@@ -95,27 +112,11 @@ def _accuracy_table(accuracy: Accuracy) -> Table:
         cells += [format_points(score.get("miou_of_shown_classes"))] if before else []
         table.add_row(*([label, *cells] if score is not accuracy else (f"[bold]{cell}[/]" for cell in (label, *cells))))
     table.add_row("gap from none to all closed", format_percent(accuracy["gap_closed"]))
-    words = [score_words(accuracy, before=before), false_class_words(accuracy)]
+    count = sum(iou is not None for iou in accuracy["per_class_iou"].values())
+    words = [f"mIoU: mean over the {count} classes of the truth. Overall: share of pixels that are right."]
+    words = [f"{words[0]} {SHOWN_WORDS}" if before else words[0], false_class_words(accuracy)]
     table.caption, table.caption_justify = escape("\n".join(filter(None, words))), "left"
     return table
-
-
-def score_rows(accuracy: Accuracy) -> list[tuple[str, Mapping[str, Any]]]:
-    """The maps that a receipt has scores of, and what a terminal calls them."""
-    seats = control_seats(accuracy)
-    return [
-        ("none: the coarse look alone", accuracy["none"]),
-        ("this survey", accuracy),
-        *((f"{seats} placed by {escape(policy)}", control) for policy, control in accuracy["controls"].items()),
-        ("all: detail everywhere", accuracy["all"]),
-    ]
-
-
-def score_words(accuracy: Accuracy, *, before: bool) -> str:
-    """What the scores are means of, for whoever reads the table; ``before``: it has the definition of before too."""
-    count = sum(iou is not None for iou in accuracy["per_class_iou"].values())
-    words = f"mIoU: mean over the {count} classes of the truth. Overall: share of pixels that are right."
-    return f"{words} {SHOWN_WORDS}" if before else words
 
 
 def control_seats(accuracy: Mapping[str, Any]) -> str:
@@ -124,22 +125,25 @@ def control_seats(accuracy: Mapping[str, Any]) -> str:
     return "other seats," if share is None else f"{format_percent(share)} of the seats, free,"
 
 
-def _stages_table(stages: Iterable[Mapping[str, Any]]) -> Table:
-    table = _table("Stages", "stage", "state", "wall", "peak memory", "written")
-    colours = {"ran": "green", "cached": "cyan", "skipped": "dim", "failed": "bold red"}
-    for stage in stages:
-        state = f"[{colours[stage['state']]}]{stage['state']}[/]"
-        peak, wrote = format_bytes(stage["peak_rss_bytes"]), format_bytes(stage["bytes_out"])
-        table.add_row(escape(stage["name"]), state, format_seconds(stage["wall_s"]), peak, wrote)
-    return table
-
-
 LEAST_HECTARES = 0.1  # smaller areas are told in square metres
 
 
 def sentences(found: Mapping[str, Any]) -> list[str]:
     """The findings in words, for the terminal and the report."""
-    words = _plan_words(found["plan"]) if "plan" in found else []
+    words = []
+    if plan := found.get("plan"):
+        if plan["kind"] == "full" and plan["reason"]:
+            words.append(_sentence(plan["reason"]))
+        if plan["out_of_reach"]:
+            words.append(f"{plan['out_of_reach']} places worth a second look lie beyond the mirror's range.")
+        if plan.get("spared_s"):
+            share = f" ({format_percent(plan['spared_share'])} of the full scan's)" if plan["spared_share"] else ""
+            words.append(
+                f"The threshold of {plan['threshold']:g} a second left {plan['spared_s']:.1f} s{share} unspent: no "
+                f"further run of lines pays."
+            )
+        if plan["lines"]:
+            words.append(_sentence(plan["orientation"]["sentence"]))
     for name, one in found.get("pointing", {}).items():
         if isinstance(one, Mapping) and (told := _pointing_words(name, one)):
             words.append(told)
@@ -152,27 +156,6 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
         place = f"{ground['crs']}, {ground['resolution_m']:g} m a pixel"
         words.append(f"On the ground ({place}) the classes cover {', '.join(areas)}.")
     return words
-
-
-def _plan_words(plan: Mapping[str, Any]) -> list[str]:
-    words = []
-    if plan["kind"] == "full" and plan["reason"]:
-        words.append(_sentence(plan["reason"]))
-    if plan["out_of_reach"]:
-        words.append(f"{plan['out_of_reach']} places worth a second look lie beyond the mirror's range.")
-    if plan.get("spared_s"):
-        words.append(_spared_words(plan))
-    if plan["lines"]:
-        words.append(_sentence(plan["orientation"]["sentence"]))
-    return words
-
-
-def _spared_words(plan: Mapping[str, Any]) -> str:
-    share = f" ({format_percent(plan['spared_share'])} of the full scan's)" if plan["spared_share"] else ""
-    return (
-        f"The threshold of {plan['threshold']:g} a second left {plan['spared_s']:.1f} s{share} unspent: no further run "
-        f"of lines pays."
-    )
 
 
 def _sentence(text: str) -> str:
@@ -241,7 +224,8 @@ def print_effects(effects: Iterable[Row], total: Row, console: Console) -> None:
 
 def _figures(row: Row, total: Row) -> list[str]:
     """Name, variant or off, what leaving it out would change, what is changed, measured, seconds."""
-    beyond = row["state"] == "off" and total["tolerance"] is not None and not _within(row["bound"], total["tolerance"])
+    most, bound = total["tolerance"], row["bound"]
+    beyond = row["state"] == "off" and most is not None and (bound is None or bound > most)
     colour = "yellow" if beyond else COLOURS[row["state"]]
     return [
         escape(row["name"]),
@@ -249,19 +233,8 @@ def _figures(row: Row, total: Row) -> list[str]:
         format_change(row["left_out"], endless=True),
         format_change(row["bound"], endless=True),
         "" if row["measured"] is None else format_change(row["measured"]),
-        _cpu(row["cost_s"]),
+        "" if not row["cost_s"] else "< 0.01 s" if row["cost_s"] < 0.01 else format_seconds(row["cost_s"]),
     ]
-
-
-def _within(bound: float | None, tolerance: float) -> bool:
-    return bound is not None and bound <= tolerance
-
-
-def _cpu(seconds: float) -> str:
-    """Nothing where nothing is spent; never a bare 0."""
-    if not seconds:
-        return ""
-    return "< 0.01 s" if seconds < 0.01 else format_seconds(seconds)
 
 
 def _words(row: Row) -> str:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -16,8 +16,8 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from flows.publish.receipt import Accuracy, Receipt, Savings
-from flows.publish.receipt_table import COST_LABELS, control_seats, format_change, headline, sentences, total_words
+from flows.publish.receipt import Accuracy, Receipt
+from flows.publish.receipt_table import control_seats, cost_rows, format_change, headline, sentences, total_words
 from flows.survey.scores import SHOWN, SHOWN_WORDS, definitions_differ, false_class_words
 from flows.terminal.figures import format_bytes, format_percent, format_points, format_seconds
 from pipeline.visible_text import visible
@@ -27,22 +27,25 @@ _MARKDOWN = "\\`*_{}[]<>#|"
 
 def render_page(template: str, **facts: Any) -> str:
     """Fill in an HTML template; every word of ``facts`` that is no `Markup` is escaped."""
-    return visible(_html().get_template(template).render(facts))
+    return visible(_environment(markdown=False).get_template(template).render(facts))
 
 
 def render_markdown(template: str, **facts: Any) -> str:
     """Fill in a Markdown template; in words that are no `Markup` nothing has a meaning of its own."""
-    return visible(_markdown().get_template(template).render(facts))
-
-
-_environment = partial(
-    Environment, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
-)
+    return visible(_environment(markdown=True).get_template(template).render(facts))
 
 
 @cache
-def _html() -> Environment:
-    found = _environment(loader=_templates(), autoescape=True)
+def _environment(*, markdown: bool) -> Environment:
+    found = Environment(
+        loader=PackageLoader("flows.publish", "templates"),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        autoescape=not markdown,
+        finalize=_plain if markdown else None,
+    )
     found.filters |= {
         "bytes": format_bytes,
         "change": format_change,
@@ -52,15 +55,6 @@ def _html() -> Environment:
         "json": partial(json.dumps, ensure_ascii=False),
     }
     return found
-
-
-@cache
-def _markdown() -> Environment:
-    return _environment(loader=_templates(), finalize=_plain)
-
-
-def _templates() -> PackageLoader:
-    return PackageLoader("flows.publish", "templates")
 
 
 def _plain(value: object) -> object:
@@ -119,7 +113,7 @@ def render_report(
         about=f"{receipt['scene']} seen by {receipt['source']}, seed {receipt['seed']}, finished {receipt['finished']}",
         receipt=receipt,
         pictures=[{"data": base64.b64encode(one.png).decode("ascii"), "caption": one.caption} for one in shown],
-        costs=list(_costs(receipt["savings"])),
+        costs=cost_rows(receipt["savings"]),
         shares={name: split[name] / split["done"] for name in parts},
         findings=sentences(receipt),
         **_scores(receipt.get("accuracy")),
@@ -130,18 +124,6 @@ def render_report(
             "Files of this survey": receipt["products"],
         },
     )
-
-
-def _costs(savings: Savings) -> Iterator[dict[str, Any]]:
-    """What was spent against everything, a row each."""
-    entries: Mapping[str, Any] = savings
-    for name, (label, show) in COST_LABELS.items():
-        entry = entries[name]
-        yield {**entry, "label": label, "done": show(entry["done"]), "full": show(entry["full"])}
-    if "segment_wall_s" in savings:
-        done, full = savings["segment_wall_s"]["done"], savings["segment_wall_s"]["full"]
-        times = {"done": format_seconds(done), "full": format_seconds(full), "full_is": "measured"}
-        yield {**times, "label": "time of the model", "ratio": done / full if full else None}
 
 
 def _scores(accuracy: Accuracy | None) -> dict[str, Any]:

@@ -7,9 +7,8 @@ the run. A survey that was stopped meanwhile goes on with the run that it had pu
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -19,6 +18,7 @@ from flows.publish.receipt import is_pending
 from flows.publish.receipt_table import headline, print_table, sentences
 from flows.publish.run_folder import Published, add_accuracy, asked_settings, publish_run
 from flows.settings.survey_settings import OF_THE_MACHINE, Settings
+from flows.survey.prefect_engine import EngineUnavailable, survey_with_prefect
 from flows.survey.run import SurveyRun, now, open_run
 from flows.survey.survey import STAGES, TITLES, Products, StageRunner, Step, judge, survey
 from flows.terminal.progress import StageProgress
@@ -28,8 +28,6 @@ from storage.archive.keys import canonical_json
 from storage.archive.records import Run, read_run
 from storage.archive.run_folders import RunDraft
 from storage.archive.whole_files import to_json
-
-Finish = Callable[[Step, Products], Published]  # what comes after the map, with what runs a stage
 
 
 def run_survey(settings: Settings, console: Console) -> Published:
@@ -67,33 +65,23 @@ def _survey_and_publish(run: SurveyRun, settings: Settings, console: Console, st
     with StageProgress(console, TITLES) as progress:
 
         def watch(stage: str, state: str, done: float) -> None:
-            running = state == "running"
-            progress.show(stage, done, "" if running else state, ended=not running)
+            progress.watch(stage, state, done)
             shown(stage, state, done)
 
         runner = StageRunner(replace(run, source=run.source.saying(progress.say)), watch)
 
+        def tell(words: str) -> None:
+            console.print(escape(words), highlight=False, soft_wrap=True)
+
         def finish(step: Step, products: Products) -> Published:
-            return publish_and_judge(
-                runner,
-                step,
-                products,
-                started,
-                lambda words: console.print(escape(words), highlight=False, soft_wrap=True),
-            )
+            return publish_and_judge(runner, step, products, started, tell)
 
-        return _run(runner, settings.engine, console, finish)
-
-
-def _run(runner: StageRunner, engine: str, console: Console, finish: Finish) -> Published:
-    if engine != "plain":
-        from flows.survey.prefect_engine import EngineUnavailable, survey_with_prefect
-
-        try:
-            return survey_with_prefect(runner, finish)
-        except EngineUnavailable as error:
-            console.print(f"[yellow]{escape(str(error))}; going on with --engine plain[/]", highlight=False)
-    return finish(runner, survey(runner))
+        if settings.engine != "plain":
+            try:
+                return survey_with_prefect(runner, finish)
+            except EngineUnavailable as error:
+                console.print(f"[yellow]{escape(str(error))}; going on with --engine plain[/]", highlight=False)
+        return finish(runner, survey(runner))
 
 
 JUDGE = STAGES["evaluate"]
@@ -163,10 +151,8 @@ def _is_stopped(runner: StageRunner, run: Run) -> bool:
         return False
     stores = {name: one.key for name, one in runner.records.items()}
     found = {str(row.get("name")): row.get("key") for row in run.stages}
-    return found == stores and _told(run.settings) == _told(asked_settings(runner.run))
-
-
-def _told(settings: Mapping[str, Any]) -> str:
-    """Settings as a receipt tells them, in one text."""
-    plain = json.loads(to_json({name: value for name, value in settings.items() if name not in NOT_ASKED}))
-    return canonical_json(plain)
+    asked = (
+        canonical_json(json.loads(to_json({name: value for name, value in given.items() if name not in NOT_ASKED})))
+        for given in (run.settings, asked_settings(runner.run))
+    )
+    return found == stores and len(set(asked)) == 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -89,6 +90,12 @@ def _row(archive: Archive, catalogue: Catalogue, run: Run, line: Mapping[str, An
     receipt = run.receipt
     savings = found if isinstance(found := receipt.get("savings"), Mapping) else {}
     shares, unit = _areas(archive, catalogue, run)
+    colours: dict[str, str] = {}  # in which the run's map shows its classes, as CSS writes them
+    if (address := run.products.get("class_map")) is not None:
+        with suppress(OSError, LookupError, ValueError):
+            shown = load_class_names(archive.locate(address))
+            hexes = [f"#{bytes(map(int, rgb)).hex()}" for rgb in shown.colours]
+            colours = dict(zip(shown.names, hexes, strict=False))
     return {
         "run": run.uri,
         "created": run.created,
@@ -100,7 +107,7 @@ def _row(archive: Archive, catalogue: Catalogue, run: Run, line: Mapping[str, An
             for name in ("capture_s", "lines", "bytes_stored", "multiply_adds")
         },
         "areas": shares,
-        "colours": _colours(archive, run),
+        "colours": colours,
         "unit": unit,
         "problem": run.problem,
     }
@@ -122,18 +129,6 @@ def _areas(archive: Archive, catalogue: Catalogue, run: Run) -> tuple[dict[str, 
     counts = {name: int((found.classes == number).sum()) for number, name in enumerate(found.names)}
     total = sum(counts.values()) or 1
     return {name: count / total for name, count in counts.items()}, "share"
-
-
-def _colours(archive: Archive, run: Run) -> dict[str, str]:
-    """The colours in which the run's map shows its classes, as CSS writes them; none where there is no map."""
-    address = run.products.get("class_map")
-    try:
-        found = None if address is None else load_class_names(archive.locate(address))
-    except (OSError, LookupError, ValueError):
-        found = None
-    if found is None:
-        return {}
-    return {name: f"#{bytes(map(int, rgb)).hex()}" for name, rgb in zip(found.names, found.colours, strict=False)}
 
 
 def day_of(row: Mapping[str, Any]) -> float | None:

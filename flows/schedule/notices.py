@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from flows.schedule.due_runs import Outcome
+from flows.schedule.due_runs import Outcome, outcome_of
 from flows.schedule.field_schedule import FieldSchedule, moment_words, read_moment, read_state
 from pipeline.errors import PipelineError, SettingsError
 
@@ -64,7 +64,7 @@ class ScheduleNews:
         if known is None:
             return []
         many = [found for line in passed[told:] if (found := _several(name, line)) is not None]
-        return [*many, *(_outcome(name, due, ended[due]) for due in sorted(set(ended) - known))]
+        return [*many, *(outcome_of(name, due, ended[due]) for due in sorted(set(ended) - known))]
 
 
 def together(outcomes: Iterable[Outcome]) -> list[Outcome]:
@@ -88,11 +88,6 @@ def _as_one(outcomes: Sequence[Outcome]) -> Outcome:
         since=min(one.since if isinstance(one, Several) else one.due for one in outcomes),
         count=None if None in counts else sum(filter(None, counts)),
     )
-
-
-def _outcome(name: str, due: datetime, line: Mapping[str, Any]) -> Outcome:
-    reason, run = line.get("reason"), line.get("run")
-    return Outcome(name, due, line["event"], None if reason is None else str(reason), None if run is None else str(run))
 
 
 def _several(name: str, line: Mapping[str, Any]) -> Several | None:

@@ -78,9 +78,11 @@ class RigLock:
 
     def holder(self) -> str:
         """Who holds it, as far as is known."""
-        with suppress(OSError, UnicodeDecodeError):
-            words = _held_by(self.place) if isinstance(self.place, str) else self.place.read_text().strip()
-            return words or "another process"
+        with suppress(OSError, UnicodeDecodeError, IndexError):
+            if isinstance(self.place, Path):
+                return self.place.read_text().strip() or "another process"
+            below = rf" @{re.escape(self.place)}/(.+)$"  # the words below a name that is held
+            return re.findall(below, _NAMES.read_text(errors="replace"), re.MULTILINE)[0]
         return "another process"
 
     def of_servers(self) -> Path | str:
@@ -135,12 +137,6 @@ def _hold_name(name: str, words: str) -> Callable[[], None] | None:
 def _bind(held: ExitStack, name: str) -> None:
     one = held.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM))
     one.bind(b"\0" + name.encode())
-
-
-def _held_by(name: str) -> str:
-    """The words below a name that is held."""
-    told = re.findall(rf" @{re.escape(name)}/(.+)$", _NAMES.read_text(errors="replace"), re.MULTILINE)
-    return told[0] if told else ""
 
 
 @contextmanager

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import signal
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from datetime import datetime, timedelta
@@ -207,7 +207,9 @@ def serve_plain(
             for outcome in together(fresh):
                 note(outcome)
             if not any(outcome.ending for outcome in outcomes):  # else others may have become due meanwhile
-                watch.sleep(_pause(schedules.values(), watch.now()).total_seconds())
+                now = watch.now()
+                due = [schedule.timetable.next_after(now) for schedule in schedules.values()]
+                watch.sleep(min([LOOK_AGAIN, *(one - now for one in due if one is not None)]).total_seconds())
 
 
 def _close(name: str, schedule: FieldSchedule, tell: Tell) -> None:
@@ -216,9 +218,3 @@ def _close(name: str, schedule: FieldSchedule, tell: Tell) -> None:
         schedule.close()
     except PipelineError as error:
         tell(f"{name}: {error}")
-
-
-def _pause(schedules: Iterable[FieldSchedule], now: datetime) -> timedelta:
-    due = [schedule.timetable.next_after(now) for schedule in schedules]
-    soonest = min((one - now for one in due if one is not None), default=LOOK_AGAIN)
-    return min(soonest, LOOK_AGAIN)

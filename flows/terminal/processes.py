@@ -92,11 +92,18 @@ def place_caches(environment: MutableMapping[str, str] | None = None) -> Path | 
     SettingsError : nothing can be written, the temporary folder included.
     """
     environment = os.environ if environment is None else environment
-    if not _has_home(environment):
+    try:
+        home = environment.get("HOME") or pwd.getpwuid(os.getuid()).pw_dir
+    except KeyError:
+        home = None
+    if not home:
         environment["HOME"] = NO_HOME  # Prefect asks for one before anybody tells it where to keep its files
     usual = _usual_folder(environment)
-    if usual is not None and _can_be_made(usual):
-        return None
+    with suppress(OSError):
+        if usual is not None:
+            usual.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if os.access(usual, os.W_OK | os.X_OK):
+                return None
     folder = _private_folder(usual)
     environment["XDG_CACHE_HOME"] = str(folder)
     for name, part in OF_LIBRARIES.items():
@@ -114,16 +121,6 @@ def place_pages(environment: Mapping[str, str] | None = None) -> dict[str, str]:
     return {"PREFECT_SERVER_UI_STATIC_DIRECTORY": str(folder / "spectralzoom" / "prefect-pages")}
 
 
-def _has_home(environment: Mapping[str, str]) -> bool:
-    """Whether the environment or the system's list of users names a home, be it there or not."""
-    if environment.get("HOME"):
-        return True
-    try:
-        return bool(pwd.getpwuid(os.getuid()).pw_dir)
-    except KeyError:
-        return False
-
-
 def _usual_folder(environment: Mapping[str, str]) -> Path | None:
     """Where caches belong; None where there is no home to hold them."""
     named = Path(environment.get("XDG_CACHE_HOME", ""))
@@ -133,20 +130,13 @@ def _usual_folder(environment: Mapping[str, str]) -> Path | None:
     return home / ".cache" if home.is_absolute() and home.is_dir() else None
 
 
-def _can_be_made(folder: Path) -> bool:
-    try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    except OSError:
-        return False
-    return os.access(folder, os.W_OK | os.X_OK)
-
-
 def _private_folder(usual: Path | None) -> Path:
     try:
         folder = Path(tempfile.gettempdir()) / f"spectralzoom-{os.geteuid()}"
         with suppress(FileExistsError):
             folder.mkdir(mode=0o700)
-        if _is_ours_alone(folder):
+        found = folder.lstat()  # a folder, no link, that this user owns and no other may enter
+        if stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid() and not found.st_mode & 0o077:
             return folder
         other = Path(tempfile.mkdtemp(prefix="spectralzoom-"))
     except OSError as error:
@@ -156,12 +146,6 @@ def _private_folder(usual: Path | None) -> Path:
         ) from None
     atexit.register(shutil.rmtree, other, ignore_errors=True)
     return other
-
-
-def _is_ours_alone(folder: Path) -> bool:
-    """Whether it is a folder, no link, that this user owns and no other may enter."""
-    found = folder.lstat()
-    return stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid() and not found.st_mode & 0o077
 
 
 LARGEST_LOG = 10_000_000  # bytes; a larger one is begun anew
