@@ -109,7 +109,6 @@ def run_export(archive: str | Path, run: str | None, out: Path, envi: bool, cons
 
 @contextmanager
 def _alone_in(out: Path) -> Iterator[None]:
-    """Wait until no other export writes there."""
     release = take_lock(out / ".export.lock")
     try:
         yield

@@ -127,21 +127,14 @@ def map_layers(run: ExportedRun) -> list[Layer]:
     about = open_image(run.path(product), "classes").about
     colours = np.array(about.get("class_colours", ()), np.uint8).reshape(-1, 3)
     legend = ClassLegend(tuple(about.get("class_names", ())), colours)
-    made = [
-        _layer(run, product, "classes", ("class",), nodata=UNLABELLED, legend=legend),
-        _layer(run, product, "confidence", ("confidence",), nodata=np.nan),
-        _attention(run),
-        _picture(run) if run.geobox is None else _layer(run, product, "picture", RGB, nodata=0),
-    ]
-    names = {
-        "class_map": ("Class map", ("data",), None, classes(legend)),
-        "confidence": ("Probability of the class given", ("data", "confidence"), "1", {}),
-        "attention": ("Worth of a fine look, by seat", ("data",), "1", {}),
-        "rgb": ("Picture of the coarse look", ("visual", "overview"), None, {}),
-    }
+    drawn = _layer(run, product, "classes", ("class",), nodata=UNLABELLED, legend=legend)
+    sure = _layer(run, product, "confidence", ("confidence",), nodata=np.nan)
+    seen = _picture(run) if run.geobox is None else _layer(run, product, "picture", RGB, nodata=0)
     return [
-        Layer(name, title, roles, image, rows, unit, about)
-        for (name, (title, roles, unit, about)), (image, rows) in zip(names.items(), made, strict=True)
+        Layer("class_map", "Class map", ("data",), *drawn, fields=classes(legend)),
+        Layer("confidence", "Probability of the class given", ("data", "confidence"), *sure, "1"),
+        Layer("attention", "Worth of a fine look, by seat", ("data",), *_attention(run), "1"),
+        Layer("rgb", "Picture of the coarse look", ("visual", "overview"), *seen),
     ]
 
 

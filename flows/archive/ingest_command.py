@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -51,26 +50,23 @@ def ingest(
     wavelengths
         Centre wavelengths of all bands [nm], where the files do not say them: 660,800
     """
-    request = IngestRequest(source, archive, name, dark, white, parse_numbers(wavelengths, "--wavelengths"))
-    record = run_ingest(request, stderr)
+    nm = parse_numbers(wavelengths, "--wavelengths")
+    record = run_ingest(source, archive, stderr, name=name, dark=dark, white=white, wavelengths=nm)
     if as_json:
         print_json(record)
     return DONE
 
 
-@dataclass(frozen=True)
-class IngestRequest:
-    """What to ingest, as the flags say it."""
-
-    source: str
-    archive: str | Path
-    name: str | None = None
-    dark: str | None = None
-    white: str | None = None
-    wavelengths: Sequence[float] | None = None  # [nm], one a band
-
-
-def run_ingest(request: IngestRequest, console: Console) -> dict[str, Any]:
+def run_ingest(
+    source: str,
+    archive: str | Path,
+    console: Console,
+    *,
+    name: str | None = None,
+    dark: str | None = None,
+    white: str | None = None,
+    wavelengths: Sequence[float] | None = None,
+) -> dict[str, Any]:
     """Store a source in an archive, with progress on ``console``; give the record that --json prints.
 
     What the files hold and the flags say is the store's key: the same content is stored once, whatever it is called and
@@ -81,29 +77,30 @@ def run_ingest(request: IngestRequest, console: Console) -> dict[str, Any]:
     SceneError, WavelengthError : the source cannot be used, or changed while it was read.
     ArchiveError : the name cannot be one in an archive, or the archive cannot be written to.
     """
-    if request.name is not None:
-        check_name(request.name)
+    if name is not None:
+        check_name(name)
     with console.status("opening the source"):
-        source = open_cube_source(request.source, dark=request.dark, white=request.white)
-        if request.wavelengths is not None:
-            source = with_wavelengths(source, request.wavelengths)
-        archive = open_archive(request.archive)
-        archive.reclaim()  # what a killed ingest left half made
-    with archive.in_use(), StageProgress(console, TITLES) as progress:
-        before = _stamps(source)
-        files = hash_files(source, lambda done: progress.show("read", done))
+        cube = open_cube_source(source, dark=dark, white=white)
+        if wavelengths is not None:
+            cube = with_wavelengths(cube, wavelengths)
+        opened = open_archive(archive)
+        opened.reclaim()  # what a killed ingest left half made
+    with opened.in_use(), StageProgress(console, TITLES) as progress:
+        before = _stamps(cube)
+        files = hash_files(cube, lambda done: progress.show("read", done))
         progress.show("read", 1.0, ended=True)
 
         def build(path: Path) -> None:
-            name = request.name or source.name
-            write_ingested_cube(path, source, files, name=name, report=lambda done: progress.show(STAGE, done))
-            if _stamps(source) != before:  # what was written is not what was hashed
-                raise SceneError(f"{request.source} changed while it was read; ingest it again once it is whole")
+            write_ingested_cube(
+                path, cube, files, name=name or cube.name, report=lambda done: progress.show(STAGE, done)
+            )
+            if _stamps(cube) != before:  # what was written is not what was hashed
+                raise SceneError(f"{source} changed while it was read; ingest it again once it is whole")
 
-        ref, built = archive.produce(STAGE, build, version=VERSION, params=_key(request, source, files))
+        ref, built = opened.produce(STAGE, build, version=VERSION, params=_key(name, cube, files))
         progress.show(STAGE, 1.0, "" if built else "cached", ended=True)
-    record = _record(archive, ref, source, files, cached=not built)
-    _print(record, source, console)
+    record = _record(opened, ref, cube, files, cached=not built)
+    _print(record, cube, console)
     return record
 
 
@@ -122,14 +119,14 @@ def _stamps(source: CubeSource) -> list[tuple[int, int]]:
     return [(path.stat().st_size, path.stat().st_mtime_ns) for path in source.files]
 
 
-def _key(request: IngestRequest, source: CubeSource, files: Sequence[SourceFile]) -> dict[str, Any]:
+def _key(name: str | None, source: CubeSource, files: Sequence[SourceFile]) -> dict[str, Any]:
     """What the store depends on: content, the flags, and wavelengths that come from elsewhere than the files."""
     named = source.root is not None  # in a Zarr store names say where a chunk lies
     centres, widths = source.bands.wavelength_nm, source.bands.fwhm_nm
     return {
         "files": [[file.name if named else "", file.size, file.sha256] for file in files],
         "shape": source.shape,
-        "name": request.name,
+        "name": name,
         "references": [source.dark, source.white],
         "wavelength_nm": None if centres is None else centres.tolist(),
         "fwhm_nm": None if widths is None else widths.tolist(),
@@ -162,7 +159,6 @@ def _record(
 
 
 def _print(record: dict[str, Any], source: CubeSource, console: Console) -> None:
-    """The record in a few lines: what came in, what is doubtful, where it lies."""
     lines, samples, bands = record["shape"]
     span = record["wavelength_nm"]
     light = "no wavelengths (give --wavelengths)" if span is None else f"{span[0]:g}-{span[1]:g} nm"

@@ -5,7 +5,7 @@ Nothing of the survey is made again: what it left is read from the archive, and 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from rich.console import Console
 from rich.markup import escape
@@ -15,7 +15,6 @@ from flows.archive.stale_runs import asked_again
 from flows.publish.receipt import Receipt
 from flows.publish.run_folder import add_accuracy, load_receipt
 from flows.publish.survey_command import show_published
-from flows.settings.survey_settings import Settings
 from flows.survey.run import SurveyRun, open_run
 from flows.survey.sources import for_rig
 from flows.survey.stage import versions
@@ -29,30 +28,28 @@ from storage.archive.records import Run
 from storage.remote.opening import open_archive
 
 
-@dataclass(frozen=True)
-class JudgeRequest:
-    """Which run, and how: None leaves it as the survey was asked for."""
-
-    archive: str
-    run: str  # its name, `latest` or `previous`
-    controls: bool | None = None
-    labels: str | None = None
-
-
-def run_judge(request: JudgeRequest, console: Console) -> Receipt:
+def run_judge(
+    archive: str, name: str, console: Console, *, controls: bool | None = None, labels: str | None = None
+) -> Receipt:
     """Judge a run's map and add its accuracy to the run; gives its receipt, as it is where it has what is asked for.
+
+    ``name`` may be `latest` or `previous`; what is None is as the survey was asked for.
 
     Raises
     ------
     ArchiveError : there is no such run, it is damaged, or lacks what is needed.
     SceneError, WeightsError : scene, labels or weights are not those of the run, or there are no labels.
     """
-    opened = open_archive(request.archive, create=False)
+    opened = open_archive(archive, create=False)
     catalogue = Catalogue.read(opened.root)
-    found = find_run(catalogue, request.run)
+    found = find_run(catalogue, name)
     receipt = load_receipt(found.folder)
-    settings = _settings(found, request, opened.name)
-    judged = "accuracy" in receipt and request.labels is None
+    settings = replace(asked_again(found, opened.name, None), accuracy=True)
+    if controls is not None:
+        settings = for_rig(replace(settings, controls=controls))
+    if labels is not None:
+        settings = replace(settings, labels=labels)
+    judged = "accuracy" in receipt and labels is None
     if judged and (receipt["accuracy"]["controls"] or not settings.controls):
         console.print(escape(f"{found.uri} has its accuracy already"), highlight=False, soft_wrap=True)
         return receipt
@@ -75,14 +72,6 @@ def run_judge(request: JudgeRequest, console: Console) -> Receipt:
     return published.receipt
 
 
-def _settings(found: Run, request: JudgeRequest, archive: str) -> Settings:
-    """The settings of the run's survey, with what is asked for now."""
-    settings = replace(asked_again(found, archive, None), accuracy=True)
-    if request.controls is not None:
-        settings = for_rig(replace(settings, controls=request.controls))
-    return settings if request.labels is None else replace(settings, labels=request.labels)
-
-
 def _products(catalogue: Catalogue, found: Run, run: SurveyRun) -> Products:
     """What the run's survey left, each whole by its manifest and of the present version of its stage."""
     rows = {str(row.get("name")): row for row in found.stages}
@@ -90,16 +79,15 @@ def _products(catalogue: Catalogue, found: Run, run: SurveyRun) -> Products:
     for stage in STAGES.values():
         if not stage.judges:
             row = rows.get(stage.name, {})
+            key, what = str(row.get("key") or ""), f"{stage.title} of {found.uri}"
             skipped = row.get("state") == "skipped"
-            key = str(row.get("key") or "")
-            products[stage.name] = None if skipped else _store(catalogue, found, run.archive, stage.title, key)
+            products[stage.name] = None if skipped else _store(catalogue, run.archive, what, key)
     return products
 
 
-def _store(catalogue: Catalogue, found: Run, archive: Archive, title: str, key: str) -> StageRef:
+def _store(catalogue: Catalogue, archive: Archive, what: str, key: str) -> StageRef:
     uris = [uri for uri in catalogue.by_key.get(key, []) if uri in catalogue.stores]
     store = catalogue.stores[uris[0]] if uris else None
-    what = f"{title} of {found.uri}"
     if store is None or store.problem is not None:
         raise ArchiveError(f"the {what} is missing or damaged; run verify --repair")
     now = versions().get(store.ref.stage)

@@ -134,7 +134,6 @@ class Planner:
         return ref
 
     def _look(self, stage: Stage, wanted: Wanted) -> tuple[StageForecast, StageRef]:
-        """Find the store that a stage wants, or say why there is none."""
         key = stage.key(wanted)
         if stage.name == "capture_fine":
             self._costs.plan_fine(sum(sweep["lines"] for sweep in wanted.params["sweeps"]))

@@ -196,7 +196,6 @@ def _moment(text: str) -> datetime:
 def _again(
     catalogue: Catalogue, generation: Generation, request: ReprocessRequest, console: Console, survey: Survey
 ) -> dict[str, Any]:
-    """One field surveyed again; an error is said in its row."""
     run, begun = generation.run, time.perf_counter()
     row: dict[str, Any] = {
         "field": generation.field,
@@ -239,7 +238,6 @@ def _scores(receipt: Mapping[str, Any], when: str) -> dict[str, float | None]:
 
 
 def _words(row: Mapping[str, Any]) -> str:
-    """What became of one field, in one line."""
     words = f"{row['field']} ({row['old']}) {row['state']}"
     if row["state"] == "ran":
         words += f": {row['new']}, {format_seconds(row['seconds'])}"
@@ -251,7 +249,6 @@ def _words(row: Mapping[str, Any]) -> str:
 
 
 def _show(content: Mapping[str, Any], file: Path | None) -> None:
-    """Print the summary on stdout, a line a field."""
     rows = content["fields"]
     counts = {state: sum(row["state"] == state for row in rows) for state in STATES}
     told = ", ".join(f"{count} {state}" for state, count in counts.items() if count)

@@ -143,7 +143,6 @@ class PastCosts:
         )
 
     def _below(self, store: Store) -> list[Store]:
-        """A store and all that it rests on."""
         stores = self._catalogue.stores
         below = self._catalogue.ancestors([store.ref.uri])
         return [store, *(stores[uri] for uri in sorted(below) if uri in stores)]

@@ -54,7 +54,6 @@ def _run(arguments: list[str]) -> int:
 
 
 def _usage(error: CycloptsError) -> str:
-    """What was wrong with the words of a command, and where its right ones stand."""
     what = str(error).partition(" Available commands:")[0]  # cut off in the middle: the help has them all
     verb = " ".join(("spectralzoom", *(error.command_chain or ())))
     if isinstance(error, UnknownOptionError):

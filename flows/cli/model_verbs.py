@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from flows.archive.judge_command import JudgeRequest, run_judge
+from flows.archive.judge_command import run_judge
 from flows.cli.app import AsJson, OutFile, OutFolder, Switch, parse_numbers, parse_wholes, split_list, stderr
 from flows.evaluate.command import run_evaluate
 from flows.evaluate.request import SHARES, USUAL, EvaluateRequest
@@ -311,7 +311,7 @@ def _evaluate_run(archive: str, run: str, flags: Mapping[str, Any]) -> int:
                 f"--{name.replace('_', '-')} is for weights that are judged on a data set; the run {run} is judged as "
                 "it was surveyed: leave it out"
             )
-    receipt = run_judge(JudgeRequest(archive, run, flags["controls"], flags["labels"]), stderr)
+    receipt = run_judge(archive, run, stderr, controls=flags["controls"], labels=flags["labels"])
     if flags["as_json"]:
         print_json(receipt)
     return 0

@@ -80,37 +80,27 @@ def small_jpeg(png: bytes) -> bytes:
 
 
 def progress_shown(field: str) -> Callable[[str, str, float], None]:
-    """What shows how far stages are on Prefect's pages: nothing outside of a flow, or where the server is gone."""
+    """What shows how far stages are on Prefect's pages, every two seconds at most: nothing outside of a flow.
+
+    A stage has an artifact where it takes longer than a moment. A server that is gone is no matter.
+    """
     if not inside_flow():
         return lambda stage, state, done: None
-    shown = TaskProgress(field, time.monotonic)
+    from prefect.artifacts import create_progress_artifact, update_progress_artifact
+
+    shown: dict[str, Any] = {}
+    last: dict[str, float] = {}
 
     def show(stage: str, state: str, done: float) -> None:
+        now = time.monotonic()
+        if now - last.setdefault(stage, now) < 2.0 and not (stage in shown and state != "running"):
+            return
+        last[stage] = now
         with suppress(Exception):
-            shown(stage, state, done)
+            if stage in shown:
+                update_progress_artifact(shown[stage], progress=round(100 * done, 1))
+            else:
+                key = f"{stage.replace('_', '-')}-{artifact_key(field)}"
+                shown[stage] = create_progress_artifact(100 * done, key=key, description=stage)
 
     return show
-
-
-class TaskProgress:
-    """How far the stages of a flow are, as Prefect artifacts: one for a stage that takes longer than a moment."""
-
-    def __init__(self, field: str, clock: Callable[[], float]) -> None:
-        self._field, self._clock = artifact_key(field), clock
-        self._shown: dict[str, Any] = {}
-        self._last: dict[str, float] = {}
-
-    def __call__(self, stage: str, state: str, done: float) -> None:
-        """Show it, at most every two seconds."""
-        from prefect.artifacts import create_progress_artifact, update_progress_artifact
-
-        now = self._clock()
-        since = now - self._last.setdefault(stage, now)
-        if since < 2.0 and not (stage in self._shown and state != "running"):
-            return
-        self._last[stage] = now
-        if stage in self._shown:
-            update_progress_artifact(self._shown[stage], progress=round(100 * done, 1))
-        else:
-            name = stage.replace("_", "-")
-            self._shown[stage] = create_progress_artifact(100 * done, key=f"{name}-{self._field}", description=stage)

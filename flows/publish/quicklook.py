@@ -99,7 +99,6 @@ _FLAT, _TALL = 0.3, 2.0  # height over width beyond which the panels are stacked
 
 
 def _compose(data: QuicklookData) -> Figure:
-    """Place title, panels and legend on a page that is as large as the panels need."""
     height, width = data.class_map.shape
     page_width, rows = _arrange(height / width)
     caption = 1.25 if height / width > _TALL else 0.72  # inches: narrow panels need another line of words or two
@@ -153,7 +152,6 @@ def _draw_raw(axes: Axes, data: QuicklookData) -> None:
 
 
 def _draw_rectified(axes: Axes, data: QuicklookData) -> None:
-    """Panel 1, second half: the same bands of the field put straight."""
     _, words = choose_bands(data.wavelength_nm)
     _show(axes, _colours(data, data.rectified))
     draw_scale(axes, data.class_map.shape, data.pixel_mrad)
@@ -219,7 +217,6 @@ def _score_range(score: NDArray[np.floating]) -> tuple[NDArray[np.float64], floa
 
 
 def _draw_classes(axes: Axes, data: QuicklookData) -> None:
-    """Panel 3: the class map in the legend's colours."""
     _show(axes, class_rgb(data.class_map, _palette(data)), interpolation="nearest")
     draw_scale(axes, data.class_map.shape, data.pixel_mrad)
     _caption(axes, "3  Class map", "what the model says grows where")
@@ -244,7 +241,6 @@ def _draw_truth(axes: Axes, data: QuicklookData) -> None:
 
 
 def _draw_legend(figure: Figure, data: QuicklookData, columns: int) -> None:
-    """Class names with their colours and shares of the map, along the bottom."""
     palette = _palette(data)
     shares = np.bincount(data.class_map.ravel(), minlength=256)[: len(data.class_names)] / max(data.class_map.size, 1)
     marks = [Patch(facecolor=tuple(colour), edgecolor="#555555", linewidth=0.6) for colour in palette]

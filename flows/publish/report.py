@@ -10,7 +10,6 @@ import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache, partial
-from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -72,35 +71,13 @@ class Picture:
     caption: str
 
 
-def write_report(
-    path: str | Path,
-    receipt: Receipt,
-    quicklook_png: bytes,
-    pictures: Iterable[Picture] = (),
-    *,
-    looked_twice: float | None = None,
-) -> None:
-    """Write the page.
-
-    Parameters
-    ----------
-    pictures
-        More pictures, shown below the quicklook.
-    looked_twice
-        Share of the field captured in detail, 0..1, for the first sentence; None leaves it out.
-
-    Raises
-    ------
-    OSError : the file cannot be written.
-    """
-    page = render_report(receipt, quicklook_png, pictures, looked_twice=looked_twice)
-    Path(path).write_text(page, encoding="utf-8")
-
-
 def render_report(
     receipt: Receipt, quicklook_png: bytes, pictures: Iterable[Picture] = (), *, looked_twice: float | None = None
 ) -> str:
-    """The page as text; the same receipt and pictures give the same bytes."""
+    """The page as text, ``pictures`` below the quicklook; the same receipt and pictures give the same bytes.
+
+    ``looked_twice`` is the share of the field captured in detail, 0..1, for the first sentence; None leaves it out.
+    """
     shown = [Picture(quicklook_png, "The survey at a glance."), *pictures]
     split: Mapping[str, Any] = receipt["savings"]["multiply_adds"]
     parts = [name for name in ("glance", "score", "encode", "decode") if split["done"] and split[name] is not None]
@@ -141,7 +118,6 @@ def _scores(accuracy: Accuracy | None) -> dict[str, Any]:
 
 
 def _flat(settings: Mapping[str, Any]) -> dict[str, object]:
-    """Tables within the settings as dotted names."""
     flat: dict[str, object] = {}
     for name, value in settings.items():
         table = isinstance(value, Mapping)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from flows.publish.panels import draw_ground
 from flows.publish.quicklook import QuicklookData, draw_quicklook
 from flows.publish.receipt import AccuracyIs, Header, Receipt, build_receipt, check_receipt, with_accuracy
-from flows.publish.report import Picture, write_report
+from flows.publish.report import Picture, render_report
 from flows.settings.load import anchor_paths
 from flows.survey.model_work import work_done, work_of_map
 from flows.survey.run import SurveyRun, now
@@ -122,14 +122,14 @@ def load_receipt(folder: Path) -> Receipt:
 
 
 def _publish(run: SurveyRun, draft: RunDraft, products: Products, plan: FinePlan, receipt: Receipt) -> Published:
-    """Draw and write what a run's folder holds, and publish it."""
     looked_twice = float(seen_shares(run, products.of("cut_patches")).sum()) / len(run.grid.valid_seats())
     draw_quicklook(draft.folder / "quicklook.png", quicklook_data(run, products, plan, receipt))
     draft.write_file("receipt.json", to_json(receipt))
     picture = (draft.folder / "quicklook.png").read_bytes()
     maps = (load_ground_map(ref.path / STORE) for ref in products.there(["ground"]))
     pictures = [Picture(draw_ground(drawn), "The map on the ground, north up.") for drawn in maps]
-    write_report(draft.folder / "report.html", receipt, picture, pictures, looked_twice=looked_twice)
+    page = render_report(receipt, picture, pictures, looked_twice=looked_twice)
+    (draft.folder / "report.html").write_text(page, encoding="utf-8")
     rests_on = run.archive.manifest_hashes(products.there(products))
     folder = draft.publish(survey=receipt["survey"], settings=receipt["settings"], rests_on=rests_on)
     return Published(receipt, folder, looked_twice)
@@ -173,7 +173,6 @@ def asked_settings(run: SurveyRun) -> dict[str, object]:
 
 
 def _address(name: str, ref: StageRef) -> str:
-    """Where a receipt says that a product lies."""
     return f"{ref.uri}{IN_STORES[name][1]}"
 
 

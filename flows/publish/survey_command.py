@@ -146,7 +146,6 @@ def _draft_of_stopped(runner: StageRunner) -> RunDraft | None:
 
 
 def _is_stopped(runner: StageRunner, run: Run) -> bool:
-    """Whether a run waits for its accuracy, and is of this survey: the same settings, the same stores."""
     if run.problem is not None or not is_pending(run.receipt):
         return False
     stores = {name: one.key for name, one in runner.records.items()}

@@ -120,8 +120,9 @@ def render_index(histories: Sequence[FieldHistory], archive: str, pages: Mapping
                 "runs": len(one.runs),
                 "newest": _short(max((str(row["created"]) for row in one.runs), default="")) or DASH,
                 "counts": list(one.counts.values()),
-                "trouble": next((line for line in reversed(one.events) if line["event"] != "done"), {}).get("reason")
-                or "",
+                "trouble": next(
+                    (line.get("reason") or "" for line in reversed(one.events) if line["event"] != "done"), ""
+                ),
             }
             for one in histories
         ],

@@ -135,7 +135,12 @@ def notice_address(given: str | None) -> str | None:
 
 
 def _checked(address: str, otherwise: str) -> str:
-    if not _can_be_asked(address):
+    try:
+        parts = urlsplit(address)
+        known = parts.scheme in ("http", "https") and parts.hostname and parts.port != 0 and "@" not in parts.netloc
+    except ValueError:
+        known = False
+    if not known or not address.isprintable() or any(character.isspace() for character in address):
         raise SettingsError(f"{otherwise}; expected https://HOST/PATH")
     return address
 
@@ -166,14 +171,3 @@ def send_notice(address: str | None, outcome: Outcome, archive: str) -> bool:
     with suppress(OSError, ValueError, HTTPException), opener.open(request, timeout=PATIENCE_S):
         return True
     return False
-
-
-def _can_be_asked(address: str) -> bool:
-    if not address.isprintable() or any(character.isspace() for character in address):
-        return False
-    try:
-        parts = urlsplit(address)
-        port = parts.port
-    except ValueError:
-        return False
-    return parts.scheme in ("http", "https") and bool(parts.hostname) and port != 0 and "@" not in parts.netloc

@@ -82,7 +82,8 @@ class RigLock:
             if isinstance(self.place, Path):
                 return self.place.read_text().strip() or "another process"
             below = rf" @{re.escape(self.place)}/(.+)$"  # the words below a name that is held
-            return re.findall(below, _NAMES.read_text(errors="replace"), re.MULTILINE)[0]
+            told: list[str] = re.findall(below, _NAMES.read_text(errors="replace"), re.MULTILINE)
+            return told[0]
         return "another process"
 
     def of_servers(self) -> Path | str:
@@ -160,7 +161,6 @@ def rig_to_oneself(settings: Settings, words: str) -> Iterator[None]:
 
 
 def _port(settings: Settings) -> str | None:
-    """Name of the rig's port; None of a source that is no rig."""
     return settings.rig.port if settings.source == "rig" else None
 
 

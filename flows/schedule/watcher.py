@@ -269,7 +269,6 @@ class Watcher:
         return True
 
     def _why(self, line: Mapping[str, Any]) -> str | None:
-        """Why a run is not to be resumed: somebody cancelled it."""
         known = line.get("flow_run")
         with suppress(Exception), self.client_of() as client:
             state = client.read_flow_run(known).state if known else None

@@ -229,7 +229,6 @@ class KeptProcess:
         self._forget()
 
     def _forget(self) -> None:
-        """It has been waited for."""
         let_go, self._let_go, self._process = self._let_go, None, None
         if let_go is not None:
             let_go()

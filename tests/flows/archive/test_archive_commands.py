@@ -29,13 +29,10 @@ from tests.storage.small_archive import flip, small_survey
 QUIET = Console(quiet=True)
 
 
-@pytest.fixture(scope="module")
-def surveyed(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey) -> Path:
-    """An archive of two surveys of one scene with different budgets; not to be changed."""
-    folder = tmp_path_factory.mktemp("surveyed")
-    for budget in ("0.8", "0.7"):
-        survey_png(folder, budget=budget)
-    return folder
+@pytest.fixture
+def surveyed(two_budgets: Path) -> Path:
+    """Not to be changed."""
+    return two_budgets
 
 
 @pytest.fixture

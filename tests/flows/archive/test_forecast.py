@@ -35,17 +35,10 @@ def settings(scene_files: Path, weights: Path) -> Settings:
     return load_settings(None, given | {"engine": "plain", "budget": "0.8", "controls": False})
 
 
-@pytest.fixture(scope="module")
-def surveyed(tmp_path_factory: pytest.TempPathFactory, survey_png: Any) -> tuple[Path, Any]:
-    """An archive with one survey of the small picture, not to be changed, and its receipt."""
-    out = tmp_path_factory.mktemp("surveyed")
-    return out, survey_png(out).receipt
-
-
 @pytest.fixture
-def archive(surveyed: tuple[Path, Any], tmp_path: Path) -> Path:
-    """A copy of that archive."""
-    return Path(shutil.copytree(surveyed[0], tmp_path / "archive"))
+def archive(one_survey: tuple[Path, Any], tmp_path: Path) -> Path:
+    """A copy of an archive with one survey."""
+    return Path(shutil.copytree(one_survey[0], tmp_path / "archive"))
 
 
 def _plan(settings: Settings, out: Path, **changes: Any) -> dict[str, StageForecast]:
@@ -161,7 +154,7 @@ def test_two_records_tell_what_starting_takes() -> None:
     assert scaled_cost([10.0, 30.0], [1.0, 3.5], 0.0) == 0.0
 
 
-def _plan(asked: Settings, *, as_json: bool = False) -> None:
+def _show(asked: Settings, *, as_json: bool = False) -> None:
     put_out(plan_content(asked), show_plan, as_json=as_json)
 
 
@@ -185,9 +178,9 @@ def test_a_field_beyond_this_machine_is_planned_without_drawing_it(
     with pytest.raises(SettingsError, match="this machine has 9; take a smaller one") as refused:
         open_run(asked)
     assert found.refused == str(refused.value)
-    _plan(asked)
+    _show(asked)
     assert f"refused here: {refused.value}" in capsys.readouterr().out
-    _plan(asked, as_json=True)
+    _show(asked, as_json=True)
     assert json.loads(capsys.readouterr().out)["refused"] == str(refused.value)
     assert not list(tmp_path.iterdir())
 
@@ -233,17 +226,17 @@ def test_what_the_survey_refuses_the_plan_refuses(settings: Settings, tmp_path: 
 def test_plan_as_json_and_as_a_table(settings: Settings, archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """One object with the sums of what is ahead; the table names every stage and says what is left to make."""
     asked = replace(settings, out=str(archive), kernel="nearest")
-    _plan(asked, as_json=True)
+    _show(asked, as_json=True)
     content = json.loads(capsys.readouterr().out)
     ahead = [row for row in content["stages"] if row["state"] in ("to run", "blocked")]
     assert content["to_make"] == content["estimated"] == len(ahead) == 7
     assert content["seconds"] == pytest.approx(sum(row["seconds"] for row in ahead))
     assert content["bytes"] == sum(row["bytes"] for row in ahead)
-    _plan(asked)
+    _show(asked)
     shown = capsys.readouterr().out
     assert all(row["stage"] in shown for row in content["stages"])
     assert "7 stages to make, about" in shown
-    _plan(replace(settings, out=str(archive)))
+    _show(replace(settings, out=str(archive)))
     assert "everything is stored" in capsys.readouterr().out
 
 

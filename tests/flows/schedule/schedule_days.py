@@ -35,6 +35,14 @@ def field_schedule(
     return FieldSchedule(Ledger(root, field), parse_timetable(None, every, "UTC"), late, clock)
 
 
+def opened(root: Path, every: str = "20m", late: float = 0.5) -> tuple[HandClock, FieldSchedule]:
+    """A clock that shows noon, and a schedule by it that is served since then."""
+    clock = HandClock()
+    schedule = field_schedule(root, clock, every=every, late=late)
+    schedule.open()
+    return clock, schedule
+
+
 def accounted(lines: list[dict[str, object]], timetable: Timetable) -> Counter[datetime]:
     """How often each due time is accounted for: by its own ending, or by a line for very many."""
     found: Counter[datetime] = Counter(list(read_state(lines).ended))
