@@ -187,7 +187,7 @@ def _comparison(catalogue: Catalogue, runs: tuple[Run, Run], pair: _Pair) -> dic
 
 def _classes(runs: tuple[Run, Run], pair: _Pair) -> list[dict[str, Any]]:
     """Area in each map, its change and the agreement of both, for each class that is in one of them."""
-    areas = [found for run in runs if (found := areas_on_ground(run.receipt)) is not None]
+    hectares = [known for run in runs if (known := areas_on_ground(run.receipt)) is not None]
     rows, columns, total = pair.joint.sum(axis=1), pair.joint.sum(axis=0), pair.maps.old.size
     found = []
     for number, name in enumerate((*pair.maps.names, "no class")):
@@ -195,8 +195,8 @@ def _classes(runs: tuple[Run, Run], pair: _Pair) -> list[dict[str, Any]]:
         either = sum(pixels) - both
         if either:
             row = {"name": name, "pixels": pixels, "share": [count / total for count in pixels], "iou": both / either}
-            if len(areas) == 2 and number < len(pair.maps.names):
-                row["ha"] = [float(area.get(name, 0.0)) for area in areas]
+            if len(hectares) == 2 and number < len(pair.maps.names):
+                row["ha"] = [float(area.get(name, 0.0)) for area in hectares]
             found.append(row)
     return found
 

@@ -49,8 +49,8 @@ def run_judge(
         settings = for_rig(replace(settings, controls=controls))
     if labels is not None:
         settings = replace(settings, labels=labels)
-    judged = "accuracy" in receipt and labels is None
-    if judged and (receipt["accuracy"]["controls"] or not settings.controls):
+    there = "accuracy" in receipt and labels is None
+    if there and (receipt["accuracy"]["controls"] or not settings.controls):
         console.print(escape(f"{found.uri} has its accuracy already"), highlight=False, soft_wrap=True)
         return receipt
     use_one_thread()

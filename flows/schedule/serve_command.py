@@ -183,7 +183,7 @@ def serve_plain(
     tell: Tell,
     *,
     clock: WallClock | None = None,
-    note: Callable[[Outcome], None] = lambda outcome: None,
+    note: Callable[[Outcome], object] = lambda outcome: None,
     until: datetime | None = None,
 ) -> None:
     """Serve schedules until ``until``, or until interrupted; then they are closed, and what began is resumed later.
