@@ -1,54 +1,101 @@
-"""What `ls`, `gc`, `explain` and `verify` do: storage does the work, this says where and with which exit code."""
+"""The verbs `ls`, `explain`, `verify`, `gc` and `seal`: what an archive holds as plain tables, and its care.
+
+Storage does the work; this says where, shows what was found, and gives the exit code.
+"""
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Mapping
+import shlex
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from flows.archive.contents import contents, explanation, verdict
 from flows.archive.tables import show_clearance, show_contents, show_explanation, show_repair, show_verdict
-from flows.terminal.progress import StageProgress
-from flows.terminal.shown_text import on_stdout
+from flows.cli.app import ArchiveName, AsJson, Switch, stderr
+from flows.settings.survey_settings import Settings
+from flows.survey.scores import score_of
+from flows.survey.stage import versions
+from flows.terminal.figures import known_number
+from flows.terminal.processes import DONE, FAILED, PARTLY
+from flows.terminal.progress import StageProgress, put_out
+from models.weights.files import seal_weights
 from pipeline.errors import SettingsError
 from storage.archive.archive import Archive
-from storage.archive.whole_files import to_json
-from storage.maintenance.garbage import Removal, clear_up
-from storage.maintenance.repair import Repaired, Rerun
+from storage.archive.changes import changes_between, version_before
+from storage.archive.lineage import Catalogue
+from storage.archive.product_names import find_product
+from storage.archive.records import Run, Store
+from storage.maintenance.garbage import clear_up
+from storage.maintenance.repair import Rerun, plan_repair
 from storage.maintenance.verification import Finding
 from storage.remote.opening import open_archive, put_back_archive, repair_archive, verify_archive
 
-DONE, FAILED, PARTLY = 0, 1, 3
+DEEPEST = 60  # levels of a lineage that are shown
 
 
-def run_ls(archive: str | Path, *, as_json: bool = False) -> int:
-    """List runs and stores of an archive on stdout."""
-    content = contents(open_archive(archive, create=False, write=False))
-    _put_out(content, show_contents, as_json=as_json)
+def ls(archive: ArchiveName, *, as_json: AsJson = False) -> int:
+    """List the runs and stores of an archive: when, what of, how good, how large."""
+    put_out(contents(open_archive(archive, create=False, write=False)), show_contents, as_json=as_json)
     return DONE
 
 
-def run_gc(
-    archive: str | Path,
-    console: Console,
+def explain(archive: ArchiveName, product: str, *, as_json: AsJson = False) -> int:
+    """Show how a product came about, and what changed since the version before it.
+
+    Parameters
+    ----------
+    product
+        Its address (stages/rectify/KEY), a key or its beginning, a run's name or `latest`, or a product's name in the
+        newest run (class_map, mosaic).
+    """
+    found = explanation(open_archive(archive, create=False, write=False), product)
+    put_out(found, show_explanation, as_json=as_json)
+    return DONE
+
+
+def verify(archive: ArchiveName, *, repair: Switch = False, as_json: AsJson = False) -> int:
+    """Read every byte of an archive again and compare it with what was published.
+
+    Parameters
+    ----------
+    repair
+        Make anew what is broken and what was made of it, by running the surveys again that name it.
+    """
+    return run_verify(archive, stderr, remake=repair, as_json=as_json)
+
+
+def gc(
+    archive: ArchiveName,
     *,
     keep_days: float = 1.0,
-    raw_too: bool = False,
-    dry_run: bool = False,
-    as_json: bool = False,
+    raw_too: Switch = False,
+    dry_run: Switch = False,
+    as_json: AsJson = False,
 ) -> int:
-    """Remove what no run names; progress on ``console``, what went (or would go) on stdout."""
+    """Remove what no run names and no named product rests on.
+
+    Parameters
+    ----------
+    keep_days
+        Stores younger than this stay: a survey may be about to name them.
+    raw_too
+        Also raw lines of a rig, or ingested, that no run names; they cannot be had again.
+    dry_run
+        Only say what would go, and how many bytes.
+    """
     opened = open_archive(archive, create=False, write=not dry_run)
-    with StageProgress(console, {"gc": "clearing up"}) as bars:
-
-        def progress(removal: Removal, done: float) -> None:
-            bars.show("gc", done, removal.uri)
-
-        done = clear_up(opened, keep_days=keep_days, raw_too=raw_too, dry_run=dry_run, progress=progress)
+    with StageProgress(stderr, {"gc": "clearing up"}) as bars:
+        done = clear_up(
+            opened,
+            keep_days=keep_days,
+            raw_too=raw_too,
+            dry_run=dry_run,
+            progress=lambda removal, share: bars.show("gc", share, removal.uri),
+        )
     content = {
         "archive": opened.name,
         "dry_run": dry_run,
@@ -57,15 +104,26 @@ def run_gc(
         "kept": done.kept,
         "obstacle": done.obstacle,
     }
-    _put_out(content, show_clearance, as_json=as_json)
+    put_out(content, show_clearance, as_json=as_json)
     return DONE if done.obstacle is None else PARTLY
 
 
-def run_explain(archive: str | Path, product: str, *, as_json: bool = False) -> int:
-    """Tell on stdout how a product came about, and what changed since the version before."""
-    opened = open_archive(archive, create=False, write=False)
-    _put_out(explanation(opened, product), show_explanation, as_json=as_json)
-    return DONE
+def seal(*weights: Path) -> int:
+    """Give WEIGHTS of an earlier version the hashes by which damage is told; those that have them are checked.
+
+    Nothing else of a file changes, and nothing that was made with it counts as made with other weights.
+
+    Parameters
+    ----------
+    weights
+        Files of weights.
+    """
+    if not weights:
+        raise SettingsError("seal needs files of weights: spectralzoom seal FILE ...")
+    for path in weights:
+        done = "sealed" if seal_weights(path) else "sealed already, every tensor as it was written"
+        stderr.print(f"{path}: {done}", highlight=False, markup=False, soft_wrap=True)
+    return 0
 
 
 def run_verify(
@@ -77,57 +135,24 @@ def run_verify(
         with opened.in_use(alone=True) as alone:
             if alone:
                 put_back_archive(opened)
-    findings = _read_again(opened, console)
-    bad = [finding for finding in findings if finding.problem is not None]
-    content = verdict(opened, findings, _versions() if bad else {})
-    done = None
-    if bad and remake:
-        if not as_json:
-            show_verdict(content, console)
-        done = repair_archive(opened, bad, rerun or _survey_again(opened, console), versions=_versions())
-        content["repair"] = _repaired(done)
-    _put_out(content, show_verdict if done is None else show_repair, as_json=as_json)
-    if done is None:
-        return FAILED if bad else DONE
-    stray = any(finding.kind in ("stray", "growing", "unreadable") for finding in bad)
-    return DONE if done.complete and not stray else PARTLY if done.remade or done.dropped else FAILED
-
-
-def check_outside(out: Path, archive: Archive) -> Path:
-    """The folder ``out`` whole, if it does not lie in the archive, where nothing else belongs (SettingsError)."""
-    folder = out.resolve()
-    if folder.is_relative_to(archive.root.resolve()):
-        raise SettingsError(f"--out {folder} lies in the archive, where nothing else belongs; choose another folder")
-    return folder
-
-
-def _survey_again(archive: Archive, console: Console) -> Rerun:
-    def rerun(settings: dict[str, Any]) -> None:
-        from flows.publish.survey_command import run_survey
-        from flows.settings.load import of_this_version, parse_settings
-        from flows.settings.survey_settings import OF_THE_MACHINE
-
-        here = {**of_this_version(settings), "out": archive.name, **dict.fromkeys(OF_THE_MACHINE)}
-        run_survey(parse_settings(here), console)
-
-    return rerun
-
-
-def _versions() -> Mapping[str, int]:
-    from flows.survey.stage import versions
-
-    return versions()
-
-
-def _read_again(archive: Archive, console: Console) -> list[Finding]:
     with StageProgress(console, {"verify": "reading again"}) as bars:
-        findings = verify_archive(archive, lambda uri, done: bars.show("verify", done, uri))
+        findings = verify_archive(opened, lambda uri, share: bars.show("verify", share, uri))
         bars.show("verify", 1.0, ended=True)
-    return findings
+    bad = [finding for finding in findings if finding.problem is not None]
+    content = verdict(opened, findings)
+    if not (bad and remake):
+        put_out(content, show_verdict, as_json=as_json)
+        return FAILED if bad else DONE
+    if not as_json:
+        show_verdict(content, console)
 
+    def survey_again(settings: dict[str, Any]) -> None:
+        from flows.archive.reprocess_command import survey_as_before  # torch, which nobody needs where all is whole
 
-def _repaired(done: Repaired) -> dict[str, Any]:
-    return {
+        survey_as_before(settings, opened.name, console)
+
+    done = repair_archive(opened, bad, rerun or survey_again, versions=versions())
+    content["repair"] = {
         "remade": done.remade,
         "dropped": done.dropped,
         "put_back": done.put_back,
@@ -135,10 +160,170 @@ def _repaired(done: Repaired) -> dict[str, Any]:
         "hopeless": done.plan.hopeless,
         "complete": done.complete,
     }
+    put_out(content, show_repair, as_json=as_json)
+    stray = any(finding.kind in ("stray", "growing", "unreadable") for finding in bad)
+    return DONE if done.complete and not stray else PARTLY if done.remade or done.dropped else FAILED
 
 
-def _put_out(content: dict[str, Any], show: Callable[[dict[str, Any], Console], None], *, as_json: bool) -> None:
-    if as_json:
-        sys.stdout.write(to_json(content))
-    else:
-        show(content, on_stdout())
+def contents(archive: Archive, now: datetime | None = None) -> dict[str, Any]:
+    """Runs, newest last, and stores by stage, oldest first, of an archive."""
+    catalogue, moment = Catalogue.read(archive.root), now or datetime.now(UTC)
+    stages: dict[str, list[dict[str, Any]]] = {}
+    for store in sorted(catalogue.stores.values(), key=lambda store: (store.ref.stage, store.created, store.ref.key)):
+        row = {
+            "key": store.ref.key,
+            "version": store.version,
+            "created": store.created,
+            "age_s": _age_s(store.created, moment),
+            "bytes": store.size,
+            "runs": len(catalogue.named_by(store.ref.uri)),
+            "problem": store.problem,
+        }
+        stages.setdefault(store.ref.stage, []).append(row)
+    return {
+        "archive": archive.name,
+        "runs": [{**_run_row(catalogue, run), "age_s": _age_s(run.created, moment)} for run in catalogue.runs],
+        "stages": stages,
+        "bytes": sum(store.size for store in catalogue.stores.values()),
+        "lost": list(catalogue.lost),
+    }
+
+
+def _run_row(catalogue: Catalogue, run: Run) -> dict[str, Any]:
+    receipt, settings = run.receipt, run.settings
+    below = catalogue.named_and_below[run.uri]
+    return {
+        "id": run.folder.name,
+        "created": run.created,
+        "survey": receipt.get("survey", run.facts.get("survey")),
+        "scene": settings.get("scene"),
+        "seed": settings.get("seed"),
+        "budget": settings.get("budget"),
+        **score_of(receipt),
+        "accuracy_is": receipt.get("accuracy_is"),
+        "bytes": sum(catalogue.stores[uri].size for uri in below if uri in catalogue.stores),
+        "state": _run_state(catalogue, run, below),
+    }
+
+
+def _run_state(catalogue: Catalogue, run: Run, below: Iterable[str]) -> str:
+    """Told from manifests alone: verify reads every byte."""
+    if run.problem is not None:
+        return "damaged"
+    stores = [catalogue.stores.get(uri) for uri in below]
+    damaged = sum(store is not None and store.problem is not None for store in stores)
+    counts = ((stores.count(None), "missing"), (damaged, "damaged"))
+    return " and ".join(f"{count} {word}" for count, word in counts if count) or "there"
+
+
+def _age_s(created: str, now: datetime) -> float | None:
+    try:
+        return (now - datetime.fromisoformat(created)).total_seconds()
+    except (ValueError, TypeError):
+        return None
+
+
+def explanation(archive: Archive, product: str) -> dict[str, Any]:
+    """Lineage of a product as nested tables, and what changed since the version before it.
+
+    Raises
+    ------
+    ArchiveError : there is no such product.
+    """
+    catalogue = Catalogue.read(archive.root)
+    found = find_product(catalogue, product)
+    if isinstance(found, Run):
+        below = set[str]().union(*(catalogue.ancestors([uri]) for uri in found.names))
+        shown: set[str] = set()
+        trees = [_tree(catalogue, uri, shown, ()) for uri in sorted(found.names - below)]
+        row = {**_run_row(catalogue, found), "problem": found.problem, "command": command(found.settings, archive.name)}
+        return {"archive": archive.name, "product": found.uri, "run": row, "lineage": trees}
+    this, before = catalogue.stores[found], version_before(catalogue, found)
+    return {
+        "archive": archive.name,
+        "product": found,
+        "runs": [run.uri for run in catalogue.named_by(found)],
+        "lineage": [_tree(catalogue, found, set(), ())],
+        "before": None if before is None else before.ref.uri,
+        "changes": [] if before is None else [asdict(one) for one in changes_between(catalogue, before, this)],
+    }
+
+
+def _tree(catalogue: Catalogue, uri: str, shown: set[str], path: tuple[str, ...]) -> dict[str, Any]:
+    """One store and below it what it was made of; what was shown already is not opened again."""
+    store = catalogue.stores.get(uri)
+    if store is None:
+        return {"uri": uri, "problem": "is not there", "inputs": []}
+    wall, cpu = _took(catalogue, store)
+    node = {
+        "uri": uri,
+        "stage": store.ref.stage,
+        "key": store.ref.key,
+        "version": store.version,
+        "called": sorted(catalogue.roles(uri)),
+        "created": store.created,
+        "bytes": store.size,
+        "wall_s": wall,
+        "cpu_s": cpu,
+        "problem": store.problem,
+        "inputs": [],
+    }
+    if uri in shown or uri in path or len(path) >= DEEPEST:
+        return node | {"see": "in a circle" if uri in path else "above" if uri in shown else "too deep"}
+    shown.add(uri)
+    return node | {"inputs": [_tree(catalogue, one, shown, (*path, uri)) for one in catalogue.inputs_of(uri)]}
+
+
+def _took(catalogue: Catalogue, store: Store) -> tuple[float | None, float | None]:
+    """Wall and CPU seconds of the making, by the manifest or by the receipt of the run that made it."""
+    if store.cost is not None:
+        return store.cost.wall_s, store.cost.cpu_s
+    rows = [row for run in catalogue.runs for row in run.stages if row.get("key") == store.ref.key]
+    ran = next((row for row in rows if row.get("state") == "ran"), {})
+    return known_number(ran.get("wall_s")), known_number(ran.get("cpu_s"))
+
+
+def verdict(archive: Archive, findings: list[Finding]) -> dict[str, Any]:
+    """What verification found, and for what is broken what a repair would do."""
+    bad = [finding for finding in findings if finding.problem is not None]
+    places = {finding.uri for finding in findings if finding.kind in ("whole", "broken", "unreadable")}
+    broken = {finding.uri for finding in bad if finding.kind == "broken"}
+    content: dict[str, Any] = {
+        "archive": archive.name,
+        "checked": len(places),
+        "whole": len(places - broken),
+        "problems": [asdict(finding) for finding in bad],
+    }
+    if bad:
+        plan = plan_repair(archive, bad, versions=versions())
+        content["to_remake"] = list(plan.remade)
+        content["hopeless"] = plan.hopeless
+        content["surveys"] = [
+            {"run": run.uri, "command": command(settings, archive.name)} for run, settings in plan.surveys
+        ]
+    return content
+
+
+def command(settings: Mapping[str, Any], out: str) -> str:
+    """The command that asks for these settings in the archive ``out``, as far as flags can say it; empty without any.
+
+    The archive may have been moved since: what its receipt calls ``out`` is not said.
+    """
+    if not settings:
+        return ""
+    asked, defaults = {**settings, "out": out}, Settings().to_dict()
+    words = ["spectralzoom", "survey"]
+    for name, usual in defaults.items():
+        value, flag = asked.get(name, usual), name.replace("_", "-")
+        if value == usual or isinstance(value, dict) or value is None:
+            continue
+        if isinstance(value, bool):
+            words.append(f"--{flag}" if value else f"--no-{flag}")
+        elif isinstance(value, list):
+            words += [f"--{flag}", ("x" if name == "size" else ",").join(map(str, value))]
+        else:
+            words += [f"--{flag}", str(value)]
+    tables = [name for name, value in asked.items() if isinstance(value, dict) and value != defaults.get(name)]
+    more = [f"with [{'], ['.join(tables)}] as in its receipt"] if tables else []
+    more += ["it had two rounds of detail, which are no more"] if "rounds" in asked else []
+    return shlex.join(words) + (f"  ({'; '.join(more)})" if more else "")

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator, Mapping
-from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
 
-from flows.archive.commands import check_outside
-from flows.archive.comparison_table import SAVINGS, change_words, panel_words, show_comparison
 from flows.archive.difference_picture import MapPair, draw_difference
+from flows.cli.app import ArchiveName, AsJson, OutFolder, check_outside
+from flows.publish.receipt import areas_on_ground
 from flows.settings.survey_settings import BUILT_IN_SCENES
 from flows.survey.scores import score_of
-from flows.terminal.shown_text import on_stdout
+from flows.terminal.figures import DASH, format_count, format_percent, format_points, format_seconds, known_number
+from flows.terminal.processes import DONE
+from flows.terminal.progress import put_out
 from pipeline.errors import ArchiveError, SceneError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.simulator.scenes.farm.farm_scene import REMOVED_LAW, law_of_key
@@ -23,26 +27,34 @@ from storage.archive.archive import Archive
 from storage.archive.keys import in_text
 from storage.archive.lineage import ABSENT, Catalogue, find_product, flatten
 from storage.archive.records import Run
-from storage.archive.whole_files import to_json, written_aside
+from storage.archive.whole_files import written_aside
 from storage.arrays.class_maps import ClassMap, load_class_map
 from storage.remote.opening import open_archive
 
 LARGEST_PAIRS = 10
+SAVINGS = {  # name in a receipt: words for it, and how it is shown
+    "lines": ("lines", format_count),
+    "capture_s": ("time of capture", format_seconds),
+    "tokens": ("tokens", format_count),
+}
 NOT_ASKED = ("notes", "out")  # of a receipt's settings
 NO_FILES = (None, *BUILT_IN_SCENES, REMOVED_LAW)  # scenes of runs that are no file's
 
 
-def run_compare(archive: str | Path, old: str, new: str, out: Path | None = None, *, as_json: bool = False) -> int:
-    """Compare run ``old`` (A) with run ``new`` (B) on stdout; the picture goes to ``out``, or beside the archive.
+def compare(archive: ArchiveName, old: str, new: str, *, out: OutFolder = None, as_json: AsJson = False) -> int:
+    """Compare two runs of one field: classes, where they differ, what was asked and spent, and a picture.
 
-    Raises
-    ------
-    ArchiveError : there is no such run, or it cannot be read.
-    SceneError, ShapeError : the runs are of different fields.
-    SettingsError : ``out`` lies in the archive.
+    Parameters
+    ----------
+    old
+        Run A: its name, a folder's below runs, `latest`, or `previous`, the one before it of the same field.
+    new
+        Run B, likewise.
+    out
+        Folder for the picture; beside the archive without one.
     """
     opened = open_archive(archive, create=False, write=False)
-    folder = opened.around if out is None else check_outside(out, opened)
+    folder = opened.around if out is None else check_outside(out, opened.root)
     catalogue = Catalogue.read(opened.root)
     runs = (find_run(catalogue, old), find_run(catalogue, new))
     _check_same_field(*runs)
@@ -53,11 +65,8 @@ def run_compare(archive: str | Path, old: str, new: str, out: Path | None = None
     with written_aside(folder, [name]) as aside:
         (aside / name).write_bytes(draw_difference(pair.maps, words))
     content["picture"] = str(folder / name)
-    if as_json:
-        sys.stdout.write(to_json(content))
-    else:
-        show_comparison(content, on_stdout())
-    return 0
+    put_out(content, show_comparison, as_json=as_json)
+    return DONE
 
 
 def find_run(catalogue: Catalogue, text: str) -> Run:
@@ -97,17 +106,13 @@ def _field_key(run: Run) -> str:
     return "/".join(part for part in key.split("/") if not part.startswith(("day=", "hour=")))
 
 
-def _field_words(run: Run) -> str:
-    scene = run.settings.get("scene")
-    return str(_field_key(run) if scene in NO_FILES else scene)
-
-
 def _check_same_field(old: Run, new: Run) -> None:
     for run in (old, new):
         if "class_map" not in run.products:
             raise ArchiveError(f"{run.uri} has no class map to compare: {run.problem or 'it left none'}; see verify")
     if not _is_same_field(old, new):
-        fields = (f"{run.uri} is of {_field_words(run)}" for run in (old, new))
+        scenes = ((run, run.settings.get("scene")) for run in (old, new))
+        fields = (f"{run.uri} is of {_field_key(run) if scene in NO_FILES else scene}" for run, scene in scenes)
         raise SceneError(f"these runs are of different fields: {', '.join(fields)}; give two runs of one field")
 
 
@@ -119,11 +124,12 @@ def _class_map(catalogue: Catalogue, archive: Archive, run: Run) -> ClassMap:
     return load_class_map(archive.locate(address))
 
 
-class _Pair:
+class _Pair(NamedTuple):
     """Two maps with one list of classes, matched by name, and how often each meets each."""
 
-    def __init__(self, maps: MapPair, joint: NDArray[np.int64], confidence: list[NDArray[np.float32]]) -> None:
-        self.maps, self.joint, self.confidence = maps, joint, confidence  # joint: (class of A, class of B), last: none
+    maps: MapPair
+    joint: NDArray[np.int64]  # (class of A, class of B), last: none
+    confidence: list[NDArray[np.float32]]
 
 
 def _pair_of(found: list[ClassMap]) -> _Pair:
@@ -132,7 +138,12 @@ def _pair_of(found: list[ClassMap]) -> _Pair:
         raise ShapeError(f"the maps are {shapes[0]} and {shapes[1]} px (y, x); give two runs of one field and size")
     names = tuple(dict.fromkeys(name for one in found for name in one.names))
     colours = {name: colour for one in reversed(found) for name, colour in zip(one.names, one.colours, strict=True)}
-    old, new = (_renumbered(one, names) for one in found)
+    numbered = []
+    for one in found:
+        table = np.full(256, UNLABELLED, np.uint8)
+        table[: len(one.names)] = [names.index(name) for name in one.names]
+        numbered.append(np.asarray(table[one.classes], np.uint8))
+    old, new = numbered
     none, count = len(names), len(names) + 1
     codes = np.minimum(old, none).astype(np.intp) * count + np.minimum(new, none)
     joint = np.bincount(codes.ravel(), minlength=count * count).reshape(count, count)
@@ -144,13 +155,6 @@ def _pair_of(found: list[ClassMap]) -> _Pair:
     return _Pair(MapPair(old, new, names, palette, pairs), joint, [one.confidence for one in found])
 
 
-def _renumbered(found: ClassMap, names: tuple[str, ...]) -> NDArray[np.uint8]:
-    """A map's classes by their places in another list."""
-    table = np.full(256, UNLABELLED, np.uint8)
-    table[: len(found.names)] = [names.index(name) for name in found.names]
-    return np.asarray(table[found.classes], np.uint8)
-
-
 def _comparison(catalogue: Catalogue, runs: tuple[Run, Run], pair: _Pair) -> dict[str, Any]:
     total, same = pair.maps.old.size, int(np.trace(pair.joint))
     largest = [
@@ -159,25 +163,29 @@ def _comparison(catalogue: Catalogue, runs: tuple[Run, Run], pair: _Pair) -> dic
     ]
     asked = [{name: value for name, value in run.settings.items() if name not in NOT_ASKED} for run in runs]
     return {
-        **{side: _side(run) for side, run in zip("ab", runs, strict=True)},
+        **{
+            side: {
+                "run": run.folder.name,
+                "created": run.created,
+                "scene": run.settings.get("scene"),
+                "seed": run.settings.get("seed"),
+                **score_of(run.receipt),
+            }
+            for side, run in zip("ab", runs, strict=True)
+        },
         "classes": _classes(runs, pair),
         "differing": {"pixels": total - same, "share": (total - same) / total, "pairs": len(pair.maps.pairs)},
         "largest": largest,
         "confidence": _confidence(*pair.confidence),
         "settings": list(_changes(*(flatten(one) for one in asked))),
         "versions": list(_changes(*(_versions(catalogue, run) for run in runs))),
-        "savings": {name: [_number(run.receipt, "savings", name, "done") for run in runs] for name in SAVINGS},
+        "savings": {name: [_spent(run.receipt, name) for run in runs] for name in SAVINGS},
     }
-
-
-def _side(run: Run) -> dict[str, Any]:
-    scene, seed = run.settings.get("scene"), run.settings.get("seed")
-    return {"run": run.folder.name, "created": run.created, "scene": scene, "seed": seed, **score_of(run.receipt)}
 
 
 def _classes(runs: tuple[Run, Run], pair: _Pair) -> list[dict[str, Any]]:
     """Area in each map, its change and the agreement of both, for each class that is in one of them."""
-    areas = [run.receipt["ground"]["areas_ha"] for run in runs if _on_ground(run)]
+    hectares = [known for run in runs if (known := areas_on_ground(run.receipt)) is not None]
     rows, columns, total = pair.joint.sum(axis=1), pair.joint.sum(axis=0), pair.maps.old.size
     found = []
     for number, name in enumerate((*pair.maps.names, "no class")):
@@ -185,15 +193,10 @@ def _classes(runs: tuple[Run, Run], pair: _Pair) -> list[dict[str, Any]]:
         either = sum(pixels) - both
         if either:
             row = {"name": name, "pixels": pixels, "share": [count / total for count in pixels], "iou": both / either}
-            if len(areas) == 2 and number < len(pair.maps.names):
-                row["ha"] = [float(area.get(name, 0.0)) for area in areas]
+            if len(hectares) == 2 and number < len(pair.maps.names):
+                row["ha"] = [float(area.get(name, 0.0)) for area in hectares]
             found.append(row)
     return found
-
-
-def _on_ground(run: Run) -> bool:
-    ground = run.receipt.get("ground")
-    return isinstance(ground, Mapping) and isinstance(ground.get("areas_ha"), Mapping)
 
 
 def _confidence(old: NDArray[np.float32], new: NDArray[np.float32]) -> dict[str, float | None]:
@@ -202,13 +205,8 @@ def _confidence(old: NDArray[np.float32], new: NDArray[np.float32]) -> dict[str,
     if not known.any():
         return {"a": None, "b": None, "change": None, "rose": None}
     before, after = old[known].astype(np.float64), new[known].astype(np.float64)
-    change = float(after.mean() - before.mean())
-    return {
-        "a": float(before.mean()),
-        "b": float(after.mean()),
-        "change": change,
-        "rose": float(np.mean(after > before)),
-    }
+    a, b = float(before.mean()), float(after.mean())
+    return {"a": a, "b": b, "change": float(after.mean() - before.mean()), "rose": float(np.mean(after > before))}
 
 
 def _versions(catalogue: Catalogue, run: Run) -> dict[str, str]:
@@ -229,8 +227,69 @@ def _changes(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[dict[st
             yield {"name": name, "old": old.get(name, ABSENT), "new": new.get(name, ABSENT)}
 
 
-def _number(table: Any, *names: str) -> float | int | None:
-    """A figure deep in a receipt; None where there is none."""
-    for name in names:
-        table = table.get(name) if isinstance(table, Mapping) else None
-    return table if isinstance(table, int | float) and not isinstance(table, bool) else None
+def _spent(receipt: Mapping[str, Any], name: str) -> float | int | None:
+    savings = receipt.get("savings")
+    entry = savings.get(name) if isinstance(savings, Mapping) else None
+    done = entry.get("done") if isinstance(entry, Mapping) else None
+    return done if known_number(done) is not None else None
+
+
+def panel_words(side: Mapping[str, Any]) -> str:
+    """A run and how good it is, in words."""
+    scores = (("mIoU", side["miou"]), ("overall", side["overall_accuracy"]))
+    return ", ".join([str(side["run"]), *(f"{name} {format_points(one)}" for name, one in scores if one is not None)])
+
+
+def change_words(differing: Mapping[str, Any]) -> str:
+    """How much differs, in words."""
+    return f"{format_count(differing['pixels'])} px, {format_percent(differing['share'])}"
+
+
+def show_comparison(content: dict[str, Any], console: Console) -> None:
+    """Print what `compare` found."""
+
+    def say(text: str) -> None:
+        console.print(escape(text), highlight=False, soft_wrap=True)
+
+    say(f"A: {panel_words(content['a'])}\nB: {panel_words(content['b'])}")
+    console.print(_class_table(content["classes"]))
+    say(f"{change_words(content['differing'])} differ")
+    if content["largest"]:
+        table = _table("Largest changes", "A", "B", "pixels", "share", left=2)
+        for row in content["largest"]:
+            figures = (format_count(row["pixels"]), format_percent(row["share"]))
+            table.add_row(escape(row["from"]), escape(row["to"]), *figures)
+        console.print(table)
+    sure = content["confidence"]
+    if sure["a"] is not None:
+        both = f"{sure['a']:.3f} in A, {sure['b']:.3f} in B ({sure['change']:+.3f})"
+        say(f"confidence {both}, higher at {format_percent(sure['rose'])} of pixels")
+    table = _table("Spent", "cost", "A", "B", left=1)
+    for name, (label, show) in SAVINGS.items():
+        table.add_row(label, *(show(value) for value in content["savings"][name]))
+    console.print(table)
+    changes = [(kind, row) for kind in ("settings", "versions") for row in content[kind]]
+    if changes:
+        table = _table("What was not the same", "what", "name", "A", "B", left=4)
+        for kind, row in changes:
+            table.add_row(kind.removesuffix("s"), *(escape(str(row[name])) for name in ("name", "old", "new")))
+    console.print(table if changes else "settings and versions are the same")
+    say(f"  {content['picture']}")
+
+
+def _class_table(rows: list[dict[str, Any]]) -> Table:
+    ground = any("ha" in row for row in rows)
+    hectares = ("ha in A", "ha in B") if ground else ()
+    table = _table("Classes", "class", "px in A", "px in B", "in A", "in B", *hectares, "IoU of A and B", left=1)
+    for row in rows:
+        figures = [*map(format_count, row["pixels"]), *map(format_percent, row["share"])]
+        figures += [f"{area:.4g}" for area in row["ha"]] if "ha" in row else [DASH] * len(hectares)
+        table.add_row(escape(row["name"].replace("_", " ")), *figures, format_points(row["iou"]))
+    return table
+
+
+def _table(title: str, *columns: str, left: int) -> Table:
+    table = Table(title=title, title_justify="left", title_style="bold", header_style="dim", box=SIMPLE_HEAD)
+    for number, column in enumerate(columns):
+        table.add_column(column, justify="left" if number < left else "right", overflow="fold")
+    return table

@@ -5,23 +5,17 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 
-from flows.archive.commands import check_outside
-from flows.archive.export_catalogue import (
-    NOT_PLACED,
-    Export,
-    band_fields,
-    describe_collection,
-    describe_item,
-    grid_fields,
-    name_stores,
-)
-from flows.archive.export_layers import map_layers, open_exported
+from flows.archive.export_layers import ExportedRun, Layer, Rows, map_layers, open_exported, seen_rows
+from flows.cli.app import ArchiveName, AsJson, OutFile, Switch, check_outside, stderr
+from flows.terminal.processes import DONE
+from flows.terminal.progress import print_json
 from pipeline.errors import ArchiveError, PipelineError
 from storage.archive.staging import take_lock
 from storage.archive.whole_files import remove_leftovers
@@ -31,9 +25,41 @@ from storage.arrays.layout import SHARD_ROWS
 from storage.export.cog_files import need_rasterio, write_cog
 from storage.export.envi_writer import EnviFile, write_envi
 from storage.export.stac_items import COG, check_owner, need_pystac, write_stac
+from storage.export.stac_fields import COG, ZARR, angular, clean_id, footprint, projection, spectral_bands, wavelengths
+from storage.export.stac_items import Collection, Item, check_owner, need_pystac, write_stac
 from storage.remote.opening import open_archive
 
 ENVI_NUMBERS = "application/octet-stream"
+NOT_PLACED = (
+    "The survey has no rig pose: its images lie on the camera's angular grid (transforms in radians), and where on "
+    "earth that is is not known."
+)
+RUN_FILES = {
+    "receipt.json": ("Receipt", "application/json", ["metadata"]),
+    "report.html": ("Report", "text/html", ["metadata"]),
+    "quicklook.png": ("Quicklook", "image/png", ["overview"]),
+}
+Asset = dict[str, Any]
+
+
+def export(
+    archive: ArchiveName, run: str | None = None, *, out: OutFile, envi: Switch = False, as_json: AsJson = False
+) -> int:
+    """Export a run: maps as cloud-optimised GeoTIFF, a STAC catalogue of them, and on request cubes as ENVI.
+
+    Parameters
+    ----------
+    run
+        The run's name, a folder's below runs, or `latest`, as without one.
+    out
+        Folder to export into, beside the runs of the same archive that lie there.
+    envi
+        Also write the coarse mosaic and the raw sweeps as ENVI files.
+    """
+    content = run_export(archive, run, out, envi, stderr)
+    if as_json:
+        print_json(content)
+    return DONE
 
 
 def run_export(archive: str | Path, run: str | None, out: Path, envi: bool, console: Console) -> dict[str, Any]:
@@ -52,34 +78,38 @@ def run_export(archive: str | Path, run: str | None, out: Path, envi: bool, cons
     need_rasterio()
     need_pystac()
     opened = open_exported(open_archive(archive, create=False, write=False), run)
-    out = check_outside(out, opened.archive)
+    out = check_outside(out, opened.archive.root)
     about = describe_collection(opened)
-    with _writing(out), _alone_in(out):
-        check_owner(out, about.id)
-        export = Export(opened, out)
-        for folder in (out, export.folder, export.folder / "envi"):
-            remove_leftovers(folder)
-        _export_images(export, console)
-        name_stores(export)
-        if envi:
-            _export_cubes(export, console)
-        item, collection = write_stac(out, about, describe_item(export))
-    return _tell(export, item, collection, console)
-
-
-@contextmanager
-def _writing(out: Path) -> Iterator[None]:
+    export = Export(opened, out)
     try:
-        yield
-    except PipelineError:
+        with _alone_in(out):
+            check_owner(out, about.id)
+            for folder in (out, export.folder, export.folder / "envi"):
+                remove_leftovers(folder)
+            _export_images(export, console)
+            name_stores(export)
+            if envi:
+                _export_cubes(export, console)
+            item, collection = write_stac(out, about, describe_item(export))
+    except PipelineError:  # which some OSErrors are
         raise
     except OSError as error:
         raise ArchiveError(f"cannot export to {out}: {error.strerror}; choose another --out") from error
+    files = {
+        key: path.relative_to(out).as_posix()
+        for key, asset in export.assets.items()
+        if (path := Path(os.path.normpath(export.folder / asset["href"]))).is_relative_to(out)
+    }
+    placed = opened.geobox is not None
+    if not placed:
+        console.print("[dim]note: no rig pose in this survey, so the images have no CRS[/]", highlight=False)
+    for path in (*(out / name for name in files.values()), item, collection):
+        console.print(f"  {escape(str(path))}", highlight=False, soft_wrap=True)
+    return {"run": opened.id, "item": str(item), "collection": str(collection), "placed": placed, "files": files}
 
 
 @contextmanager
 def _alone_in(out: Path) -> Iterator[None]:
-    """Wait until no other export writes there."""
     release = take_lock(out / ".export.lock")
     try:
         yield
@@ -105,35 +135,115 @@ def _export_cubes(export: Export, console: Console) -> None:
     wave, width = load_bands(run.path("mosaic"))
     text = f"coarse mosaic of {run.id}, scene values; {NOT_PLACED if run.geobox is None else 'camera grid, no CRS'}"
     file = EnviFile((rows, columns, bands), "<f4", "bil", wave, width, text, nodata=float("nan"))
-    with console.status("writing mosaic.img"):
-        _name_cube(export, "mosaic", write_envi(_header(export, "mosaic"), file, mosaic.rows()))
+    _write_cube(export, "mosaic", file, mosaic.rows(), console)
     for path in run.sweeps():
         cube = open_raw_cube(path)
         text = f"raw numbers of sweep {cube.sweep.name} of {run.id} (line, sample, band), not calibrated"
         file = EnviFile(cube.shape, "<u2", "bil", cube.wavelength_nm, cube.fwhm_nm, text)
         blocks = ((first, cube.read(first, first + SHARD_ROWS)) for first in range(0, cube.shape[0], SHARD_ROWS))
-        with console.status(f"writing {path.stem}.img"):
-            _name_cube(export, path.stem, write_envi(_header(export, path.stem), file, blocks))
+        _write_cube(export, path.stem, file, blocks, console)
 
 
-def _header(export: Export, name: str) -> Path:
-    return export.folder / "envi" / f"{name}.hdr"
-
-
-def _name_cube(export: Export, name: str, data: Path) -> None:
+def _write_cube(export: Export, name: str, file: EnviFile, blocks: Rows, console: Console) -> None:
+    header = export.folder / "envi" / f"{name}.hdr"
+    with console.status(f"writing {name}.img"):
+        data = write_envi(header, file, blocks)
     export.add(f"{name}_envi", data, f"{name} as ENVI, numbers", ENVI_NUMBERS, ["data"], **export.nowhere)
-    export.add(f"{name}_envi_header", _header(export, name), f"{name} as ENVI, header", "text/plain", ["metadata"])
+    export.add(f"{name}_envi_header", header, f"{name} as ENVI, header", "text/plain", ["metadata"])
 
 
-def _tell(export: Export, item: Path, collection: Path, console: Console) -> dict[str, Any]:
-    files = {
-        key: path.relative_to(export.out).as_posix()
-        for key, about in export.assets.items()
-        if (path := Path(os.path.normpath(export.folder / about["href"]))).is_relative_to(export.out)
+@dataclass
+class Export:
+    """One run on its way into a folder."""
+
+    run: ExportedRun
+    out: Path  # without links, so that the way from there to the archive is the same for every program
+    assets: dict[str, Asset] = field(default_factory=dict)
+
+    @property
+    def folder(self) -> Path:
+        """Where the run's files go."""
+        return self.out / self.run.id
+
+    @property
+    def nowhere(self) -> Asset:
+        """Fields of an asset that has no CRS, in an item that has one."""
+        return {} if self.run.geobox is None else {"proj:code": None}
+
+    def add(self, key: str, path: Path, title: str, kind: str, roles: list[str], **fields: Any) -> None:
+        """Name one file or store to the catalogue, by its address seen from the item."""
+        href = Path(os.path.relpath(path.resolve(), self.folder)).as_posix()
+        self.assets[key] = {"href": href, "title": title, "type": kind, "roles": roles, **fields}
+
+
+def band_fields(layer: Layer) -> list[Asset]:
+    """STAC's words for the bands of an image."""
+    nodata: Any = "nan" if layer.image.nodata != layer.image.nodata else layer.image.nodata
+    unit = {} if layer.unit is None else {"unit": layer.unit}
+    return [{"name": name, "data_type": layer.image.dtype, "nodata": nodata, **unit} for name in layer.image.bands]
+
+
+def grid_fields(run: ExportedRun, layer: Layer) -> dict[str, Any]:
+    """Where an image lies, for surveys that have a place at all."""
+    if run.geobox is None:
+        return {}
+    if layer.image.place.crs_wkt is None:
+        return angular(layer.image.place.transform, layer.image.shape)
+    return projection(run.geobox)
+
+
+def name_stores(export: Export) -> None:
+    """Name the archive's own stores and the run's files to the catalogue, where they are."""
+    run, root = export.run, export.run.archive.root
+    nowhere = export.nowhere
+    about = {"data_type": "float32", "nodata": "nan", "unit": "1"}
+    bands = spectral_bands(*load_bands(run.path("mosaic")), about)
+    stores: dict[str, tuple[str, dict[str, Any]]] = {
+        "mosaic": ("Coarse mosaic", {**nowhere, **bands}),
+        "class_map": ("Class map and confidence on the camera's grid", nowhere),
+        "attention": ("Score and rank of the seats", nowhere),
+        "patches": ("Fine patches", nowhere),
     }
-    if export.run.geobox is None:
-        console.print("[dim]note: no rig pose in this survey, so the images have no CRS[/]", highlight=False)
-    for path in (*(export.out / name for name in files.values()), item, collection):
-        console.print(f"  {escape(str(path))}", highlight=False, soft_wrap=True)
-    placed = export.run.geobox is not None
-    return {"run": export.run.id, "item": str(item), "collection": str(collection), "placed": placed, "files": files}
+    if run.geobox is not None:
+        stores["ground_map"] = ("Class map, confidence and picture on the map", projection(run.geobox))
+    for product, (title, fields) in stores.items():
+        if run.store(product) is not None:
+            path = root / run.receipt["products"][product]
+            export.add(f"{product}_zarr", path, title, ZARR, ["data"], **fields)
+    for sweep in run.sweeps():
+        export.add(f"{sweep.stem}_zarr", sweep, f"Raw sweep {sweep.stem}", ZARR, ["data", "raw"], **nowhere)
+    for name, (title, kind, roles) in RUN_FILES.items():
+        if (run.folder / name).is_file():
+            export.add(Path(name).stem, run.folder / name, title, kind, roles)
+
+
+def describe_collection(run: ExportedRun) -> Collection:
+    """The collection of an archive's surveys."""
+    name = clean_id(run.archive.root.name, "surveys")
+    words = (
+        f"Surveys exported from the archive {run.archive.root.name}: a coarse look at a whole field, a fine look where "
+        "it changes the map. Where no survey says where it was, the extent is the whole earth."
+    )
+    return Collection(name, f"Surveys of {run.archive.root.name}", words)
+
+
+def describe_item(export: Export) -> Item:
+    """The run's item, with all assets that were added."""
+    run, receipt = export.run, export.run.receipt
+    placed = run.geobox is not None
+    where = "Images lie on a map." if placed else NOT_PLACED
+    properties: dict[str, Any] = {
+        "title": f"Survey of {receipt['survey']}",
+        "description": f"Survey of {receipt['survey']} ({receipt['source']} source). {where}",
+        "instruments": [str(receipt["source"])],
+        "processing:level": "L4",
+        "processing:lineage": ", then ".join(f"{one['name']} {one['key']}" for one in receipt["stages"] if one["key"]),
+        "processing:software": dict(receipt["versions"]),
+        **wavelengths(load_bands(run.path("mosaic"))[0]),
+    }
+    outline = None
+    if run.geobox is not None:
+        properties["proj:code"] = projection(run.geobox)["proj:code"]
+        properties["gsd"] = abs(float(run.geobox.resolution.x))
+        outline = footprint(run.geobox, seen_rows(run))
+    return Item(run.id, receipt["started"], receipt["finished"], properties, export.assets, outline)

@@ -77,11 +77,6 @@ class ExportedRun:
         """Where the run's map lies on the earth; None without a pose."""
         return None if self.store("ground_map") is None else load_geobox(self.path("ground_map"))
 
-    @property
-    def software(self) -> str:
-        """Name and version of what made the run."""
-        return f"spectralzoom {self.receipt['versions'].get('spectralzoom', 'of unknown version')}"
-
 
 def open_exported(archive: Archive, name: str | None) -> ExportedRun:
     """Open a run by its name or address, the latest without one.
@@ -128,34 +123,24 @@ def map_layers(run: ExportedRun) -> list[Layer]:
     Attention keeps its grid of seats.
     """
     product = "class_map" if run.geobox is None else "ground_map"
-    legend = _legend(open_image(run.path(product), "classes"))
-    made = [
-        _layer(run, product, "classes", ("class",), nodata=UNLABELLED, legend=legend),
-        _layer(run, product, "confidence", ("confidence",), nodata=np.nan),
-        _attention(run),
-        _picture(run) if run.geobox is None else _layer(run, product, "picture", RGB, nodata=0),
-    ]
-    names = {
-        "class_map": ("Class map", ("data",), None, classes(legend)),
-        "confidence": ("Probability of the class given", ("data", "confidence"), "1", {}),
-        "attention": ("Worth of a fine look, by seat", ("data",), "1", {}),
-        "rgb": ("Picture of the coarse look", ("visual", "overview"), None, {}),
-    }
+    about = open_image(run.path(product), "classes").about
+    colours = np.array(about.get("class_colours", ()), np.uint8).reshape(-1, 3)
+    legend = ClassNames(tuple(about.get("class_names", ())), colours)
+    drawn = _layer(run, product, "classes", ("class",), nodata=UNLABELLED, legend=legend)
+    sure = _layer(run, product, "confidence", ("confidence",), nodata=np.nan)
+    seen = _picture(run) if run.geobox is None else _layer(run, product, "picture", RGB, nodata=0)
     return [
-        Layer(name, title, roles, image, rows, unit, about)
-        for (name, (title, roles, unit, about)), (image, rows) in zip(names.items(), made, strict=True)
+        Layer("class_map", "Class map", ("data",), *drawn, fields=classes(legend)),
+        Layer("confidence", "Probability of the class given", ("data", "confidence"), *sure, "1"),
+        Layer("attention", "Worth of a fine look, by seat", ("data",), *_attention(run), "1"),
+        Layer("rgb", "Picture of the coarse look", ("visual", "overview"), *seen),
     ]
-
-
-def _legend(stored: StoredImage) -> ClassNames:
-    names, colours = (stored.about.get(f"class_{word}", ()) for word in ("names", "colours"))
-    return ClassNames(tuple(names), np.array(colours, np.uint8).reshape(-1, 3))
 
 
 def _tags(run: ExportedRun, product: str, place: Place) -> dict[str, str]:
     """What a file says of where it comes from and where it lies."""
     return {
-        "TIFFTAG_SOFTWARE": run.software,
+        "TIFFTAG_SOFTWARE": f"spectralzoom {run.receipt['versions'].get('spectralzoom', 'of unknown version')}",
         "run": run.id,
         "product": run.receipt["products"][product],
         "surveyed": run.receipt["started"],

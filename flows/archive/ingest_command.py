@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 
-from flows.terminal.progress import StageProgress
+from flows.cli.app import ArchiveName, AsJson, parse_numbers, stderr
+from flows.terminal.processes import DONE
+from flows.terminal.progress import StageProgress, print_json
 from pipeline.errors import SceneError
 from storage.archive.archive import Archive, StageRef
 from storage.archive.staging import check_name, file_hash
@@ -23,19 +24,48 @@ VERSION = 2
 TITLES = {"read": "reading the files", STAGE: "storing the cube"}
 
 
-@dataclass(frozen=True)
-class IngestRequest:
-    """What to ingest, as the flags say it."""
+def ingest(
+    source: str,
+    archive: ArchiveName,
+    *,
+    name: str | None = None,
+    dark: str | None = None,
+    white: str | None = None,
+    wavelengths: str | None = None,
+    as_json: AsJson = False,
+) -> int:
+    """Store SOURCE in ARCHIVE as one cube that never changes; the same content is stored once.
 
-    source: str
-    archive: str | Path
-    name: str | None = None
-    dark: str | None = None
-    white: str | None = None
-    wavelengths: Sequence[float] | None = None  # [nm], one a band
+    Parameters
+    ----------
+    source
+        ENVI header or data file, folder of a Headwall camera, GeoTIFF, .mat, .npy, PNG, or Zarr store.
+    name
+        What the cube is called; the file's or folder's name by default.
+    dark
+        Dark frame, ENVI or .npy, averaged over its lines; a Headwall folder's own by default.
+    white
+        White frame, likewise.
+    wavelengths
+        Centre wavelengths of all bands [nm], where the files do not say them: 660,800
+    """
+    nm = parse_numbers(wavelengths, "--wavelengths")
+    record = run_ingest(source, archive, stderr, name=name, dark=dark, white=white, wavelengths=nm)
+    if as_json:
+        print_json(record)
+    return DONE
 
 
-def run_ingest(request: IngestRequest, console: Console) -> dict[str, Any]:
+def run_ingest(
+    source: str,
+    archive: str | Path,
+    console: Console,
+    *,
+    name: str | None = None,
+    dark: str | None = None,
+    white: str | None = None,
+    wavelengths: Sequence[float] | None = None,
+) -> dict[str, Any]:
     """Store a source in an archive, with progress on ``console``; give the record that --json prints.
 
     What the files hold and the flags say is the store's key: the same content is stored once, whatever it is called and
@@ -46,27 +76,30 @@ def run_ingest(request: IngestRequest, console: Console) -> dict[str, Any]:
     SceneError, WavelengthError : the source cannot be used, or changed while it was read.
     ArchiveError : the name cannot be one in an archive, or the archive cannot be written to.
     """
-    if request.name is not None:
-        check_name(request.name)
+    if name is not None:
+        check_name(name)
     with console.status("opening the source"):
-        source = _opened(request)
-        archive = open_archive(request.archive)
-        archive.reclaim()  # what a killed ingest left half made
-    with archive.in_use(), StageProgress(console, TITLES) as progress:
-        before = _stamps(source)
-        files = hash_files(source, lambda done: progress.show("read", done))
+        cube = open_cube_source(source, dark=dark, white=white)
+        if wavelengths is not None:
+            cube = with_wavelengths(cube, wavelengths)
+        opened = open_archive(archive)
+        opened.reclaim()  # what a killed ingest left half made
+    with opened.in_use(), StageProgress(console, TITLES) as progress:
+        before = _stamps(cube)
+        files = hash_files(cube, lambda done: progress.show("read", done))
         progress.show("read", 1.0, ended=True)
 
         def build(path: Path) -> None:
-            name = request.name or source.name
-            write_ingested_cube(path, source, files, name=name, report=lambda done: progress.show(STAGE, done))
-            if _stamps(source) != before:  # what was written is not what was hashed
-                raise SceneError(f"{request.source} changed while it was read; ingest it again once it is whole")
+            write_ingested_cube(
+                path, cube, files, name=name or cube.name, report=lambda done: progress.show(STAGE, done)
+            )
+            if _stamps(cube) != before:  # what was written is not what was hashed
+                raise SceneError(f"{source} changed while it was read; ingest it again once it is whole")
 
-        ref, built = archive.produce(STAGE, build, version=VERSION, params=_key(request, source, files))
+        ref, built = opened.produce(STAGE, build, version=VERSION, params=_key(name, cube, files))
         progress.show(STAGE, 1.0, "" if built else "cached", ended=True)
-    record = _record(archive, ref, source, files, cached=not built)
-    _print(record, source, console)
+    record = _record(opened, ref, cube, files, cached=not built)
+    _print(record, cube, console)
     return record
 
 
@@ -74,33 +107,25 @@ def hash_files(source: CubeSource, report: Report = lambda done: None) -> list[S
     """Size and SHA-256 of every file that a cube comes from; names are without folders, but those within a store."""
     files: list[SourceFile] = []
     for number, path in enumerate(source.files):
-        name = path.name if source.root is None or not path.is_relative_to(source.root) else _within(path, source.root)
+        root = source.root
+        name = path.relative_to(root).as_posix() if root is not None and path.is_relative_to(root) else path.name
         files.append(SourceFile(name, path.stat().st_size, file_hash(path)))
         report((number + 1) / len(source.files))
     return files
-
-
-def _within(path: Path, root: Path) -> str:
-    return path.relative_to(root).as_posix()
-
-
-def _opened(request: IngestRequest) -> CubeSource:
-    source = open_cube_source(request.source, dark=request.dark, white=request.white)
-    return source if request.wavelengths is None else with_wavelengths(source, request.wavelengths)
 
 
 def _stamps(source: CubeSource) -> list[tuple[int, int]]:
     return [(path.stat().st_size, path.stat().st_mtime_ns) for path in source.files]
 
 
-def _key(request: IngestRequest, source: CubeSource, files: Sequence[SourceFile]) -> dict[str, Any]:
+def _key(name: str | None, source: CubeSource, files: Sequence[SourceFile]) -> dict[str, Any]:
     """What the store depends on: content, the flags, and wavelengths that come from elsewhere than the files."""
     named = source.root is not None  # in a Zarr store names say where a chunk lies
     centres, widths = source.bands.wavelength_nm, source.bands.fwhm_nm
     return {
         "files": [[file.name if named else "", file.size, file.sha256] for file in files],
         "shape": source.shape,
-        "name": request.name,
+        "name": name,
         "references": [source.dark, source.white],
         "wavelength_nm": None if centres is None else centres.tolist(),
         "fwhm_nm": None if widths is None else widths.tolist(),
@@ -133,7 +158,6 @@ def _record(
 
 
 def _print(record: dict[str, Any], source: CubeSource, console: Console) -> None:
-    """The record in a few lines: what came in, what is doubtful, where it lies."""
     lines, samples, bands = record["shape"]
     span = record["wavelength_nm"]
     light = "no wavelengths (give --wavelengths)" if span is None else f"{span[0]:g}-{span[1]:g} nm"

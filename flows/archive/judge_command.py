@@ -5,9 +5,7 @@ Nothing of the survey is made again: what it left is read from the archive, and 
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from rich.console import Console
 from rich.markup import escape
@@ -17,7 +15,6 @@ from flows.archive.stale_runs import asked_again
 from flows.publish.receipt import Receipt
 from flows.publish.run_folder import add_accuracy, load_receipt
 from flows.publish.survey_command import show_published
-from flows.settings.survey_settings import Settings
 from flows.survey.run import SurveyRun, open_run
 from flows.survey.sources import for_rig
 from flows.survey.stage import versions
@@ -31,36 +28,29 @@ from storage.archive.records import Run
 from storage.remote.opening import open_archive
 
 
-@dataclass(frozen=True)
-class JudgeRequest:
-    """Which run, and how: None leaves it as the survey was asked for."""
-
-    archive: str
-    run: str  # its name, `latest` or `previous`
-    controls: bool | None = None
-    labels: str | None = None
-
-
-def split_address(text: str) -> tuple[str, str] | None:
-    """Archive and run of an address such as ``archive/runs/20261120T101701-farm``; None of anything else."""
-    found = re.fullmatch(r"(.+)/runs/([^/]+)/?", text)
-    return None if found is None else (found[1], found[2])
-
-
-def run_judge(request: JudgeRequest, console: Console) -> Receipt:
+def run_judge(
+    archive: str, name: str, console: Console, *, controls: bool | None = None, labels: str | None = None
+) -> Receipt:
     """Judge a run's map and add its accuracy to the run; gives its receipt, as it is where it has what is asked for.
+
+    ``name`` may be `latest` or `previous`; what is None is as the survey was asked for.
 
     Raises
     ------
     ArchiveError : there is no such run, it is damaged, or lacks what is needed.
     SceneError, WeightsError : scene, labels or weights are not those of the run, or there are no labels.
     """
-    opened = open_archive(request.archive, create=False)
+    opened = open_archive(archive, create=False)
     catalogue = Catalogue.read(opened.root)
-    found = find_run(catalogue, request.run)
+    found = find_run(catalogue, name)
     receipt = load_receipt(found.folder)
-    settings = _settings(found, request, opened.name)
-    if _has(receipt, settings, request):
+    settings = replace(asked_again(found, opened.name, None), accuracy=True)
+    if controls is not None:
+        settings = for_rig(replace(settings, controls=controls))
+    if labels is not None:
+        settings = replace(settings, labels=labels)
+    there = "accuracy" in receipt and labels is None
+    if there and (receipt["accuracy"]["controls"] or not settings.controls):
         console.print(escape(f"{found.uri} has its accuracy already"), highlight=False, soft_wrap=True)
         return receipt
     use_one_thread()
@@ -71,35 +61,15 @@ def run_judge(request: JudgeRequest, console: Console) -> Receipt:
         products = _products(catalogue, found, run)
         _check_same(catalogue, found, products, run)
     with run.archive.in_use(), run.settings.crew.open(), StageProgress(console, TITLES) as progress:
-
-        def watch(stage: str, state: str, done: float) -> None:
-            running = state == "running"
-            progress.show(stage, done, "" if running else state, ended=not running)
-
         draft = run.archive.extend_run(found.folder.name, wait=False)
         if draft is None:
             raise ArchiveError(f"{found.uri} is being judged by another process; it adds the accuracy")
         with draft:
-            runner = StageRunner(run, watch)
+            runner = StageRunner(run, progress.watch)
             judged = judge(runner, products)
             published = add_accuracy(run, draft, judged, runner.records["evaluate"])
     show_published(published, run.archive, console)
     return published.receipt
-
-
-def _settings(found: Run, request: JudgeRequest, archive: str) -> Settings:
-    """The settings of the run's survey, with what is asked for now."""
-    settings = replace(asked_again(found, archive, None), accuracy=True)
-    if request.controls is not None:
-        settings = for_rig(replace(settings, controls=request.controls))
-    return settings if request.labels is None else replace(settings, labels=request.labels)
-
-
-def _has(receipt: Receipt, settings: Settings, request: JudgeRequest) -> bool:
-    """Whether a run's receipt has what is asked for: accuracy, by these labels, and controls where they are wanted."""
-    if "accuracy" not in receipt or request.labels is not None:
-        return False
-    return bool(receipt["accuracy"]["controls"]) or not settings.controls
 
 
 def _products(catalogue: Catalogue, found: Run, run: SurveyRun) -> Products:
@@ -109,16 +79,15 @@ def _products(catalogue: Catalogue, found: Run, run: SurveyRun) -> Products:
     for stage in STAGES.values():
         if not stage.judges:
             row = rows.get(stage.name, {})
+            key, what = str(row.get("key") or ""), f"{stage.title} of {found.uri}"
             skipped = row.get("state") == "skipped"
-            key = str(row.get("key") or "")
-            products[stage.name] = None if skipped else _store(catalogue, found, run.archive, stage.title, key)
+            products[stage.name] = None if skipped else _store(catalogue, run.archive, what, key)
     return products
 
 
-def _store(catalogue: Catalogue, found: Run, archive: Archive, title: str, key: str) -> StageRef:
+def _store(catalogue: Catalogue, archive: Archive, what: str, key: str) -> StageRef:
     uris = [uri for uri in catalogue.by_key.get(key, []) if uri in catalogue.stores]
     store = catalogue.stores[uris[0]] if uris else None
-    what = f"{title} of {found.uri}"
     if store is None or store.problem is not None:
         raise ArchiveError(f"the {what} is missing or damaged; run verify --repair")
     now = versions().get(store.ref.stage)
@@ -136,16 +105,10 @@ def _check_same(catalogue: Catalogue, found: Run, products: Products, run: Surve
         raise SceneError(
             f"the scene {run.settings.scene} is another than {found.uri} looked at; put that one back, or survey again"
         )
-    drawn_with = _param(catalogue, products.of("draw_map"), "weights")
-    if run.weights_key != drawn_with:
+    if run.weights_key != catalogue.stores[products.of("draw_map").uri].params.get("weights"):
         raise WeightsError(
             f"the weights {run.settings.weights or 'that come with SpectralZoom'} are others than the map of"
             f" {found.uri} was drawn with; put those back, or reprocess with these"
         )
     if not run.scene.labelled:
         raise SceneError(f"there are no labels to judge {found.uri} by; give --labels FILE, on the scene's pixels")
-
-
-def _param(catalogue: Catalogue, ref: StageRef, name: str) -> object:
-    params: Mapping[str, object] = catalogue.stores[ref.uri].params
-    return params.get(name)

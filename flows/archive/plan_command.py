@@ -1,35 +1,188 @@
-"""What `spectralzoom plan` shows: stage by stage what a survey would do, why, and about how long it would take."""
+"""What `spectralzoom plan` does: a survey's stages are asked which store they want; nothing is built or written."""
 
 from __future__ import annotations
 
-import sys
+import tempfile
 from collections.abc import Sequence
-from dataclasses import asdict
-from typing import Any
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from flows.archive.forecast import StageForecast, forecast
+from flows.archive.stage_costs import PastCosts
+from flows.cli.app import AsJson
+from flows.cli.survey_verbs import NO_FLAGS, SurveyFlags, by_setting
+from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
+from flows.survey.run import SurveyRun, open_run
+from flows.survey.stage import Stage, Wanted
+from flows.survey.survey import STAGES, judge, survey
 from flows.terminal.figures import format_bytes, format_seconds
-from flows.terminal.shown_text import on_stdout
-from storage.archive.whole_files import to_json
+from flows.terminal.processes import DONE
+from flows.terminal.progress import put_out
+from pipeline.errors import IncompleteStoreError, PipelineError
+from storage.archive.addresses import store_at
+from storage.archive.archive import Archive, StageRef
+from storage.archive.changes import Change, changes_between
+from storage.archive.keys import plain
+from storage.archive.lineage import Catalogue
+from storage.archive.records import Store
+from storage.remote.opening import is_archive, open_archive
+
+State = Literal["cached", "to run", "blocked", "skipped"]
+
+
+def plan(settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = False) -> int:
+    """Tell what a survey would run: what is stored, what is to be made and why, and about how long it takes.
+
+    Nothing is captured, started or written. Give the settings that you would give to `survey`.
+
+    Parameters
+    ----------
+    settings
+        A survey's TOML file; flags win over it.
+    """
+    put_out(plan_content(load_settings(settings, by_setting(flags))), show_plan, as_json=as_json)
+    return DONE
+
+
+@dataclass(frozen=True)
+class StageForecast:
+    """What would become of one stage. ``seconds`` and ``size`` are None where the archive has nothing to go by."""
+
+    stage: str
+    state: State
+    key: str | None  # None while an input of it is not known
+    why: str
+    seconds: float | None = 0.0
+    size: int | None = 0  # [bytes]
+    basis: str = ""  # what the estimate comes from, or why there is none
+    changes: tuple[Change, ...] = ()  # against the newest store of the same stage and scene
+
+
+class _WaitsError(IncompleteStoreError):
+    """A stage asks for the content, or for the key, of what is still to be made."""
+
+
+@dataclass(frozen=True)
+class _Awaited(StageRef):
+    """Where a store would be: whoever asks for its path, or for a key that is not known, waits for ``made_by``."""
+
+    made_by: str
+
+    def __getattribute__(self, name: str) -> Any:
+        value = object.__getattribute__(self, name)
+        if name == "path" or (name == "key" and not value):
+            raise _WaitsError(object.__getattribute__(self, "made_by"))
+        return value
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """What a survey would do, stage by stage in order, and why this machine would refuse to (None: it would not)."""
+
+    stages: list[StageForecast]
+    refused: str | None = None
+
+
+def forecast(settings: Settings) -> Forecast:
+    """Tell of every stage what a survey of these settings would do. Writes nothing.
+
+    Raises
+    ------
+    PipelineError : what the survey itself would refuse at its start, but for a scene that this machine cannot hold.
+    """
+    with tempfile.TemporaryDirectory(prefix="spectralzoom-plan-") as empty:
+        archive = Archive(Path(empty), writes=False)  # where there is none yet
+        if is_archive(settings.out):
+            archive = open_archive(settings.out, create=False, write=False)
+        run = replace(open_run(replace(settings, out=empty), planning=True), settings=settings, archive=archive)
+        planner = Planner(run, Catalogue.read(archive.root))
+        judge(planner, survey(planner))
+    return Forecast(planner.rows, run.refused)
+
+
+@dataclass
+class Planner:
+    """An engine for `flows.survey.survey.survey` that asks every stage for its key, and runs none."""
+
+    run: SurveyRun
+    catalogue: Catalogue
+    rows: list[StageForecast] = field(default_factory=list)
+    _planned: dict[str, Store] = field(default_factory=dict)  # by address
+
+    def __post_init__(self) -> None:
+        self._costs = PastCosts(self.catalogue, self.run)
+
+    def __call__(self, stage: str, /, *inputs: StageRef) -> StageRef | None:
+        """Forecast one of ``STAGES`` by its name."""
+        ref: StageRef | None = None
+        try:
+            wanted = STAGES[stage](self.run, *inputs)
+            row = StageForecast(stage, "skipped", None, "nothing to do with these settings")
+            if wanted is not None:
+                row, ref = self._look(STAGES[stage], wanted)
+        except (PipelineError, OSError) as error:  # what is there cannot be used: the survey would stop here
+            why = f"waits for {error}" if isinstance(error, _WaitsError) else str(error)
+            row = StageForecast(stage, "blocked", None, why, *self._costs.estimate(stage))
+            ref = _Awaited(STAGES[stage].product.name, "", Path(), stage)
+        self.rows.append(row)
+        return ref
+
+    def _look(self, stage: Stage, wanted: Wanted) -> tuple[StageForecast, StageRef]:
+        key = stage.key(wanted)
+        if stage.name == "capture_fine":
+            self._costs.plan_fine(sum(sweep["lines"] for sweep in wanted.params["sweeps"]))
+        found = stage.find(self.run.archive, wanted)
+        if found is not None:
+            return StageForecast(stage.name, "cached", key, "stored"), found
+        ref = store_at(self.run.archive.root, stage.product.name, key)
+        inputs = [one.key for one in wanted.inputs]
+        facts = {"version": stage.product.version, "params": plain(wanted.params), "inputs": inputs}
+        self._planned[ref.uri] = Store(ref, facts)
+        why, changes = self._reason(stage.name, self._planned[ref.uri])
+        row = StageForecast(stage.name, "to run", key, why, *self._costs.estimate(stage.name), changes)
+        return row, _Awaited(ref.stage, key, ref.path, stage.name)
+
+    def _reason(self, stage: str, store: Store) -> tuple[str, tuple[Change, ...]]:
+        """What differs from the newest store of the same stage of the same scene, in words and in full."""
+        stored = self._costs.stored(stage)
+        before = next((one for one in stored if self._costs.of_scene(one)), None)
+        if before is None:
+            return ("nothing stored yet of this scene" if stored else "nothing stored yet"), ()
+        known = replace(self.catalogue, stores=self.catalogue.stores | self._planned)
+        found = tuple(change for change in changes_between(known, before, store) if change.kind != "library")
+        return _in_words(found, store.ref.stage), found
+
+
+def _in_words(changes: Sequence[Change], stage: str) -> str:
+    """The first thing that differs where it began, and how many more."""
+    causes = [change for change in changes if change.kind != "input"] or list(changes)
+    if not causes:
+        return "nothing differs but its key"
+    first = causes[0]
+    where = "" if first.where == stage else f" of {first.where}"
+    more = f", and {len(causes) - 1} more" if len(causes) > 1 else ""
+    if first.kind == "input":
+        return f"other {first.name} than in the newest store{more}"
+    if first.name == "weights":
+        return f"other weights than in the newest store{where}{more}"
+    name = "version" if first.kind == "version" else first.name
+    return f"{name}{where}: {_shown(first.old)} before, {_shown(first.new)} now{more}"
+
+
+def _shown(value: object) -> str:
+    """A value as a person writes it: lists with commas, nothing as none."""
+    parts = value if isinstance(value, list) else [value]
+    return ", ".join("none" if part is None else str(part) for part in parts) or "none"
+
 
 MOST_LETTERS = 250  # of a reason
 COLOURS = {"cached": "green", "to run": "bold", "blocked": "yellow", "skipped": "dim"}
-
-
-def run_plan(settings: Settings, *, as_json: bool = False) -> int:
-    """Tell on stdout what a survey of these settings would run; nothing is run or written."""
-    content = plan_content(settings)
-    if as_json:
-        sys.stdout.write(to_json(content))
-    else:
-        show_plan(content, on_stdout())
-    return 0
 
 
 def plan_content(settings: Settings) -> dict[str, Any]:
@@ -42,17 +195,13 @@ def plan_content(settings: Settings) -> dict[str, Any]:
     ahead = [row for row in rows if row.state in ("to run", "blocked")]
     return {
         "archive": settings.out,
-        "stages": [_row(row) for row in rows],
+        "stages": [{"bytes" if name == "size" else name: value for name, value in asdict(row).items()} for row in rows],
         "to_make": len(ahead),
         "estimated": sum(row.seconds is not None for row in ahead),
         "seconds": _sum(ahead, "seconds"),
         "bytes": _sum(ahead, "size"),
         "refused": found.refused,
     }
-
-
-def _row(row: StageForecast) -> dict[str, Any]:
-    return {"bytes" if name == "size" else name: value for name, value in asdict(row).items()}
 
 
 def _sum(rows: Sequence[StageForecast], name: str) -> float | None:
@@ -72,7 +221,12 @@ def show_plan(content: dict[str, Any], console: Console) -> None:
         ahead = row["state"] in ("to run", "blocked")
         figures = (format_seconds(row["seconds"]), format_bytes(row["bytes"])) if ahead else ("", "")
         state = f"[{COLOURS[row['state']]}]{row['state']}[/]"
-        table.add_row(row["stage"], state, escape(_short(row["why"])), *figures)
+        table.add_row(
+            row["stage"],
+            state,
+            escape(row["why"] if len(row["why"]) <= MOST_LETTERS else f"{row['why'][: MOST_LETTERS - 3]}..."),
+            *figures,
+        )
     console.print(table)
     console.print(escape(_sentence(content)), highlight=False, soft_wrap=True)
     if content["refused"] is not None:
@@ -88,7 +242,3 @@ def _sentence(content: dict[str, Any]) -> str:
     about = f"about {format_seconds(content['seconds'])} and {format_bytes(content['bytes'])}"
     rest = "" if known == count else f" without {count - known} stages of which there is no record"
     return f"{count} stages to make, {about} by the archive's own records{rest}"
-
-
-def _short(text: str) -> str:
-    return text if len(text) <= MOST_LETTERS else f"{text[: MOST_LETTERS - 3]}..."

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,7 +16,6 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
-from flows.archive.commands import DONE, FAILED, PARTLY, check_outside
 from flows.archive.stale_runs import (
     Generation,
     asked_again,
@@ -28,10 +27,18 @@ from flows.archive.stale_runs import (
     newest_runs,
     would_remake,
 )
-from flows.settings.survey_settings import Settings
+from flows.cli.app import ArchiveName, AsJson, OutFolder, Scheduler, Switch, Workers, check_outside, stderr
+from flows.publish.survey_command import run_survey
+from flows.settings.load import of_this_version, parse_settings
+from flows.settings.survey_settings import OF_THE_MACHINE, Settings
 from flows.survey.scores import score_of
 from flows.terminal.figures import format_points, format_seconds
 from pipeline.errors import PipelineError, SettingsError, visible
+from flows.terminal.figures import counted, format_points, format_seconds
+from flows.terminal.processes import DONE, FAILED, PARTLY
+from flows.terminal.progress import put_out
+from pipeline.errors import PipelineError, SettingsError
+from pipeline.visible_text import visible
 from storage.archive.lineage import Catalogue
 from storage.archive.records import read_run
 from storage.archive.whole_files import new_file, to_json, write_whole
@@ -40,6 +47,44 @@ from storage.remote.opening import open_archive
 
 Survey = Callable[[Settings, Console], Path]  # settings in, the folder of the published run out
 STATES = ("ran", "would run", "skipped", "failed")
+
+
+def reprocess(
+    archive: ArchiveName,
+    *,
+    since: str | None = None,
+    stage: str | None = None,
+    field: str | None = None,
+    failed: Switch = False,
+    weights: Path | None = None,
+    scheduler: Scheduler = "threads",
+    workers: Workers = None,
+    dry_run: Switch = False,
+    out: OutFolder = None,
+    as_json: AsJson = False,
+) -> int:
+    """Survey every field of an archive again: light is found there, only what has changed is made anew.
+
+    Parameters
+    ----------
+    since
+        Only fields whose newest run is of this date (UTC) or later: 2026-05-01
+    stage
+        Only where this stage would be made anew: segment, draw_map
+    field
+        Only fields whose survey, scene file or newest run is called so; * stands for any letters.
+    failed
+        Only fields whose newest run is damaged or lacks stores; what `verify` finds in bytes is for its --repair.
+    weights
+        Other model weights for all of them.
+    dry_run
+        Only say what would run.
+    out
+        Folder for the summary, reprocess-TIME.json; without one beside the archive, where anything was to be done.
+    """
+    crew = Crew(scheduler, workers)
+    request = ReprocessRequest(archive, since, stage, field, failed, weights, dry_run, out, crew)
+    return run_reprocess(request, stderr, as_json=as_json)
 
 
 @dataclass(frozen=True)
@@ -71,7 +116,7 @@ def run_reprocess(
     ArchiveError : the archive cannot be read or written, or there is no room for the summary.
     """
     opened = open_archive(request.archive, create=False, write=not request.dry_run)
-    folder = opened.around if request.out is None else check_outside(request.out, opened)
+    folder = opened.around if request.out is None else check_outside(request.out, opened.root)
     catalogue = Catalogue.read(opened.root)
     wanted = _chosen(catalogue, request, opened.name)
     rows: list[dict[str, Any]] = []
@@ -80,7 +125,14 @@ def run_reprocess(
         "started": f"{datetime.now(UTC):%Y%m%dT%H%M%S}",
         "finished": None,
         "dry_run": request.dry_run,
-        "asked": _asked(request),
+        "asked": {  # as it can be told years later
+            "since": request.since,
+            "stage": request.stage,
+            "field": request.field,
+            "failed": request.failed,
+            "weights": None if request.weights is None else str(request.weights.absolute()),
+            "weights_key": None if request.weights is None else file_key(request.weights),
+        },
         "fields": rows,
     }
     file = None
@@ -96,39 +148,26 @@ def run_reprocess(
             if file is not None:
                 write_whole(file, to_json(content))  # also of what was done before an interruption
     content["finished"] = f"{datetime.now(UTC):%Y%m%dT%H%M%S}"
-    if file is not None:
-        file = _end_summary(file, content, wanted=request.out is not None)
-    if as_json:
-        sys.stdout.write(to_json(content))
-    else:
-        _show(content, file)
-    return _exit_code([row["state"] for row in rows])
-
-
-def _end_summary(file: Path, content: Mapping[str, Any], *, wanted: bool) -> Path | None:
-    """Write the whole summary; where there was nothing to do and nobody asked for the file, take it away."""
-    if not wanted and all(row["state"] == "skipped" for row in content["fields"]):
-        file.unlink(missing_ok=True)
-        return None
-    write_whole(file, to_json(content))
-    return file
-
-
-def _asked(request: ReprocessRequest) -> dict[str, Any]:
-    """What was asked for, as it can be told years later: the weights by their content too."""
-    weights = None if request.weights is None else str(request.weights.absolute())
-    return {
-        "since": request.since,
-        "stage": request.stage,
-        "field": request.field,
-        "failed": request.failed,
-        "weights": weights,
-        "weights_key": None if weights is None else file_key(Path(weights)),
-    }
+    if file is not None and request.out is None and all(row["state"] == "skipped" for row in rows):
+        file.unlink(missing_ok=True)  # nothing was done, and nobody asked for the file
+        file = None
+    elif file is not None:
+        write_whole(file, to_json(content))
+    put_out(content, lambda told, screen: _show(told, file), as_json=as_json)
+    failed = sum(row["state"] == "failed" for row in rows)
+    return DONE if not failed else FAILED if failed == len(rows) else PARTLY
 
 
 def _chosen(catalogue: Catalogue, request: ReprocessRequest, out: str) -> list[Generation]:
     """Newest runs of the fields that were asked for."""
+
+    def remakes(one: Generation) -> bool:
+        try:
+            settings = asked_again(one.run, out, request.weights)
+        except PipelineError:
+            return True  # said when its turn comes
+        return would_remake(catalogue, one.run, str(request.stage), settings)
+
     if request.weights is not None and not request.weights.is_file():
         raise SettingsError(f"--weights {request.weights}: there is no such file; give weights that train has written")
     since = None if request.since is None else _moment(request.since)
@@ -144,16 +183,8 @@ def _chosen(catalogue: Catalogue, request: ReprocessRequest, out: str) -> list[G
         fields = [one for one in fields if not is_whole(catalogue, one.run)]
     if request.stage is not None:
         check_stage(request.stage)
-        fields = [one for one in fields if _would_remake(catalogue, one, request, out)]
+        fields = [one for one in fields if remakes(one)]
     return fields
-
-
-def _would_remake(catalogue: Catalogue, one: Generation, request: ReprocessRequest, out: str) -> bool:
-    try:
-        settings = asked_again(one.run, out, request.weights)
-    except PipelineError:
-        return True  # said when its turn comes
-    return would_remake(catalogue, one.run, str(request.stage), settings)
 
 
 def _moment(text: str) -> datetime:
@@ -167,7 +198,6 @@ def _moment(text: str) -> datetime:
 def _again(
     catalogue: Catalogue, generation: Generation, request: ReprocessRequest, console: Console, survey: Survey
 ) -> dict[str, Any]:
-    """One field surveyed again; an error is said in its row."""
     run, begun = generation.run, time.perf_counter()
     row: dict[str, Any] = {
         "field": generation.field,
@@ -196,41 +226,37 @@ def _again(
 
 
 def _survey(settings: Settings, console: Console) -> Path:
-    from flows.publish.survey_command import run_survey
-
     return run_survey(settings, console).folder
+
+
+def survey_as_before(settings: Mapping[str, Any], out: str, console: Console) -> None:
+    """Survey by the settings of a run's receipt into the archive ``out``, on this machine's own terms."""
+    here = {**of_this_version(settings), "out": out, **dict.fromkeys(OF_THE_MACHINE)}
+    run_survey(parse_settings(here), console)
 
 
 def _scores(receipt: Mapping[str, Any], when: str) -> dict[str, float | None]:
     return {f"{name}_{when}": score for name, score in score_of(receipt).items()}
 
 
-def _exit_code(states: Sequence[str]) -> int:
-    """Done, partly, or failed where every field did."""
-    failed = states.count("failed")
-    return DONE if not failed else FAILED if failed == len(states) else PARTLY
-
-
 def _words(row: Mapping[str, Any]) -> str:
-    """What became of one field, in one line."""
     words = f"{row['field']} ({row['old']}) {row['state']}"
     if row["state"] == "ran":
-        scored = [_change("mIoU", row, "miou"), _change("overall", row, "overall_accuracy")]
-        return f"{words}: {row['new']}, {format_seconds(row['seconds'])}{''.join(scored)}"
+        words += f": {row['new']}, {format_seconds(row['seconds'])}"
+        for label, name in (("mIoU", "miou"), ("overall", "overall_accuracy")):
+            scores = [row[f"{name}_before"], row[f"{name}_after"]]
+            words += "" if None in scores else f", {label} {' to '.join(map(format_points, scores))}"
+        return words
     return words + (f": {row['message']}" if row["message"] else "")
 
 
-def _change(label: str, row: Mapping[str, Any], name: str) -> str:
-    scores = [row[f"{name}_before"], row[f"{name}_after"]]
-    return "" if None in scores else f", {label} {' to '.join(map(format_points, scores))}"
-
-
 def _show(content: Mapping[str, Any], file: Path | None) -> None:
-    """Print the summary on stdout, a line a field."""
     rows = content["fields"]
     counts = {state: sum(row["state"] == state for row in rows) for state in STATES}
     told = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
-    count = f"{len(rows)} field{'' if len(rows) == 1 else 's'}: {told}"
-    lines = [*map(_words, rows), count if rows else "no field matches: nothing to do"]
+    lines = [
+        *map(_words, rows),
+        f"{counted(len(rows), 'field')}: {told}" if rows else "no field matches: nothing to do",
+    ]
     lines += [] if file is None else [f"  {file}"]
     sys.stdout.write(visible("\n".join(lines)) + "\n")

@@ -72,15 +72,22 @@ class PastCosts:
         survey, what both spent on starting is told apart first. None and None where there is no record, or none that
         tells how much work it was.
         """
-        records = [store for store in self.stored(stage) if store.cost is not None and self._alike(store)]
+        records = [store for store in self.stored(stage) if store.cost is not None]
+        if stage == "evaluate":  # controls are many times the work of judging a map alone
+            records = [store for store in records if store.params.get("controls") == self._run.settings.controls]
         if not records:
             return None, None, "no such store has a record of what it took"
         unit = CONTROLS_UNIT if stage == "evaluate" and self._run.settings.controls else STAGES[stage].unit
         known = self._known(sorted(records, key=lambda store: not self.of_scene(store)), unit)
         if not known:
             return None, None, f"{records[0].ref.uri} does not tell how much work it was"
-        seconds = self._line(known, unit, [cost.wall_s for _, cost, _ in known])
-        size = self._line(known, STAGES[stage].size or unit, [cost.size for _, cost, _ in known])
+        here = self._extent_like(known[0][2])
+
+        def scaled(by: Unit, took: Sequence[float]) -> float:
+            return scaled_cost([then.work(by) for _, _, then in known], took, here.work(by))
+
+        seconds = scaled(unit, [cost.wall_s for _, cost, _ in known])
+        size = scaled(STAGES[stage].size or unit, [cost.size for _, cost, _ in known])
         address, first, _ = known[0]
         rest = "" if len(known) == 1 else f", and {known[1][0]}"
         times = seconds / first.wall_s if first.wall_s else 0.0
@@ -100,15 +107,6 @@ class PastCosts:
             if len(known) == 2:
                 break
         return known
-
-    def _line(self, known: Sequence[tuple[str, Cost, Extent]], unit: Unit, took: Sequence[float]) -> float:
-        """What this run takes: the first record by its work, less what starting took where two records tell it."""
-        works = [then.work(unit) for _, _, then in known]
-        return scaled_cost(works, took, self._extent_like(known[0][2]).work(unit))
-
-    def _alike(self, store: Store) -> bool:
-        """Controls are many times the work of judging a map alone."""
-        return store.ref.stage != "evaluate" or store.params.get("controls") == self._run.settings.controls
 
     def _extent_like(self, then: Extent) -> Extent:
         """This run, with the fine pass's lines as planned, else as many as its seconds buy in runs as long as then."""
@@ -138,14 +136,13 @@ class PastCosts:
             grid=SceneGrid(**grids[0]) if grids else own.grid,
             camera=replace(own.camera, samples=captures[False].params["camera"]["samples"]),
             along=coarse[0]["along"],
-            bands=_bands_of(captures[False]),
+            bands=len(open_raw_cube(min(captures[False].ref.path.glob("*.zarr"))).wavelength_nm),
             coarse_lines=_lines(coarse),
             fine_lines=None if fine is None else _lines(fine),
             fine_runs=None if fine is None else len(fine),
         )
 
     def _below(self, store: Store) -> list[Store]:
-        """A store and all that it rests on."""
         stores = self._catalogue.stores
         below = self._catalogue.ancestors([store.ref.uri])
         return [store, *(stores[uri] for uri in sorted(below) if uri in stores)]
@@ -172,8 +169,3 @@ def _is_fine(capture: Store) -> bool:
 
 def _lines(sweeps: Sequence[dict[str, Any]]) -> int:
     return sum(int(sweep["lines"]) for sweep in sweeps)
-
-
-def _bands_of(capture: Store) -> int:
-    """Bands of a stored capture, by the first of its sweeps."""
-    return len(open_raw_cube(min(capture.ref.path.glob("*.zarr"))).wavelength_nm)

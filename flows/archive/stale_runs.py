@@ -21,23 +21,12 @@ from pipeline.errors import SettingsError, WeightsError
 from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, USUAL_DAY, USUAL_HOUR, law_of_key
 from storage.archive.keys import canonical_json
 from storage.archive.lineage import Catalogue
-from storage.archive.records import Run
+from storage.archive.records import Run, Store
 
 # what the light of a field depends on; surveys that agree in these are generations of one
 OF_THE_LIGHT = (
-    "scene",
-    "bands",
-    "wavelengths",
-    "source",
-    "seed",
-    "effects",
-    "size",
-    "day",
-    "hour",
-    "camera",
-    "pointing_px",
-    "pose",
-    "visit",
+    *("scene", "bands", "wavelengths", "source", "seed", "effects", "size"),
+    *("day", "hour", "camera", "pointing_px", "pose", "visit"),
 )
 
 
@@ -102,15 +91,14 @@ def asked_again(run: Run, out: str | Path, weights: Path | None) -> Settings:
 
 def stale_stores(catalogue: Catalogue, uris: set[str], weights: str | None) -> set[str]:
     """Stores that a survey would not find as it wants them: gone, damaged, of another version, of other weights."""
-    return {uri for uri in uris if _is_stale(catalogue, uri, weights)}
+    now, by_weights = versions(), {one.product.name for one in STAGES.values() if one.product.by_weights}
 
+    def is_stale(store: Store | None) -> bool:
+        if store is None or store.problem is not None or store.version != str(now.get(store.ref.stage)):
+            return True
+        return store.ref.stage in by_weights and store.params.get("weights", weights) != weights
 
-def _is_stale(catalogue: Catalogue, uri: str, weights: str | None) -> bool:
-    store = catalogue.stores.get(uri)
-    if store is None or store.problem is not None or store.version != str(versions().get(store.ref.stage)):
-        return True
-    by_weights = {one.product.name for one in STAGES.values() if one.product.by_weights}
-    return store.ref.stage in by_weights and store.params.get("weights", weights) != weights
+    return {uri for uri in uris if is_stale(catalogue.stores.get(uri))}
 
 
 def is_whole(catalogue: Catalogue, run: Run) -> bool:
@@ -137,9 +125,9 @@ def would_remake(catalogue: Catalogue, run: Run, stage: str, settings: Settings)
 
     Told from versions and weights in the manifests; what new weights of another patch size change in the plan is not.
     """
-    own = [
-        uri for uri in catalogue.named_and_below[run.uri] if uri.split("/")[1] == stage or stage in _called(run, uri)
-    ]
+    keys = {row.get("key") for row in run.stages if str(row.get("name")) == stage}
+    below = ((uri, uri.split("/")) for uri in catalogue.named_and_below[run.uri])
+    own = [uri for uri, parts in below if parts[1] == stage or parts[-1] in keys]
     return bool(stale_stores(catalogue, set(own) | catalogue.ancestors(own), weights_key(settings)))
 
 
@@ -168,7 +156,3 @@ def file_key(path: Path) -> str | None:
 def _file_key(path: Path, changed_ns: int, size: int) -> str:
     """Read once for all fields, and again when the file has changed."""
     return content_key(path)
-
-
-def _called(run: Run, uri: str) -> set[str]:
-    return {str(row.get("name")) for row in run.stages if row.get("key") == uri.rpartition("/")[2]}

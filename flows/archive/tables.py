@@ -30,13 +30,13 @@ def show_contents(content: dict[str, Any], console: Console) -> None:
         scored = "not yet" if is_pending(run) else format_points(miou)
         runs.add_row(
             escape(run["id"]),
-            escape(_file_name(run["scene"])),
+            escape(PurePath(str(run["scene"])).name) if run["scene"] else DASH,
             _plain(run["seed"]),
             _plain(run["budget"]),
             scored,
             format_bytes(run["bytes"]),
             _age(run["age_s"]),
-            _state(run["state"]),
+            run["state"] if run["state"] == "there" else f"[bold red]{escape(run['state'])}[/]",
         )
     console.print(runs if content["runs"] else "no runs")
     stores = _table("Stores", "stage", "key", "version", "size", "age", "runs that name it")
@@ -124,7 +124,7 @@ def _node_words(node: Mapping[str, Any]) -> str:
     if "see" in node:
         return f"{name} [dim]{node['see']}[/]"
     took = "" if node["wall_s"] is None else f", took {format_seconds(node['wall_s'])}"
-    when = _when(node["created"])
+    when = escape(node["created"][:16].replace("T", " ")) or DASH
     return f"{name} version {escape(node['version'])}, {when}, {format_bytes(node['bytes'])}{took}"
 
 
@@ -177,11 +177,6 @@ def _say(console: Console, text: str) -> None:
     console.print(escape(text), highlight=False, soft_wrap=True)
 
 
-def _when(created: str) -> str:
-    """The minute of an ISO date."""
-    return escape(created[:16].replace("T", " ")) or DASH
-
-
 def _age(seconds: float | None) -> str:
     if seconds is None:
         return DASH
@@ -189,14 +184,6 @@ def _age(seconds: float | None) -> str:
         if seconds >= 2 * unit:
             return f"{seconds // unit:.0f} {word}"
     return format_seconds(max(seconds, 0))
-
-
-def _state(state: str) -> str:
-    return state if state == "there" else f"[bold red]{escape(state)}[/]"
-
-
-def _file_name(scene: object) -> str:
-    return PurePath(str(scene)).name if scene else DASH
 
 
 def _plain(value: object) -> str:

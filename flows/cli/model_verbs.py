@@ -1,41 +1,179 @@
-"""Verbs on weights: how good they are, and what that costs."""
+"""Verbs on weights: train them, say how good they are, and what accuracy costs in time."""
 
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from flows.cli.app import AsJson, OutFolder, Switch, app, parse_numbers, parse_wholes, split_list, stderr
-from flows.terminal.shown_text import print_json
+from flows.archive.judge_command import run_judge
+from flows.cli.app import AsJson, OutFile, OutFolder, Switch, parse_numbers, parse_wholes, split_list, stderr
+from flows.evaluate.command import run_evaluate
+from flows.evaluate.request import SHARES, USUAL, EvaluateRequest
+from flows.terminal.progress import print_json
+from flows.tradeoff.command import run_tradeoff
+from flows.training.command import run_train
+from flows.training.train import TrainRequest, usual_crop
+from models.training.train import TrainingSettings
 from pipeline.errors import SettingsError
 
 
-@app.command
-def seal(*weights: Path) -> int:
-    """Give WEIGHTS of an earlier version the hashes by which damage is told; those that have them are checked.
-
-    Nothing else of a file changes, and nothing that was made with it counts as made with other weights.
+def tradeoff(
+    stage: str | None = None,
+    *,
+    out: OutFile = Path("tradeoff"),
+    repeats: int = 5,
+    seed: int = 0,
+    as_json: AsJson = False,
+) -> int:
+    """Measure what accuracy costs in time, for STAGE or for every stage that has a choice.
 
     Parameters
     ----------
-    weights
-        Files of weights.
+    stage
+        rectify, plan, simulate, segment or store; all without one.
+    out
+        Folder for tradeoff.json and tradeoff.png.
+    repeats
+        Rounds in which every setting is timed once.
+    seed
+        Of the scenes that are measured on.
     """
-    from models.weights.files import seal_weights
 
-    if not weights:
-        raise SettingsError("seal needs files of weights: spectralzoom seal FILE ...")
-    for path in weights:
-        done = "sealed" if seal_weights(path) else "sealed already, every tensor as it was written"
-        stderr.print(f"{path}: {done}", highlight=False, markup=False, soft_wrap=True)
+    content = run_tradeoff(stage, out, repeats, seed, stderr)
+    if as_json:
+        print_json(content)
     return 0
 
 
-@app.command
+def train(
+    dataset: str,
+    *,
+    out: OutFile,
+    hold_out: str | None = None,
+    validation: int | None = None,
+    seed: int = 0,
+    steps: int = 2000,
+    minutes: float = 36.0,
+    scenes: int | None = None,
+    patch: int | None = None,
+    factor: int = 4,
+    columns: int = 24,
+    preset: Literal["two-scale", "paper", "dense", "upsampled", "coarser"] = "two-scale",
+    positions: Literal["2d", "paper"] = "2d",
+    init: Path | None = None,
+    dim: int = 128,
+    layers: int = 4,
+    heads: int = 4,
+    mlp_ratio: int = 3,
+    crop: int | None = None,
+    batch: int = 4,
+    labels: str | None = None,
+    bands: str | None = None,
+    wavelengths: str | None = None,
+    train_mask: str | None = None,
+    mask_classes: str | None = None,
+    as_json: AsJson = False,
+) -> int:
+    """Train weights on DATASET: `farm` (`farm@2`), a folder of labelled scenes, or one scene file.
+
+    The state of the run is kept beside the weights, in OUT.checkpoint: the same command goes on where it was stopped.
+    `spectralzoom evaluate` then says how good the weights are on scenes that they were not trained on.
+
+    Parameters
+    ----------
+    dataset
+        `farm` (`farm@2`), a folder with images, labels and a scene.toml, or a file.
+    out
+        File of weights to write (.safetensors).
+    hold_out
+        Names of scenes never to be trained on, with commas: 059,060. The split is kept in the weights.
+    validation
+        How many scenes to keep from training, for the figures at its end; by default 3 of the farm, one in eight of a
+        folder, 4 at most.
+    seed
+        Of all that is drawn by chance: first weights, crops, noise.
+    steps
+        Training ends after so many steps or after --minutes, whichever comes first; the learning rate falls with it.
+    minutes
+        The longest that the steps may take; looking at the scenes before and validating after come on top.
+    scenes
+        How many scenes of the built-in farm, on days from April to October; 48 by default.
+    patch
+        Size of a patch [px]; by default 16 for the farm, 8 to 32 for files, by their size.
+    factor
+        How many times coarser the coarse pass is than the fine one.
+    columns
+        How many numbers a pixel's spectrum is brought to, whatever bands a camera has.
+    preset
+        Which network: `two-scale`, what surveys are made with, or a control to set beside it, with evaluate --control:
+        `paper`, the network of the paper; `dense`, one of ours that reads all of the scene finely, without a coarse
+        pass; `upsampled`, the same given the coarse pass alone; `coarser`, the same given a grid coarser by 2.
+    positions
+        How patches are told their places: `2d`, by row and column, or `paper`, by one running number.
+    init
+        Weights to begin from: a vision transformer of timm or DeiT, a Segmenter checkpoint with its variant.yml beside
+        it, or weights that this command made. What is taken is said, and kept in the weights.
+    dim
+        Width of the transformer, the numbers that a patch becomes; 192 and 384 are those of ViT-Tiny and ViT-Small.
+    layers
+        Layers of the transformer.
+    heads
+        Heads of its attention; --dim must be divisible by them.
+    mlp_ratio
+        How many times wider the middle of its MLPs is.
+    crop
+        Size of the crops [px]; by default 256 for the farm, 384 for files, whole scenes for the paper's network.
+    batch
+        Crops a step; half as many in the last 30 % of the run, where crops have twice the area if scenes are large
+        enough.
+    labels
+        For one scene: the file of its labels.
+    bands
+        For one scene: numbers of the bands to use, from 0, with commas.
+    wavelengths
+        For one scene: wavelengths of its bands [nm], with commas.
+    train_mask
+        For one scene: an image of its size that says where to train; 0 is nowhere.
+    mask_classes
+        For one scene whose mask numbers classes in another way: the label file's class of its number 1, 2, ..., with
+        commas.
+    """
+
+    size = crop if crop is not None else usual_crop(dataset, preset)
+    choices = {
+        "labels": labels,
+        "bands": parse_wholes(bands, "--bands"),
+        "wavelengths": parse_numbers(wavelengths, "--wavelengths"),
+        "train_mask": train_mask,
+        "mask_classes": parse_wholes(mask_classes, "--mask-classes"),
+    }
+    request = TrainRequest(
+        dataset,
+        out,
+        split_list(hold_out),
+        validation,
+        scenes,
+        patch,
+        factor,
+        columns,
+        positions=positions,
+        preset=preset,
+        tokens={"dim": dim, "layers": layers, "heads": heads, "mlp_ratio": mlp_ratio},
+        init=init,
+        choices=choices,
+        settings=TrainingSettings(steps=steps, minutes=minutes, seed=seed, crop=size, batch=batch),
+    )
+    record = run_train(request, stderr)
+    if as_json:
+        print_json(record)
+    return 0
+
+
 def evaluate(
     dataset: str,
     run: str | None = None,
@@ -115,32 +253,12 @@ def evaluate(
     controls
         For a run: also judge other placements of the same number of seats; as its survey was asked for by default.
     """
+    flags = {name: value for name, value in locals().items() if name not in ("dataset", "run")}
     address = _run_address(dataset, run, given=bool(weights))
     if address is not None:
-        for_weights = {
-            "weights": weights,
-            "out": out,
-            "shares": shares,
-            "policies": policies,
-            "frames": frames,
-            "scenes": scenes,
-            "seed": seed,
-            "draws": draws,
-            "timed-frames": timed_frames,
-            "timed-runs": timed_runs,
-            "control": control,
-            "rig": rig,
-            "equal-time": equal_time,
-            "pooled": pooled,
-            "bands": bands,
-            "wavelengths": wavelengths,
-        }
-        return _evaluate_run(*address, for_weights, controls=controls, labels=labels, as_json=as_json)
+        return _evaluate_run(*address, flags)
     if controls is not None:
         raise SettingsError("--controls is for a run of an archive; weights are judged beside others by --control FILE")
-    from flows.evaluate.command import run_evaluate
-    from flows.evaluate.request import SHARES, USUAL, EvaluateRequest
-
     choices = {
         "labels": labels,
         "bands": parse_wholes(bands, "--bands"),
@@ -170,46 +288,30 @@ def evaluate(
 
 
 def _run_address(dataset: str, run: str | None, *, given: bool) -> tuple[str, str] | None:
-    """Archive and run, where a run is to be judged; None where weights are, on a data set.
-
-    Raises
-    ------
-    SettingsError : neither can be meant.
-    """
-    from flows.archive.judge_command import split_address
-
+    """Archive and run, where a run is to be judged; None where weights are (SettingsError: neither can be meant)."""
     if run is not None:
         return dataset, run
     if given:
         return None
-    address = split_address(dataset)
-    if address is None:
+    found = re.fullmatch(r"(.+)/runs/([^/]+)/?", dataset)
+    if found is None:
         raise SettingsError(
             f"evaluate {dataset}: give --weights FILE to judge weights on this data set, or a run of this archive, such"
             f" as evaluate {dataset} latest, to judge its map"
         )
-    return address
+    return found[1], found[2]
 
 
-def _evaluate_run(
-    archive: str,
-    run: str,
-    for_weights: Mapping[str, object],
-    *,
-    controls: bool | None,
-    labels: str | None,
-    as_json: bool,
-) -> int:
-    from flows.archive.judge_command import JudgeRequest, run_judge
-
+def _evaluate_run(archive: str, run: str, flags: Mapping[str, Any]) -> int:
+    """Judge the map of a run; ``flags`` are all that `evaluate` has, of which some are for weights alone."""
     usual = inspect.signature(evaluate).parameters
-    named = [flag for flag, value in for_weights.items() if value != usual[flag.replace("-", "_")].default]
-    if named:
-        raise SettingsError(
-            f"--{named[0]} is for weights that are judged on a data set; the run {run} is judged as it was surveyed:"
-            " leave it out"
-        )
-    receipt = run_judge(JudgeRequest(archive, run, controls, labels), stderr)
-    if as_json:
+    for name, value in flags.items():
+        if name not in ("labels", "controls", "as_json") and value != usual[name].default:
+            raise SettingsError(
+                f"--{name.replace('_', '-')} is for weights that are judged on a data set; the run {run} is judged as "
+                "it was surveyed: leave it out"
+            )
+    receipt = run_judge(archive, run, stderr, controls=flags["controls"], labels=flags["labels"])
+    if flags["as_json"]:
         print_json(receipt)
     return 0

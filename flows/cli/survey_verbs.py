@@ -1,4 +1,4 @@
-"""Verbs that take a survey's settings: survey, plan, simulate, and the emulation of a rig."""
+"""Verbs that take a survey's settings: survey, simulate, and check or emulate a rig."""
 
 from __future__ import annotations
 
@@ -9,14 +9,18 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from flows.cli.app import AsJson, Switch, app, split_list, stderr
-from flows.cli.rig_verbs import rig
+from flows.cli.app import AsJson, OutFolder, Switch, removed, split_list, stderr
+from flows.schedule.rig_lock import rig_to_oneself
 from flows.settings.declared import SURVEY, TABLES
 from flows.settings.documents import flag_help
 from flows.settings.load import load_settings
 from flows.terminal.shown_text import print_json
 from pipeline.rig.device_settings import SurveyRig
+from flows.settings.survey_settings import REPLACED
+from flows.terminal.progress import print_json
+from pipeline.rig.survey_rig import SurveyRig
 
+removed.update(REPLACED)
 IN_TABLES = {"exposure_ms": "camera.exposure_ms"}  # flags of what a settings file has in a table
 _DECLARED = SURVEY | {name: TABLES["camera"][name] for name in IN_TABLES}
 
@@ -31,8 +35,8 @@ def _flags(names: Iterable[str]) -> Any:
     return make_dataclass("Flags", given, frozen=True, kw_only=True)
 
 
-_Every: Any = _flags(name for name in _DECLARED if name not in TABLES)
 _RENDERING = ("effects", "seed", "day", "hour", "bands", "wavelengths")
+_Every: Any = _flags(name for name in _DECLARED if name not in TABLES)
 _OfRendering: Any = _flags(_RENDERING)
 _OfSimulation: Any = _flags((*_RENDERING, "tol", "size", "exposure_ms", "workers"))
 
@@ -62,7 +66,6 @@ NO_SIMULATION_FLAGS = SimulationFlags()
 NO_RENDERING_FLAGS = RenderingFlags()
 
 
-@app.command
 def survey(settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = False) -> int:
     """Survey a field: a coarse look at everything, then a fine look where it changes the map.
 
@@ -71,8 +74,7 @@ def survey(settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_js
     settings
         A survey's TOML file; flags win over it. Without one, flags and defaults alone.
     """
-    from flows.publish.survey_command import run_survey
-    from flows.schedule.rig_lock import rig_to_oneself
+    from flows.publish.survey_command import run_survey  # torch: what can be refused is refused before
 
     asked = load_settings(settings, by_setting(flags))
     with rig_to_oneself(asked, "a survey by hand"):
@@ -82,23 +84,6 @@ def survey(settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_js
     return 0
 
 
-@app.command
-def plan(settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = False) -> int:
-    """Tell what a survey would run: what is stored, what is to be made and why, and about how long it takes.
-
-    Nothing is captured, started or written. Give the settings that you would give to `survey`.
-
-    Parameters
-    ----------
-    settings
-        A survey's TOML file; flags win over it.
-    """
-    from flows.archive.plan_command import run_plan
-
-    return run_plan(load_settings(settings, by_setting(flags)), as_json=as_json)
-
-
-@app.command
 def simulate(
     scene: str,
     *,
@@ -129,7 +114,7 @@ def simulate(
         A PNG to write: lines with everything on and exact, the same as simulated, and where they differ, with the times
         of both. Takes all lines once more both ways, or as many as about a minute allows.
     """
-    from flows.simulate.command import run_simulate
+    from flows.simulate.command import run_simulate  # torch
 
     given = {"scene": scene, "out": out, **by_setting(flags)}
     record = run_simulate(load_settings(settings, given), stderr, coarse=coarse, picture=compare)
@@ -138,7 +123,35 @@ def simulate(
     return 0
 
 
-@rig.command
+def check(
+    settings: Path | None = None,
+    *,
+    port: str | None = None,
+    camera: str | None = None,
+    move: Switch = False,
+    as_json: AsJson = False,
+) -> int:
+    """Connect to mirror and camera, read what they are and how they are, and tell what to mend. Nothing moves.
+
+    The exit code is 0 where nothing failed, 3 where one of two devices works, else 1.
+
+    Parameters
+    ----------
+    settings
+        A survey's TOML file; its table [rig] says where both devices are. Flags win over it.
+    port
+        Port of the mirror controller, /dev/ttyACM0 or COM3. Without a file only what is named is checked.
+    camera
+        Address of the camera: 10.0.65.50, HOST:PORT or HOST:PORT:FILE_PORT.
+    move
+        Also send the mirror round a small square, within 0.05 of the middle of its range, and read back where it went.
+        It ends at 0; 0.
+    """
+    from flows.simulate.rig_check_command import check_request, run_check  # the rig's drivers, and scipy
+
+    return run_check(check_request(settings, port, camera, move=move), stderr, as_json=as_json)
+
+
 def emulate(
     *,
     scene: str | None = None,
@@ -148,7 +161,7 @@ def emulate(
     faults: str | None = None,
     baud: int = SurveyRig.baud,
     speed: float = 1.0,
-    out: Annotated[Path | None, Parameter(name=("--out", "-o"))] = None,
+    out: OutFolder = None,
     as_json: AsJson = False,
 ) -> int:
     """Emulate a rig that looks at a simulated scene, until Ctrl-C: a serial port and a camera's sockets.
@@ -173,12 +186,12 @@ def emulate(
     out
         A survey's TOML file to write, ready for `survey` and `rig check`.
     """
-    from flows.simulate.rig_check_command import LIST, show_faults
-    from flows.simulate.rig_emulation import EmulateRequest, emulated_settings, run_emulate
+    from flows.simulate import rig_check_command, rig_emulation  # torch and scipy
 
     words = split_list(faults)
-    if words == (LIST,):
-        return show_faults(as_json=as_json)
+    if words == (rig_check_command.LIST,):
+        return rig_check_command.show_faults(as_json=as_json)
     given = {"scene": scene, "size": size, **by_setting(flags)}
-    request = EmulateRequest(emulated_settings(settings, given), words, baud, speed, out)
-    return run_emulate(request, stderr, as_json=as_json)
+    asked = rig_emulation.emulated_settings(settings, given)
+    request = rig_emulation.EmulateRequest(asked, words, baud, speed, out)
+    return rig_emulation.run_emulate(request, stderr, as_json=as_json)

@@ -20,6 +20,8 @@ from flows.evaluate.table import print_evaluation
 from flows.evaluate.work import Made, Work, writing
 from flows.terminal.progress import StageProgress
 from flows.terminal.shown_text import on_stdout
+from flows.evaluate.work import Judged, Work
+from flows.terminal.progress import StageProgress, on_stdout
 from models.evaluation.bootstrap import LEVEL
 from models.evaluation.metrics import agreement, false_pixels, iou_per_class, mean_iou
 from models.network.process import keep_freed_memory

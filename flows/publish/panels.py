@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 from numpy.typing import NDArray
 
-from flows.publish.finding_words import area_words
+from flows.publish.receipt_table import area_words
 from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.ground_maps import GroundMap
 from storage.arrays.quicklooks import stretch
@@ -137,7 +137,12 @@ def draw_ground(found: GroundMap) -> bytes:
     left.set_ylabel("metres north", fontsize=9)
     present = set(np.unique(found.classes).tolist()) - {UNLABELLED}
     patches = [
-        Patch(facecolor=found.legend.colours[number] / 255, edgecolor="0.4", linewidth=0.5, label=_label(found, name))
+        Patch(
+            facecolor=found.legend.colours[number] / 255,
+            edgecolor="0.4",
+            linewidth=0.5,
+            label=f"{name.replace('_', ' ')}  {area_words(found.areas.get(name, {}).get('ha', 0.0))}",
+        )
         for number, name in enumerate(found.legend.names)
         if number in present
     ]
@@ -145,7 +150,3 @@ def draw_ground(found: GroundMap) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     return buffer.getvalue()
-
-
-def _label(found: GroundMap, name: str) -> str:
-    return f"{name.replace('_', ' ')}  {area_words(found.areas.get(name, {}).get('ha', 0.0))}"

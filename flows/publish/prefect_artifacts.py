@@ -7,13 +7,13 @@ import io
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any, cast
+from typing import Any
 
-from flows.publish.finding_words import sentences
-from flows.publish.pages import render_markdown
-from flows.publish.receipt import Receipt, Saving
-from flows.publish.receipt_table import COST_LABELS, headline
+from flows.publish.receipt import Receipt
+from flows.publish.receipt_table import COST_LABELS, cost_rows, headline, sentences
+from flows.publish.report import render_markdown
 from flows.publish.run_folder import Published
+from flows.survey.prefect_engine import inside_flow
 from flows.terminal.figures import format_percent
 
 MOST_BYTES = 100 * 1024  # of the picture, as it stands in the text
@@ -51,19 +51,15 @@ def survey_markdown(published: Published, where: str) -> str:
 
 def savings_rows(receipt: Receipt) -> list[dict[str, str]]:
     """The receipt's savings, a row each, in words."""
-    rows = []
-    for name, (label, show) in COST_LABELS.items():
-        entry = cast("Saving", receipt["savings"][name])  # type: ignore[literal-required]
-        words: Callable[[float | None], str] = show
-        rows.append(
-            {
-                "cost": label,
-                "this survey": words(entry["done"]),
-                "everything": words(entry["full"]),
-                "share": format_percent(entry["ratio"]),
-            }
-        )
-    return rows
+    return [
+        {
+            "cost": row["label"],
+            "this survey": row["done"],
+            "everything": row["full"],
+            "share": format_percent(row["ratio"]),
+        }
+        for row in cost_rows(receipt["savings"])[: len(COST_LABELS)]
+    ]
 
 
 def small_jpeg(png: bytes) -> bytes:
@@ -84,39 +80,27 @@ def small_jpeg(png: bytes) -> bytes:
 
 
 def progress_shown(field: str) -> Callable[[str, str, float], None]:
-    """What shows how far stages are on Prefect's pages: nothing outside of a flow, or where the server is gone."""
-    from flows.survey.prefect_engine import inside_flow
+    """What shows how far stages are on Prefect's pages, every two seconds at most: nothing outside of a flow.
 
+    A stage has an artifact where it takes longer than a moment. A server that is gone is no matter.
+    """
     if not inside_flow():
         return lambda stage, state, done: None
-    shown = TaskProgress(field, time.monotonic)
+    from prefect.artifacts import create_progress_artifact, update_progress_artifact
+
+    shown: dict[str, Any] = {}
+    last: dict[str, float] = {}
 
     def show(stage: str, state: str, done: float) -> None:
+        now = time.monotonic()
+        if now - last.setdefault(stage, now) < 2.0 and not (stage in shown and state != "running"):
+            return
+        last[stage] = now
         with suppress(Exception):
-            shown(stage, state, done)
+            if stage in shown:
+                update_progress_artifact(shown[stage], progress=round(100 * done, 1))
+            else:
+                key = f"{stage.replace('_', '-')}-{artifact_key(field)}"
+                shown[stage] = create_progress_artifact(100 * done, key=key, description=stage)
 
     return show
-
-
-class TaskProgress:
-    """How far the stages of a flow are, as Prefect artifacts: one for a stage that takes longer than a moment."""
-
-    def __init__(self, field: str, clock: Callable[[], float]) -> None:
-        self._field, self._clock = artifact_key(field), clock
-        self._shown: dict[str, Any] = {}
-        self._last: dict[str, float] = {}
-
-    def __call__(self, stage: str, state: str, done: float) -> None:
-        """Show it, at most every two seconds."""
-        from prefect.artifacts import create_progress_artifact, update_progress_artifact
-
-        now = self._clock()
-        since = now - self._last.setdefault(stage, now)
-        if since < 2.0 and not (stage in self._shown and state != "running"):
-            return
-        self._last[stage] = now
-        if stage in self._shown:
-            update_progress_artifact(self._shown[stage], progress=round(100 * done, 1))
-        else:
-            name = stage.replace("_", "-")
-            self._shown[stage] = create_progress_artifact(100 * done, key=f"{name}-{self._field}", description=stage)

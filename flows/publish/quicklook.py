@@ -15,7 +15,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
-from matplotlib.colors import Colormap
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.patches import Patch, Rectangle
@@ -100,17 +99,20 @@ _FLAT, _TALL = 0.3, 2.0  # height over width beyond which the panels are stacked
 
 
 def _compose(data: QuicklookData) -> Figure:
-    """Place title, panels and legend on a page that is as large as the panels need."""
     height, width = data.class_map.shape
     page_width, rows = _arrange(height / width)
-    caption = _caption_height(height / width)
+    caption = 1.25 if height / width > _TALL else 0.72  # inches: narrow panels need another line of words or two
     legend_columns = max(1, int(page_width / 2.9))
     legend_in = 0.45 + _LEGEND_ROW_IN * -(-(len(data.class_names) + 1) // legend_columns)
     page_height = _HEAD_IN + sum(tall + caption for tall, _ in rows) + legend_in
     figure = Figure(figsize=(page_width, page_height), dpi=_DPI)
+    about = [f"{width} × {height} px", f"budget {data.budget:g}", f"policy {data.policy}", f"seed {data.seed}"]  # noqa: RUF001
+    about += [data.note] if data.note else []
     title_y = 1 - 0.42 / page_height
     figure.text(_MARGIN_IN / page_width, title_y, data.survey, size=23, weight="bold", va="center")
-    figure.text(1 - _MARGIN_IN / page_width, title_y, _title_line(data), size=13, color=MUTED, va="center", ha="right")
+    figure.text(
+        1 - _MARGIN_IN / page_width, title_y, "   ·   ".join(about), size=13, color=MUTED, va="center", ha="right"
+    )
     panels = iter((_draw_raw, _draw_rectified, _draw_attention, _draw_classes, _draw_truth))
     top = page_height - _HEAD_IN
     for tall, places in rows:
@@ -121,11 +123,6 @@ def _compose(data: QuicklookData) -> Figure:
         top -= tall + caption
     _draw_legend(figure, data, legend_columns)
     return figure
-
-
-def _caption_height(tallness: float) -> float:
-    """Inches above a panel; narrow panels need another line of words or two."""
-    return 1.25 if tallness > _TALL else 0.72
 
 
 def _arrange(tallness: float) -> tuple[float, list[tuple[float, list[tuple[float, float]]]]]:
@@ -145,12 +142,6 @@ def _arrange(tallness: float) -> tuple[float, list[tuple[float, list[tuple[float
     return page, rows
 
 
-def _title_line(data: QuicklookData) -> str:
-    height, width = data.class_map.shape
-    parts = [f"{width} × {height} px", f"budget {data.budget:g}", f"policy {data.policy}", f"seed {data.seed}"]  # noqa: RUF001
-    return "   ·   ".join([*parts, data.note] if data.note else parts)
-
-
 def _draw_raw(axes: Axes, data: QuicklookData) -> None:
     """Panel 1, first half: the sweeps as they came, lying as they looked at the field, stretched to its shape."""
     image = _side_by_side([_colours(data, np.asarray(sweep)) for sweep in data.raw])
@@ -161,7 +152,6 @@ def _draw_raw(axes: Axes, data: QuicklookData) -> None:
 
 
 def _draw_rectified(axes: Axes, data: QuicklookData) -> None:
-    """Panel 1, second half: the same bands of the field put straight."""
     _, words = choose_bands(data.wavelength_nm)
     _show(axes, _colours(data, data.rectified))
     draw_scale(axes, data.class_map.shape, data.pixel_mrad)
@@ -197,7 +187,7 @@ def _draw_attention(axes: Axes, data: QuicklookData) -> None:
     scores, low, high = _score_range(data.score)
     heat = axes.imshow(
         scores,
-        cmap=_heat(),
+        cmap=mpl.colormaps["inferno"].with_extremes(bad=(0, 0, 0, 0)),
         alpha=0.72,
         vmin=low,
         vmax=high,
@@ -227,7 +217,6 @@ def _score_range(score: NDArray[np.floating]) -> tuple[NDArray[np.float64], floa
 
 
 def _draw_classes(axes: Axes, data: QuicklookData) -> None:
-    """Panel 3: the class map in the legend's colours."""
     _show(axes, class_rgb(data.class_map, _palette(data)), interpolation="nearest")
     draw_scale(axes, data.class_map.shape, data.pixel_mrad)
     _caption(axes, "3  Class map", "what the model says grows where")
@@ -252,11 +241,11 @@ def _draw_truth(axes: Axes, data: QuicklookData) -> None:
 
 
 def _draw_legend(figure: Figure, data: QuicklookData, columns: int) -> None:
-    """Class names with their colours and shares of the map, along the bottom."""
     palette = _palette(data)
     shares = np.bincount(data.class_map.ravel(), minlength=256)[: len(data.class_names)] / max(data.class_map.size, 1)
     marks = [Patch(facecolor=tuple(colour), edgecolor="#555555", linewidth=0.6) for colour in palette]
-    names = [f"{name.replace('_', ' ')}  {_share(share)}" for name, share in zip(data.class_names, shares, strict=True)]
+    words = ["< 0.1 %" if 0 < share < 0.001 else f"{100 * share:.1f} %" for share in shares]
+    names = [f"{name.replace('_', ' ')}  {share}" for name, share in zip(data.class_names, words, strict=True)]
     others = [data.class_map] if data.truth is None else [data.class_map, data.truth]
     if any((image == UNLABELLED).any() for image in others):
         marks.append(Patch(facecolor=UNLABELLED_COLOUR, edgecolor="#555555", linewidth=0.6))
@@ -274,10 +263,6 @@ def _draw_legend(figure: Figure, data: QuicklookData, columns: int) -> None:
         bbox_to_anchor=(0.5, 0.0),
         borderaxespad=0.6,
     )
-
-
-def _share(share: float) -> str:
-    return "< 0.1 %" if 0 < share < 0.001 else f"{100 * share:.1f} %"
 
 
 def _palette(data: QuicklookData) -> NDArray[np.float32]:
@@ -312,7 +297,3 @@ def _heat_key(axes: Axes, image: AxesImage, ends: tuple[str, str] = ("low", "hig
     for x, text, side in ((-0.05 / length, ends[0], "right"), (1 + 0.05 / length, ends[1], "left")):
         label = box.text(x, 0.45, text, transform=box.transAxes, ha=side, va="center", color="white", size=11)
         label.set_path_effects(HALO)
-
-
-def _heat() -> Colormap:
-    return mpl.colormaps["inferno"].with_extremes(bad=(0, 0, 0, 0))

@@ -227,7 +227,15 @@ def check_receipt(receipt: Mapping[str, Any]) -> Receipt:
         if stage["state"] not in get_args(State):
             place = f"receipt.stages[{number}].state"
             raise ShapeError(f"{place} must be one of {', '.join(get_args(State))}; got {stage['state']!r}")
-    _check_savings(receipt["savings"])
+    savings = receipt["savings"]
+    _need(savings, COSTS, "receipt.savings")
+    for name in COSTS:
+        place = f"receipt.savings.{name}"
+        _need(savings[name], _SAVING_FIELDS + (_SPLIT_FIELDS if name == "multiply_adds" else ()), place)
+        if savings[name]["full_is"] not in ("measured", "predicted"):
+            raise ShapeError(f"{place}.full_is must be measured or predicted, got {savings[name]['full_is']!r}")
+    if "segment_wall_s" in savings:
+        _need(savings["segment_wall_s"], ("done", "full"), "receipt.savings.segment_wall_s")
     if receipt.get("accuracy_is", "judged") not in get_args(AccuracyIs):
         known = ", ".join(get_args(AccuracyIs))
         raise ShapeError(f"receipt.accuracy_is must be one of {known}; got {receipt['accuracy_is']!r}")
@@ -247,15 +255,11 @@ def is_pending(receipt: Mapping[str, Any]) -> bool:
     return receipt.get("accuracy_is") == "pending"
 
 
-def _check_savings(savings: Mapping[str, Any]) -> None:
-    _need(savings, COSTS, "receipt.savings")
-    for name in COSTS:
-        place = f"receipt.savings.{name}"
-        _need(savings[name], _SAVING_FIELDS + (_SPLIT_FIELDS if name == "multiply_adds" else ()), place)
-        if savings[name]["full_is"] not in ("measured", "predicted"):
-            raise ShapeError(f"{place}.full_is must be measured or predicted, got {savings[name]['full_is']!r}")
-    if "segment_wall_s" in savings:
-        _need(savings["segment_wall_s"], ("done", "full"), "receipt.savings.segment_wall_s")
+def areas_on_ground(receipt: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """Hectares of each class, where the survey was put on the ground."""
+    ground = receipt.get("ground")
+    areas = ground.get("areas_ha") if isinstance(ground, Mapping) else None
+    return areas if isinstance(areas, Mapping) else None
 
 
 def _check_accuracy(accuracy: Mapping[str, Any]) -> None:

@@ -1,18 +1,20 @@
-"""A receipt in words: its headline, and the tables that a survey ends with on a terminal."""
+"""A receipt in words: headline and findings, and the tables that a survey or a simulation ends with on a terminal."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import Any, cast
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
+import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from flows.publish.receipt import Accuracy, Receipt, Saving, Savings, is_pending
+from flows.publish.receipt import Accuracy, Receipt, Savings, is_pending
 from flows.survey.scores import SHOWN, SHOWN_WORDS, definitions_differ, false_class_words, worst_class_words
-from flows.terminal.figures import format_bytes, format_count, format_percent, format_points, format_seconds
+from flows.terminal.figures import DASH, format_bytes, format_count, format_percent, format_points, format_seconds
+from pipeline.simulator.selection.manifest import UNIT_WORDS
 
 
 def headline(receipt: Receipt, looked_twice: float | None = None) -> str:
@@ -55,12 +57,35 @@ COST_LABELS = {
 }
 
 
+def cost_rows(savings: Savings) -> list[dict[str, Any]]:
+    """What was spent against everything, a row each: `Saving` with ``label``, and ``done`` and ``full`` in words."""
+    entries: Mapping[str, Any] = savings
+    rows = [
+        {**entries[name], "label": label, "done": show(entries[name]["done"]), "full": show(entries[name]["full"])}
+        for name, (label, show) in COST_LABELS.items()
+    ]
+    if "segment_wall_s" in savings:
+        done, full = savings["segment_wall_s"]["done"], savings["segment_wall_s"]["full"]
+        times = {"done": format_seconds(done), "full": format_seconds(full), "full_is": "measured"}
+        rows.append({**times, "label": "time of the model", "ratio": done / full if full else None})
+    return rows
+
+
 def print_table(receipt: Receipt, console: Console) -> None:
     """Print the receipt's three tables to the terminal: savings, accuracy (with labels), stages."""
-    console.print(_savings_table(receipt["savings"]))
+    table = _table("Savings", "cost", "this survey", "everything", "ratio", "everything is")
+    for row in cost_rows(receipt["savings"]):
+        table.add_row(row["label"], row["done"], row["full"], format_percent(row["ratio"]), row["full_is"])
+    console.print(table)
     if "accuracy" in receipt:
         console.print(_accuracy_table(receipt["accuracy"]))
-    console.print(_stages_table(receipt["stages"]))
+    table = _table("Stages", "stage", "state", "wall", "peak memory", "written")
+    colours = {"ran": "green", "cached": "cyan", "skipped": "dim", "failed": "bold red"}
+    for stage in receipt["stages"]:
+        state = f"[{colours[stage['state']]}]{stage['state']}[/]"
+        peak, wrote = format_bytes(stage["peak_rss_bytes"]), format_bytes(stage["bytes_out"])
+        table.add_row(escape(stage["name"]), state, format_seconds(stage["wall_s"]), peak, wrote)
+    console.print(table)
 
 
 def _table(title: str, *columns: str) -> Table:
@@ -71,20 +96,14 @@ def _table(title: str, *columns: str) -> Table:
     return table
 
 
-def _savings_table(savings: Savings) -> Table:
-    table = _table("Savings", "cost", "this survey", "everything", "ratio", "everything is")
-    for name, (label, show) in COST_LABELS.items():
-        entry = cast("Saving", savings[name])  # type: ignore[literal-required]
-        table.add_row(label, show(entry["done"]), show(entry["full"]), format_percent(entry["ratio"]), entry["full_is"])
-    if "segment_wall_s" in savings:
-        done, full = savings["segment_wall_s"]["done"], savings["segment_wall_s"]["full"]
-        ratio = format_percent(done / full) if full else "-"
-        table.add_row("time of the model", format_seconds(done), format_seconds(full), ratio, "measured")
-    return table
-
-
 def _accuracy_table(accuracy: Accuracy) -> Table:
-    rows = score_rows(accuracy)
+    seats = control_seats(accuracy)
+    rows: list[tuple[str, Mapping[str, Any]]] = [
+        ("none: the coarse look alone", accuracy["none"]),
+        ("this survey", accuracy),
+        *((f"{seats} placed by {escape(policy)}", control) for policy, control in accuracy["controls"].items()),
+        ("all: detail everywhere", accuracy["all"]),
+    ]
     before = definitions_differ([score for _, score in rows])
     table = _table("Accuracy against the truth", "seats", "mIoU", "spread", "overall", *([SHOWN] if before else []))
     for label, score in rows:
@@ -93,27 +112,11 @@ def _accuracy_table(accuracy: Accuracy) -> Table:
         cells += [format_points(score.get("miou_of_shown_classes"))] if before else []
         table.add_row(*([label, *cells] if score is not accuracy else (f"[bold]{cell}[/]" for cell in (label, *cells))))
     table.add_row("gap from none to all closed", format_percent(accuracy["gap_closed"]))
-    words = [score_words(accuracy, before=before), false_class_words(accuracy)]
+    count = sum(iou is not None for iou in accuracy["per_class_iou"].values())
+    words = [f"mIoU: mean over the {count} classes of the truth. Overall: share of pixels that are right."]
+    words = [f"{words[0]} {SHOWN_WORDS}" if before else words[0], false_class_words(accuracy)]
     table.caption, table.caption_justify = escape("\n".join(filter(None, words))), "left"
     return table
-
-
-def score_rows(accuracy: Accuracy) -> list[tuple[str, Mapping[str, Any]]]:
-    """The maps that a receipt has scores of, and what a terminal calls them."""
-    seats = control_seats(accuracy)
-    return [
-        ("none: the coarse look alone", accuracy["none"]),
-        ("this survey", accuracy),
-        *((f"{seats} placed by {escape(policy)}", control) for policy, control in accuracy["controls"].items()),
-        ("all: detail everywhere", accuracy["all"]),
-    ]
-
-
-def score_words(accuracy: Accuracy, *, before: bool) -> str:
-    """What the scores are means of, for whoever reads the table; ``before``: it has the definition of before too."""
-    count = sum(iou is not None for iou in accuracy["per_class_iou"].values())
-    words = f"mIoU: mean over the {count} classes of the truth. Overall: share of pixels that are right."
-    return f"{words} {SHOWN_WORDS}" if before else words
 
 
 def control_seats(accuracy: Mapping[str, Any]) -> str:
@@ -122,11 +125,158 @@ def control_seats(accuracy: Mapping[str, Any]) -> str:
     return "other seats," if share is None else f"{format_percent(share)} of the seats, free,"
 
 
-def _stages_table(stages: Iterable[Mapping[str, Any]]) -> Table:
-    table = _table("Stages", "stage", "state", "wall", "peak memory", "written")
-    colours = {"ran": "green", "cached": "cyan", "skipped": "dim", "failed": "bold red"}
-    for stage in stages:
-        state = f"[{colours[stage['state']]}]{stage['state']}[/]"
-        peak, wrote = format_bytes(stage["peak_rss_bytes"]), format_bytes(stage["bytes_out"])
-        table.add_row(escape(stage["name"]), state, format_seconds(stage["wall_s"]), peak, wrote)
-    return table
+LEAST_HECTARES = 0.1  # smaller areas are told in square metres
+
+
+def sentences(found: Mapping[str, Any]) -> list[str]:
+    """The findings in words, for the terminal and the report."""
+    words = []
+    if plan := found.get("plan"):
+        if plan["kind"] == "full" and plan["reason"]:
+            words.append(_sentence(plan["reason"]))
+        if plan["out_of_reach"]:
+            words.append(f"{plan['out_of_reach']} places worth a second look lie beyond the mirror's range.")
+        if plan.get("spared_s"):
+            share = f" ({format_percent(plan['spared_share'])} of the full scan's)" if plan["spared_share"] else ""
+            words.append(
+                f"The threshold of {plan['threshold']:g} a second left {plan['spared_s']:.1f} s{share} unspent: no "
+                f"further run of lines pays."
+            )
+        if plan["lines"]:
+            words.append(_sentence(plan["orientation"]["sentence"]))
+    for name, one in found.get("pointing", {}).items():
+        if isinstance(one, Mapping) and (told := _pointing_words(name, one)):
+            words.append(told)
+    for sweep, facts in found.get("lines", {}).items():
+        told = ", ".join(f"{count} {what}" for what, count in facts.items() if count)
+        words.append(f"Sweep {sweep}: lines {told}; what they would have shown is left out.")
+    if "ground" in found:
+        ground = found["ground"]
+        areas = [f"{name.replace('_', ' ')} {area_words(area)}" for name, area in ground["areas_ha"].items() if area]
+        place = f"{ground['crs']}, {ground['resolution_m']:g} m a pixel"
+        words.append(f"On the ground ({place}) the classes cover {', '.join(areas)}.")
+    return words
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:] + ("" if text.endswith(".") else ".")
+
+
+def _pointing_words(name: str, one: Mapping[str, Any]) -> str:
+    put = [float(np.hypot(*offset)) for sweep, offset in one["sweeps"].items() if sweep not in one["not_found"]]
+    left, text = one["residual_rms_px"], ""
+    if len(one["sweeps"]) == 1 and one["held"] in one["sweeps"]:
+        text = f"The {name} pass is one sweep, which has no seam to be put right by."
+    elif put:
+        rest = "" if left is None else f"; {left:.2f} px rms are left at the seams"
+        text = f"The {name} sweeps were put right by up to {max(put):.1f} px{rest}."
+    if one["not_found"]:
+        text += f" Nothing could be told of {', '.join(one['not_found'])}: left where the mirror reported."
+    if one["too_narrow"]:
+        text += f" {len(one['too_narrow'])} overlaps were too narrow to compare."
+    if one.get("partly_seen"):
+        text += (
+            f" {one['partly_seen']} chosen places were not seen whole; what is missing of them is mapped by the coarse "
+            f"look."
+        )
+    return text.strip()
+
+
+def area_words(hectares: float) -> str:
+    """An area in hectares, small ones in square metres."""
+    return f"{hectares:.3g} ha" if hectares >= LEAST_HECTARES else f"{hectares * 1e4:.3g} m²"
+
+
+WIDE = 100  # characters, from which words fit into the table
+COLOURS = {"on": "green", "off": "dim"}
+_KEY = (
+    "left out: what any stored number would change by at most without the effect [{unit}]; error: by what is done"
+    " instead of the exact; measured: the same on the worst lines of the scene."
+)
+Row = Mapping[str, Any]
+
+
+def print_effects(effects: Iterable[Row], total: Row, console: Console) -> None:
+    """Print a row for every effect that the rig has, what it has none of, and below what all come to.
+
+    On a narrow terminal the words stand below the table.
+    """
+    rows = list(effects)
+    there = [row for row in rows if row["reason"] != "absent"]
+    wide = console.width >= WIDE
+    table = Table(header_style="dim", box=SIMPLE_HEAD, collapse_padding=True, pad_edge=wide)
+    for name in ("effect", "computed", "left out", "error", "measured", "CPU", *(["why"] if wide else [])):
+        figure = name in ("left out", "error", "measured", "CPU")
+        table.add_column(name, justify="right" if figure else "left", no_wrap=name != "why", overflow="fold")
+    for row in there:
+        table.add_row(*_figures(row, total), *([escape(_words(row))] if wide else []))
+    console.print(table)
+    console.print(escape(_KEY.format(unit=UNIT_WORDS[total["unit"]])), style="dim", highlight=False)
+    if not wide:
+        for row in there:
+            console.print(f"[bold]{escape(row['name'])}[/]: {escape(_words(row))}", highlight=False)
+    absent = [f"{row['name']} ({row['magnitude']})" for row in rows if row["reason"] == "absent"]
+    if absent:
+        console.print(f"[bold]Not there[/]: {escape(', '.join(absent))}.", highlight=False)
+    for sentence in total_words(total):
+        console.print(escape(sentence), highlight=False)
+
+
+def _figures(row: Row, total: Row) -> list[str]:
+    """Name, variant or off, what leaving it out would change, what is changed, measured, seconds."""
+    most, bound = total["tolerance"], row["bound"]
+    beyond = row["state"] == "off" and most is not None and (bound is None or bound > most)
+    colour = "yellow" if beyond else COLOURS[row["state"]]
+    return [
+        escape(row["name"]),
+        f"[{colour}]{escape(row['variant'] or 'off')}[/]",
+        format_change(row["left_out"], endless=True),
+        format_change(row["bound"], endless=True),
+        "" if row["measured"] is None else format_change(row["measured"]),
+        "" if not row["cost_s"] else "< 0.01 s" if row["cost_s"] < 0.01 else format_seconds(row["cost_s"]),
+    ]
+
+
+def _words(row: Row) -> str:
+    """How large an effect is, and why it is nevertheless there or left out where its figures do not tell."""
+    said = {
+        "exact": "",
+        "needed": "",
+        "small": "",
+        "unseen": "the scene shows nothing of it: ",
+        "spent": "the tolerance is spent where it saves more: ",
+        "asked": "asked for: ",
+        "unasked": "not asked for: ",
+        "always": "always there: ",
+    }[row["reason"]]
+    magnitude: str = row["magnitude"]
+    return said + magnitude.removeprefix(f"{row['name']}: ")
+
+
+def format_change(value: float | None, *, endless: bool = False) -> str:
+    """A change in units of the tolerance; what is not there is a dash, or where ``endless`` has no bound at all."""
+    if value is None:
+        return "none" if endless else DASH
+    return f"{value:.2g}"
+
+
+def total_words(total: Mapping[str, Any]) -> Sequence[str]:
+    """What was asked for and what is left out, against the tolerance, and the seconds that this saves."""
+    unit, count = UNIT_WORDS[total["unit"]], total["on"] + total["off"]
+    tolerance = "any number of" if total["tolerance"] is None else f"{total['tolerance']:g}"
+    words = [f"{total['on']} of {count} effects are computed (asked: {total['asked']}, tolerance {tolerance} {unit})."]
+    if total["bound"] is None:
+        words.append("What is left out has no bound.")
+    else:
+        measured = "" if total["measured"] is None else f", measured on the worst lines {total['measured']:.2g}"
+        if total["measured"] is not None and total["measured"] > total["bound"]:
+            measured += ", more by what arithmetic makes of light with such contrasts"
+        words.append(
+            f"What is left out or cheapened changes a stored number by at most {total['bound']:.2g} {unit}{measured}."
+        )
+    exact, cheap = (format_seconds(max(total[name], 0.0)) for name in ("saved_s", "saved_cheap_s"))
+    words.append(
+        f"That saves about {exact} of CPU for the coarse pass and a scan of everything against all effects in full, "
+        f"{cheap} against all as cheap as a tenth of the tolerance lets them be."
+    )
+    return words

@@ -1,23 +1,66 @@
-"""The report: one HTML page from a receipt and its pictures, for a farmer first and for whoever reruns it below.
+"""Pages for people from the templates beside this file: each one file that opens from disk and loads nothing.
 
-Nothing is loaded from anywhere: styles are inline, pictures are data in the page. It opens from disk and prints.
+Whatever a page shows is escaped here and nowhere else: no markup, and nothing that turns the words beside it round.
 """
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable, Iterator, Mapping
+import json
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from functools import cache, partial
 from typing import Any
 
-from flows.publish.effect_table import total_words
-from flows.publish.finding_words import sentences
-from flows.publish.pages import render_page
-from flows.publish.receipt import Accuracy, Receipt, Savings
-from flows.publish.receipt_table import COST_LABELS, control_seats, headline
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from flows.publish.receipt import Accuracy, Receipt
+from flows.publish.receipt_table import control_seats, cost_rows, format_change, headline, sentences, total_words
 from flows.survey.scores import SHOWN, SHOWN_WORDS, definitions_differ, false_class_words
-from flows.terminal.figures import format_seconds
+from flows.terminal.figures import format_bytes, format_percent, format_points, format_seconds
+from pipeline.visible_text import visible
+
+_MARKDOWN = "\\`*_{}[]<>#|"
+
+
+def render_page(template: str, **facts: Any) -> str:
+    """Fill in an HTML template; every word of ``facts`` that is no `Markup` is escaped."""
+    return visible(_environment(markdown=False).get_template(template).render(facts))
+
+
+def render_markdown(template: str, **facts: Any) -> str:
+    """Fill in a Markdown template; in words that are no `Markup` nothing has a meaning of its own."""
+    return visible(_environment(markdown=True).get_template(template).render(facts))
+
+
+@cache
+def _environment(*, markdown: bool) -> Environment:
+    found = Environment(
+        loader=PackageLoader("flows.publish", "templates"),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        autoescape=not markdown,
+        finalize=_plain if markdown else None,
+    )
+    found.filters |= {
+        "bytes": format_bytes,
+        "change": format_change,
+        "percent": format_percent,
+        "points": format_points,
+        "seconds": format_seconds,
+        "json": partial(json.dumps, ensure_ascii=False),
+    }
+    return found
+
+
+def _plain(value: object) -> object:
+    """Words as Markdown shows them letter by letter."""
+    if isinstance(value, Markup):
+        return value
+    return "".join(f"\\{letter}" if letter in _MARKDOWN else letter for letter in visible(str(value)))
 
 
 @dataclass(frozen=True)
@@ -28,35 +71,13 @@ class Picture:
     caption: str
 
 
-def write_report(
-    path: str | Path,
-    receipt: Receipt,
-    quicklook_png: bytes,
-    pictures: Iterable[Picture] = (),
-    *,
-    looked_twice: float | None = None,
-) -> None:
-    """Write the page.
-
-    Parameters
-    ----------
-    pictures
-        More pictures, shown below the quicklook.
-    looked_twice
-        Share of the field captured in detail, 0..1, for the first sentence; None leaves it out.
-
-    Raises
-    ------
-    OSError : the file cannot be written.
-    """
-    page = render_report(receipt, quicklook_png, pictures, looked_twice=looked_twice)
-    Path(path).write_text(page, encoding="utf-8")
-
-
 def render_report(
     receipt: Receipt, quicklook_png: bytes, pictures: Iterable[Picture] = (), *, looked_twice: float | None = None
 ) -> str:
-    """The page as text; the same receipt and pictures give the same bytes."""
+    """The page as text, ``pictures`` below the quicklook; the same receipt and pictures give the same bytes.
+
+    ``looked_twice`` is the share of the field captured in detail, 0..1, for the first sentence; None leaves it out.
+    """
     shown = [Picture(quicklook_png, "The survey at a glance."), *pictures]
     split: Mapping[str, Any] = receipt["savings"]["multiply_adds"]
     parts = [name for name in ("glance", "score", "encode", "decode") if split["done"] and split[name] is not None]
@@ -69,7 +90,7 @@ def render_report(
         about=f"{receipt['scene']} seen by {receipt['source']}, seed {receipt['seed']}, finished {receipt['finished']}",
         receipt=receipt,
         pictures=[{"data": base64.b64encode(one.png).decode("ascii"), "caption": one.caption} for one in shown],
-        costs=list(_costs(receipt["savings"])),
+        costs=cost_rows(receipt["savings"]),
         shares={name: split[name] / split["done"] for name in parts},
         findings=sentences(receipt),
         **_scores(receipt.get("accuracy")),
@@ -80,18 +101,6 @@ def render_report(
             "Files of this survey": receipt["products"],
         },
     )
-
-
-def _costs(savings: Savings) -> Iterator[dict[str, Any]]:
-    """What was spent against everything, a row each."""
-    entries: Mapping[str, Any] = savings
-    for name, (label, show) in COST_LABELS.items():
-        entry = entries[name]
-        yield {**entry, "label": label, "done": show(entry["done"]), "full": show(entry["full"])}
-    if "segment_wall_s" in savings:
-        done, full = savings["segment_wall_s"]["done"], savings["segment_wall_s"]["full"]
-        times = {"done": format_seconds(done), "full": format_seconds(full), "full_is": "measured"}
-        yield {**times, "label": "time of the model", "ratio": done / full if full else None}
 
 
 def _scores(accuracy: Accuracy | None) -> dict[str, Any]:
@@ -109,7 +118,6 @@ def _scores(accuracy: Accuracy | None) -> dict[str, Any]:
 
 
 def _flat(settings: Mapping[str, Any]) -> dict[str, object]:
-    """Tables within the settings as dotted names."""
     flat: dict[str, object] = {}
     for name, value in settings.items():
         table = isinstance(value, Mapping)

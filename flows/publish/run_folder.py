@@ -15,22 +15,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.publish.findings import find_out
 from flows.publish.panels import draw_ground
 from flows.publish.quicklook import QuicklookData, draw_quicklook
 from flows.publish.receipt import AccuracyIs, Header, Receipt, build_receipt, check_receipt, with_accuracy
-from flows.publish.report import Picture, write_report
+from flows.publish.report import Picture, render_report
 from flows.settings.load import anchor_paths
 from flows.survey.extent import work_done, work_of_map
 from flows.survey.run import SurveyRun, now
 from flows.survey.stages.accuracy import load_accuracy
 from flows.survey.stages.attention import load_plan
 from flows.survey.stages.capture import captured
+from flows.survey.stages.class_map import strange_pixels
 from flows.survey.stages.effects import load_manifest
 from flows.survey.stages.ground import STORE
-from flows.survey.stages.placement import SEATS_AT_ONCE, seen_shares
+from flows.survey.stages.orientation import load_orientation
+from flows.survey.stages.placement import SEATS_AT_ONCE, line_facts, seen_shares
+from flows.survey.stages.registration import load_registration
 from flows.survey.survey import Products, StageRunner
 from pipeline.errors import IncompleteStoreError
+from pipeline.geometry.grid import UNLABELLED
 from pipeline.geometry.scan import Sweep
 from pipeline.planning.coverage import on_scene
 from pipeline.planning.fine_pass import FinePlan
@@ -41,6 +44,8 @@ from storage.archive.records import StageRecord, read_run
 from storage.archive.run_folders import RunDraft
 from storage.archive.whole_files import to_json
 from storage.arrays.class_maps import ClassMap, load_class_map
+from storage.arrays.attention import load_attention
+from storage.arrays.class_maps import load_class_map
 from storage.arrays.cubes import RawCube
 from storage.arrays.ground_maps import load_ground_map, open_image
 from storage.arrays.mosaics import load_attention, open_patches
@@ -117,23 +122,17 @@ def load_receipt(folder: Path) -> Receipt:
 
 
 def _publish(run: SurveyRun, draft: RunDraft, products: Products, plan: FinePlan, receipt: Receipt) -> Published:
-    """Draw and write what a run's folder holds, and publish it."""
     looked_twice = float(seen_shares(run, products.of("cut_patches")).sum()) / len(run.grid.valid_seats())
     draw_quicklook(draft.folder / "quicklook.png", quicklook_data(run, products, plan, receipt))
     draft.write_file("receipt.json", to_json(receipt))
     picture = (draft.folder / "quicklook.png").read_bytes()
-    write_report(draft.folder / "report.html", receipt, picture, _pictures(products), looked_twice=looked_twice)
-    named = products.there(products)
-    folder = draft.publish(
-        survey=receipt["survey"], settings=receipt["settings"], rests_on=run.archive.manifest_hashes(named)
-    )
-    return Published(receipt, folder, looked_twice)
-
-
-def _pictures(products: Products) -> list[Picture]:
-    """Pictures that not every survey has."""
     maps = (load_ground_map(ref.path / STORE) for ref in products.there(["ground"]))
-    return [Picture(draw_ground(drawn), "The map on the ground, north up.") for drawn in maps]
+    pictures = [Picture(draw_ground(drawn), "The map on the ground, north up.") for drawn in maps]
+    page = render_report(receipt, picture, pictures, looked_twice=looked_twice)
+    (draft.folder / "report.html").write_text(page, encoding="utf-8")
+    rests_on = run.archive.manifest_hashes(products.there(products))
+    folder = draft.publish(survey=receipt["survey"], settings=receipt["settings"], rests_on=rests_on)
+    return Published(receipt, folder, looked_twice)
 
 
 def make_receipt(runner: StageRunner, products: Products, plan: FinePlan, started: str, folder: str) -> Receipt:
@@ -144,26 +143,28 @@ def make_receipt(runner: StageRunner, products: Products, plan: FinePlan, starte
     simulation = None if not run.source.simulates else load_manifest(products.of("choose_effects"))
     if accuracy is not None and "segment_wall_s" in accuracy:
         savings["segment_wall_s"] = accuracy.pop("segment_wall_s")
+    there = {name: products.get(stage) for name, (stage, _) in IN_STORES.items()}
+    stores = {name: _address(name, ref) for name, ref in there.items() if ref is not None}
+    unjudged: AccuracyIs = "pending" if run.settings.accuracy else "left out"
+    accuracy_is = "judged" if accuracy is not None else unjudged if run.scene.labelled else "without labels"
+    versions = {"python": platform.python_version()}
+    for name in LIBRARIES:
+        with suppress(PackageNotFoundError):  # run from a source tree that is not installed
+            versions[name] = version(name)
     header = Header(
-        run.name, run.source.name, run.scene.key, run.settings.seed, started, now(), _versions(), asked_settings(run)
+        run.name, run.source.name, run.scene.key, run.settings.seed, started, now(), versions, asked_settings(run)
     )
     return build_receipt(
         header,
         runner.records.values(),
         savings,
-        _addresses(products, folder),
+        {**stores, **{name: f"{folder}/{name}" for name in ("receipt.json", "quicklook.png", "report.html")}},
         accuracy=accuracy,
-        accuracy_is=_accuracy_is(run, products),
+        accuracy_is=accuracy_is,
         judged=None if accuracy is None else now(),
         simulation=simulation,
         findings=find_out(run, products),
     )
-
-
-def _accuracy_is(run: SurveyRun, products: Products) -> AccuracyIs:
-    if products.get("evaluate") is not None:
-        return "judged"
-    return "without labels" if not run.scene.labelled else "pending" if run.settings.accuracy else "left out"
 
 
 def asked_settings(run: SurveyRun) -> dict[str, object]:
@@ -171,23 +172,8 @@ def asked_settings(run: SurveyRun) -> dict[str, object]:
     return {**anchor_paths(run.settings.to_dict(), Path.cwd()), "notes": list(run.notes)}
 
 
-def _versions() -> dict[str, str]:
-    found = {"python": platform.python_version()}
-    for name in LIBRARIES:
-        with suppress(PackageNotFoundError):  # run from a source tree that is not installed
-            found[name] = version(name)
-    return found
-
-
 def _address(name: str, ref: StageRef) -> str:
-    """Where a receipt says that a product lies."""
     return f"{ref.uri}{IN_STORES[name][1]}"
-
-
-def _addresses(products: Products, folder: str) -> dict[str, str]:
-    there = {name: products.get(stage) for name, (stage, _) in IN_STORES.items()}
-    named = {name: _address(name, ref) for name, ref in there.items() if ref is not None}
-    return named | {name: f"{folder}/{name}" for name in ("receipt.json", "quicklook.png", "report.html")}
 
 
 def _savings(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, Any]:
@@ -200,6 +186,7 @@ def _savings(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, An
     like, kept = (plan.sweeps, stored[1]) if plan.sweeps else (run.plan.coarse, stored[0])
     of_these = capture_savings(like, run.plan.full, run.camera, run.grid, cost=run.settings.cost, bands=bands)
     full_stored = entries["bytes_raw"].full * kept / of_these["bytes_raw"].done
+    did, scan = work_done(run, plan.seats), work_of_map(run, run.grid.valid_seats())
     config, valid = run.weights.config, len(run.grid.valid_seats())
     cells, each = int(np.prod(run.grid.padded_shape)) // (config.patch * config.factor) ** 2, config.token_side**2
     return {
@@ -207,14 +194,8 @@ def _savings(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, An
         "capture_s": SavingEntry(run.plan.coarse_s + plan.seconds, run.plan.full_s, "predicted").as_dict(),
         "bytes_stored": SavingEntry(sum(stored), round(full_stored), "predicted").as_dict(),
         "tokens": SavingEntry(each * (cells + len(plan.seats)), each * (cells + valid), "predicted").as_dict(),
-        "multiply_adds": _multiply_adds(run, plan),
+        "multiply_adds": {**SavingEntry(did.total, scan.total, "predicted").as_dict(), **asdict(did)},
     }
-
-
-def _multiply_adds(run: SurveyRun, plan: FinePlan) -> dict[str, Any]:
-    """What the model did, beside the map of a full scan."""
-    done, full = work_done(run, plan.seats), work_of_map(run, run.grid.valid_seats())
-    return {**SavingEntry(done.total, full.total, "predicted").as_dict(), **asdict(done)}
 
 
 def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: Receipt) -> QuicklookData:
@@ -222,16 +203,20 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
     bands, _ = choose_bands(run.scene.wavelength_nm)
     chosen = list(bands)
     attention = load_attention(products.of("attend").path / "attention.zarr")
-    found: ClassMap = load_class_map(products.of("draw_map").path / "class_map.zarr")
+    found = load_class_map(products.of("draw_map").path / "class_map.zarr")
     order = np.argsort(attention.rank.ravel(), kind="stable")
     accuracy = receipt.get("accuracy")
-    miou = None if accuracy is None else accuracy["miou"]
+    moment = run.settings.moment  # of a farm that grows
+    notes = [] if moment is None else [f"day {moment[0]}, {moment[1]:g} h"]
+    if accuracy is not None and accuracy["miou"] is not None:
+        notes.append(f"mIoU {100 * accuracy['miou']:.1f} %")
+    strips = sorted(captured(products.of("capture_coarse")), key=lambda cube: cube.sweep.strip_px)  # as they lie there
     return QuicklookData(
         survey=run.name,
         seed=run.settings.seed,
         budget=run.settings.budget,
         policy=run.settings.policy,
-        raw=tuple(_calibrated(run, cube, chosen) for cube in _by_strip(captured(products.of("capture_coarse")))),
+        raw=tuple(_calibrated(run, cube, chosen) for cube in strips),
         rectified=_both_scales(run, products, chosen),
         wavelength_nm=run.scene.wavelength_nm[chosen],
         score=attention.score,
@@ -245,20 +230,8 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
         confidence=found.confidence,
         pixel_mrad=run.camera.ifov_rad * 1e3,
         along=run.plan.along,
-        note="   ·   ".join(_title_notes(run, miou)),
+        note="   ·   ".join(notes),
     )
-
-
-def _title_notes(run: SurveyRun, miou: float | None) -> list[str]:
-    """What ends the title line: when a farm that grows was looked at, and how good the map is."""
-    moment = run.settings.moment
-    when = [] if moment is None else [f"day {moment[0]}, {moment[1]:g} h"]
-    return when if miou is None else [*when, f"mIoU {100 * miou:.1f} %"]
-
-
-def _by_strip(cubes: list[RawCube]) -> list[RawCube]:
-    """Sweeps in the order in which they lie side by side on the field: of their names, coarse-10 precedes coarse-2."""
-    return sorted(cubes, key=lambda cube: cube.sweep.strip_px)
 
 
 def _calibrated(run: SurveyRun, cube: RawCube, bands: list[int]) -> NDArray[np.float32]:
@@ -298,3 +271,76 @@ def block_of(sweep: Sweep, run: SurveyRun) -> tuple[int, int, int, int]:
     x0, x1 = np.clip(np.rint(across), 0, size[0]).astype(int).tolist()
     y0, y1 = np.clip(np.rint(scan), 0, size[1]).astype(int).tolist()
     return (y0, y1, x0, x1) if sweep.along == "x" else (x0, x1, y0, y1)
+
+
+def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
+    """Gather ``plan`` and the parts of the receipt that not every survey has.
+
+    These are ``pointing``, ``ground``, ``pixels`` and ``lines``.
+    """
+    plan = load_plan(products.of("attend"))
+    told: dict[str, Any] = {
+        "kind": plan.kind,
+        "reason": plan.reason,
+        "lines": plan.lines,
+        "seconds": plan.seconds,
+        "score_share": plan.worth / plan.wanted_worth if plan.wanted_worth else None,
+        "score_per_second": plan.worth_per_second,
+        "full_seconds": plan.full_seconds,
+        "out_of_reach": plan.out_of_reach,
+        "orientation": load_orientation(products.of("compare_turned")),
+    }
+    if plan.threshold is not None:  # what it left, and the score that was not worth more seconds
+        told |= {
+            "threshold": plan.threshold,
+            "spared_s": plan.spared_s,
+            "spared_share": None if plan.spared_s is None else plan.spared_s / run.plan.full_s,
+            "spared_score": plan.wanted_worth - plan.worth,
+        }
+    found: dict[str, Any] = {"plan": told}
+    passes = {"coarse": products.get("register_coarse"), "fine": products.get("register_fine")}
+    pointing = {name: _pointing(ref) for name, ref in passes.items() if ref is not None}
+    if "fine" in pointing:
+        pointing["fine"]["partly_seen"] = int(np.count_nonzero(seen_shares(run, products.of("cut_patches")) < 1))
+    if pointing:
+        found["pointing"] = {"prior_px": run.settings.pointing_px, **pointing}
+    for ground_map in products.there(["ground"]):
+        drawn = load_ground_map(ground_map.path / STORE)
+        found["ground"] = {
+            "crs": str(drawn.geobox.crs),
+            "resolution_m": abs(float(drawn.geobox.resolution.x)),
+            "shape": [int(size) for size in drawn.geobox.shape],
+            "areas_ha": {name: area["ha"] for name, area in drawn.areas.items()},
+        }
+    class_map = products.of("draw_map")
+    classes = load_class_map(class_map.path / "class_map.zarr").classes
+    pixels = {
+        "scene_without_a_value": run.scene.filled_px,
+        "coarse_px_no_reading": 0,
+        "fine_px_no_reading": 0,
+        **{f"{name}_no_reading": count for name, count in strange_pixels(class_map).items()},
+        "map_without_a_class": int(np.count_nonzero(classes == UNLABELLED)),
+    }
+    if any(pixels.values()):
+        found["pixels"] = pixels
+    troubled = {name: facts for name, facts in line_facts(products.of("rectify")).items() if any(facts.values())}
+    if troubled:
+        found["lines"] = troubled
+    return found
+
+
+def _pointing(ref: StageRef) -> dict[str, Any]:
+    """Corrections of one pass, and what its windows say of them.
+
+    Each sweep beside the held one has an offset and a drift: where windows are no more than these, they leave nothing.
+    """
+    record = load_registration(ref)
+    left = np.array([window["residual_px"] for window in record["windows"] if window.get("residual_px")])
+    tells = len(left) > 2 * (len(record["sweeps"]) - len(record["untied"]) - 1)
+    return {
+        "held": record["reference"],
+        "sweeps": {name: one["offset_px"] for name, one in record["sweeps"].items()},
+        "residual_rms_px": float(np.sqrt(np.mean(left**2))) if left.size and tells else None,
+        "not_found": record["untied"],
+        "too_narrow": record["narrow"],
+    }

@@ -1,26 +1,33 @@
-"""What `spectralzoom survey` shows: progress, the receipt as a table, and where everything lies."""
+"""What `spectralzoom survey` does and shows: progress, the run published and then judged, the receipt as a table.
+
+A map is judged once its run is published, so that nothing that is lost then is the map; the accuracy is then added to
+the run. A survey that was stopped meanwhile goes on with the run that it had published.
+"""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 
 from rich.console import Console
 from rich.markup import escape
 
-from flows.publish.finding_words import sentences
-from flows.publish.judging import publish_and_judge
 from flows.publish.prefect_artifacts import progress_shown
-from flows.publish.receipt_table import headline, print_table
-from flows.publish.run_folder import Published
-from flows.settings.survey_settings import Settings
+from flows.publish.receipt import is_pending
+from flows.publish.receipt_table import headline, print_table, sentences
+from flows.publish.run_folder import Published, add_accuracy, asked_settings, publish_run
+from flows.settings.survey_settings import OF_THE_MACHINE, Settings
+from flows.survey.prefect_engine import EngineUnavailable, survey_with_prefect
 from flows.survey.run import SurveyRun, now, open_run
-from flows.survey.survey import TITLES, Products, StageRunner, Step, survey
+from flows.survey.survey import STAGES, TITLES, Products, StageRunner, Step, judge, survey
 from flows.terminal.progress import StageProgress
 from models.network.process import keep_freed_memory, use_one_thread
 from storage.archive.archive import Archive
-
-Finish = Callable[[Step, Products], Published]  # what comes after the map, with what runs a stage
+from storage.archive.keys import canonical_json
+from storage.archive.records import Run, read_run
+from storage.archive.run_folders import RunDraft
+from storage.archive.whole_files import to_json
 
 
 def run_survey(settings: Settings, console: Console) -> Published:
@@ -58,30 +65,93 @@ def _survey_and_publish(run: SurveyRun, settings: Settings, console: Console, st
     with StageProgress(console, TITLES) as progress:
 
         def watch(stage: str, state: str, done: float) -> None:
-            running = state == "running"
-            progress.show(stage, done, "" if running else state, ended=not running)
+            progress.watch(stage, state, done)
             shown(stage, state, done)
 
         runner = StageRunner(replace(run, source=run.source.saying(progress.say)), watch)
 
+        def tell(words: str) -> None:
+            console.print(escape(words), highlight=False, soft_wrap=True)
+
         def finish(step: Step, products: Products) -> Published:
-            return publish_and_judge(
-                runner,
-                step,
-                products,
-                started,
-                lambda words: console.print(escape(words), highlight=False, soft_wrap=True),
-            )
+            return publish_and_judge(runner, step, products, started, tell)
 
-        return _run(runner, settings.engine, console, finish)
+        if settings.engine != "plain":
+            try:
+                return survey_with_prefect(runner, finish)
+            except EngineUnavailable as error:
+                console.print(f"[yellow]{escape(str(error))}; going on with --engine plain[/]", highlight=False)
+        return finish(runner, survey(runner))
 
 
-def _run(runner: StageRunner, engine: str, console: Console, finish: Finish) -> Published:
-    if engine != "plain":
-        from flows.survey.prefect_engine import EngineUnavailable, survey_with_prefect
+JUDGE = STAGES["evaluate"]
+NOT_ASKED = ("notes", "out", "engine", *OF_THE_MACHINE)  # of a receipt's settings: no byte depends on them
 
-        try:
-            return survey_with_prefect(runner, finish)
-        except EngineUnavailable as error:
-            console.print(f"[yellow]{escape(str(error))}; going on with --engine plain[/]", highlight=False)
-    return finish(runner, survey(runner))
+
+def publish_and_judge(
+    runner: StageRunner, step: Step, products: Products, started: str, tell: Callable[[str], None]
+) -> Published:
+    """Publish the run of a map, then judge the map and add its accuracy to the run.
+
+    Where there is nothing to judge by, or the archive holds the accuracy, the run is published once, with all of it.
+
+    Parameters
+    ----------
+    step
+        What runs the stage that judges.
+    started
+        When the survey began, ISO 8601.
+    tell
+        Is given a line once the run is there and the map is about to be judged.
+    """
+    run = runner.run
+    draft = _draft_of_stopped(runner)
+    if draft is None and not _takes_time(run, products):
+        return publish_run(runner, judge(step, products), started)
+    if draft is not None:
+        tell(f"published before: {draft.published}; its accuracy is added to it")
+    else:
+        published = publish_run(runner, products, started)
+        tell(f"published: {published.folder}; its accuracy is judged now and added to it")
+        draft = run.archive.extend_run(published.folder.name)
+        assert draft is not None
+    with draft:
+        judged = judge(step, products)
+        return add_accuracy(run, draft, judged, runner.records[JUDGE.name])
+
+
+def _takes_time(run: SurveyRun, products: Products) -> bool:
+    """Whether there is a map to judge, and no stored accuracy of it."""
+    if not run.scene.labelled or not run.settings.accuracy:
+        return False
+    try:
+        wanted = JUDGE(run, *products.there(JUDGE.of))
+        return wanted is not None and JUDGE.find(run.archive, wanted) is None
+    except Exception:  # what is wrong is said when the map is judged: until then it is published
+        return True
+
+
+def _draft_of_stopped(runner: StageRunner) -> RunDraft | None:
+    """The run that the same survey published before it was stopped; None where there is none, or it is being judged."""
+    archive = runner.run.archive
+    for folder in reversed(archive.runs()):
+        if _is_stopped(runner, read_run(folder, {})):
+            draft = archive.extend_run(folder.name, wait=False)
+            if draft is None:
+                continue
+            if _is_stopped(runner, read_run(folder, {})):  # and not judged since
+                return draft
+            draft.abandon()
+    return None
+
+
+def _is_stopped(runner: StageRunner, run: Run) -> bool:
+    if run.problem is not None or not is_pending(run.receipt):
+        return False
+    stores = {name: one.key for name, one in runner.records.items()}
+    found = {str(row.get("name")): row.get("key") for row in run.stages}
+    asked = (
+        canonical_json(json.loads(to_json({name: value for name, value in given.items() if name not in NOT_ASKED})))
+        for given in (run.settings, asked_settings(runner.run))
+    )
+    return found == stores and len(set(asked)) == 1

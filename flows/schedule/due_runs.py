@@ -6,9 +6,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
-from flows.schedule.field_schedule import FieldSchedule
-from flows.schedule.ledger_state import Ending
+from flows.schedule.field_schedule import Ending, FieldSchedule
 from flows.schedule.rig_lock import RigLock
 from pipeline.errors import PipelineError
 
@@ -32,6 +32,11 @@ class Outcome:
         told = self.ending or "was not begun here"
         more = f": {self.reason}" if self.reason else f": {self.run}" if self.run else ""
         return f"{self.field}, due {self.due:%Y-%m-%d %H:%M:%S} UTC, {told}{more}"
+
+
+def outcome_of(field: str, due: datetime, line: Mapping[str, Any]) -> Outcome:
+    """What a line of the ledger says became of a due run."""
+    return Outcome(field, due, line.get("event"), line.get("reason"), line.get("run"))
 
 
 def run_due(
@@ -96,8 +101,7 @@ def _end(
 
 def _as_noted(schedule: FieldSchedule, due: datetime) -> Outcome:
     """What the ledger says of a run that ended otherwise than here."""
-    line = schedule.state().ended.get(due, {})
-    return Outcome(schedule.field, due, line.get("event"), line.get("reason"), line.get("run"))
+    return outcome_of(schedule.field, due, schedule.state().ended.get(due, {}))
 
 
 def run_all(

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-from flows.schedule.ledger_state import ENDINGS, read_moment
+from flows.publish.receipt import areas_on_ground
+from flows.schedule.field_schedule import ENDINGS, read_moment
 from flows.survey.scores import score_of
+from flows.terminal.figures import known_number
 from pipeline.errors import ArchiveError
 from storage.archive.archive import Archive
 from storage.archive.ledger import Ledger, ledgers
@@ -85,17 +88,26 @@ def _history(archive: Archive, catalogue: Catalogue, name: str, ledger: Ledger |
 
 def _row(archive: Archive, catalogue: Catalogue, run: Run, line: Mapping[str, Any]) -> dict[str, Any]:
     receipt = run.receipt
-    savings = receipt.get("savings")
+    savings = found if isinstance(found := receipt.get("savings"), Mapping) else {}
     shares, unit = _areas(archive, catalogue, run)
+    colours: dict[str, str] = {}  # in which the run's map shows its classes, as CSS writes them
+    if (address := run.products.get("class_map")) is not None:
+        with suppress(OSError, LookupError, ValueError):
+            shown = load_class_names(archive.locate(address))
+            hexes = [f"#{bytes(map(int, rgb)).hex()}" for rgb in shown.colours]
+            colours = dict(zip(shown.names, hexes, strict=False))
     return {
         "run": run.uri,
         "created": run.created,
         "due": line.get("due"),
         "attempts": line.get("attempts"),
         **score_of(receipt),
-        "savings": {name: _ratio(savings, name) for name in ("capture_s", "lines", "bytes_stored", "multiply_adds")},
+        "savings": {
+            name: known_number(entry.get("ratio")) if isinstance(entry := savings.get(name), Mapping) else None
+            for name in ("capture_s", "lines", "bytes_stored", "multiply_adds")
+        },
         "areas": shares,
-        "colours": _colours(archive, run),
+        "colours": colours,
         "unit": unit,
         "problem": run.problem,
     }
@@ -103,9 +115,9 @@ def _row(archive: Archive, catalogue: Catalogue, run: Run, line: Mapping[str, An
 
 def _areas(archive: Archive, catalogue: Catalogue, run: Run) -> tuple[dict[str, float], str]:
     """What each class covers: hectares where the survey was put on the ground, else shares of the map."""
-    ground = run.receipt.get("ground")
-    if isinstance(ground, Mapping) and isinstance(ground.get("areas_ha"), Mapping):
-        return {str(name): float(area) for name, area in ground["areas_ha"].items() if _number(area) is not None}, "ha"
+    hectares = areas_on_ground(run.receipt)
+    if hectares is not None:
+        return {str(name): float(area) for name, area in hectares.items() if known_number(area) is not None}, "ha"
     address = run.products.get("class_map")
     store = None if address is None else catalogue.stores.get("/".join(address.split("/")[:3]))
     if address is None or store is None or store.problem is not None:
@@ -117,27 +129,6 @@ def _areas(archive: Archive, catalogue: Catalogue, run: Run) -> tuple[dict[str, 
     counts = {name: int((found.classes == number).sum()) for number, name in enumerate(found.names)}
     total = sum(counts.values()) or 1
     return {name: count / total for name, count in counts.items()}, "share"
-
-
-def _colours(archive: Archive, run: Run) -> dict[str, str]:
-    """The colours in which the run's map shows its classes, as CSS writes them; none where there is no map."""
-    address = run.products.get("class_map")
-    try:
-        found = None if address is None else load_class_names(archive.locate(address))
-    except (OSError, LookupError, ValueError):
-        found = None
-    if found is None:
-        return {}
-    return {name: f"#{bytes(map(int, rgb)).hex()}" for name, rgb in zip(found.names, found.colours, strict=False)}
-
-
-def _ratio(savings: object, name: str) -> float | None:
-    entry = savings.get(name) if isinstance(savings, Mapping) else None
-    return _number(entry.get("ratio")) if isinstance(entry, Mapping) else None
-
-
-def _number(value: object) -> float | None:
-    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
 
 
 def day_of(row: Mapping[str, Any]) -> float | None:

@@ -7,23 +7,97 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from itertools import islice
-from typing import Any
+from typing import Any, Literal
 
-from flows.schedule.ledger_state import Ending, ScheduleState, moment_words, read_state
-from flows.schedule.times import Timetable, WallClock
+from flows.schedule.times import Timetable, WallClock, read_timetable
 from storage.archive.ledger import Ledger
 
+Ending = Literal["done", "skipped", "failed"]
+ENDINGS = ("done", "skipped", "failed")
 SET_BACK = timedelta(minutes=1)  # a clock that goes back by less is being put right
 MOST_LINES = 100  # due times that passed and have a line each; more have one together
 MOST_COUNTED = 100_000
 MOST_ATTEMPTS = 3
 NOT_SERVED = "nothing was serving the schedule when it was due, or was killed before it could begin"
 TOO_LATE = "it could not begin in time"
+GONE = "its process was gone before it ended (killed, or a power cut)"
 OVERTAKEN = "a later one came first"
+
+
+@dataclass
+class ScheduleState:
+    """A ledger read to its end. ``since``: due times up to it are accounted for, or their runs have begun."""
+
+    timetable: Timetable | None = None
+    late: float = 0.0
+    serving: bool = False  # opened, and not closed
+    opened: datetime | None = None
+    since: datetime | None = None
+    seen: datetime | None = None  # the latest that a clock has shown here
+    ended: dict[datetime, Mapping[str, Any]] = field(default_factory=dict)
+    begun: dict[datetime, list[Mapping[str, Any]]] = field(default_factory=dict)
+
+    @property
+    def open(self) -> dict[datetime, list[Mapping[str, Any]]]:
+        """Runs that began and have not ended: the lines of each attempt."""
+        return {due: lines for due, lines in self.begun.items() if due not in self.ended}
+
+
+def read_state(lines: Iterable[Mapping[str, Any]]) -> ScheduleState:
+    """Go through a ledger; lines that are not understood count as nothing."""
+    state = ScheduleState()
+    for line in lines:
+        at, event = read_moment(line.get("at")), line.get("event")
+        if at is None:
+            continue
+        if event == "clock":  # set back: what was skipped in a future that did not come is due again; what ran has run
+            state.seen = at
+            state.since = at if state.since is None else min(state.since, at)  # what waits to be begun waits still
+            state.ended = {due: one for due, one in state.ended.items() if due <= at or one.get("event") != "skipped"}
+        state.seen = at if state.seen is None else max(state.seen, at)
+        due = read_moment(line.get("due"))
+        if event == "opened":
+            known, late, first = line.get("schedule"), line.get("late"), read_moment(line.get("first"))
+            state.timetable = read_timetable(known) if isinstance(known, Mapping) else None
+            state.late = float(late) if isinstance(late, int | float) else 0.0
+            if not state.serving:  # what would have been due while nothing was scheduled was not due
+                _reach(state, at if first is None else min(at, first - timedelta.resolution))
+            state.serving, state.opened = True, at
+        elif event == "closed":
+            state.serving = False
+        elif event == "passed" and (until := read_moment(line.get("until"))) is not None:
+            _reach(state, until)
+        elif event == "begun" and due is not None:
+            if due not in state.begun:
+                _reach(state, due)
+            state.begun.setdefault(due, []).append(line)
+        elif event in ENDINGS and due is not None and due not in state.ended:
+            state.ended[due] = line
+            if due not in state.begun:
+                _reach(state, due)
+    return state
+
+
+def read_moment(value: object) -> datetime | None:
+    """A moment as `moment_words` writes it; None where it is none."""
+    try:
+        found = datetime.fromisoformat(value) if isinstance(value, str) else None
+    except ValueError:
+        return None
+    return None if found is None else found.replace(tzinfo=found.tzinfo or UTC).astimezone(UTC)
+
+
+def moment_words(moment: datetime) -> str:
+    """A moment in ISO 8601, UTC, to the second (with parts of it where there are any)."""
+    return moment.astimezone(UTC).isoformat().replace("+00:00", "Z")
+
+
+def _reach(state: ScheduleState, moment: datetime) -> None:
+    state.since = moment if state.since is None else max(state.since, moment)
 
 
 @dataclass(frozen=True)
@@ -124,20 +198,16 @@ class FieldSchedule:
         """
         resumed: list[datetime] = []
         for due, lines in self.state().open.items():
-            told = why(lines[-1]) or self._why_not_again(due, len(lines))
+            told = why(lines[-1])
+            if told is None and len(lines) >= MOST_ATTEMPTS:
+                told = f"{GONE}, {len(lines)} times over; what it captured is kept"
+            if told is None and self.clock.now() >= due + self.timetable.interval(due):
+                told = f"{GONE}, and the next one was due before it could be resumed; what it captured is kept"
             if told is None:
                 resumed.append(due)
             else:
                 self.end(due, "failed", told)
         return resumed
-
-    def _why_not_again(self, due: datetime, attempts: int) -> str | None:
-        gone = "its process was gone before it ended (killed, or a power cut)"
-        if attempts >= MOST_ATTEMPTS:
-            return f"{gone}, {attempts} times over; what it captured is kept"
-        if self.clock.now() >= due + self.timetable.interval(due):
-            return f"{gone}, and the next one was due before it could be resumed; what it captured is kept"
-        return None
 
     def _overtake(self, state: ScheduleState, now: datetime, due: datetime) -> None:
         """Skip what is due before a due time that is about to be accounted for: later looks begin after that."""
@@ -165,7 +235,9 @@ class FieldSchedule:
             if keep and now <= timetable.latest_start(due, state.late):
                 kept.append(due)
             else:
-                self._write("skipped", now, due=moment_words(due), reason=_lateness(why, due, now))
+                minutes = (now - due).total_seconds() / 60
+                reason = f"{why} (noted {minutes:.1f} min after it was due)"
+                self._write("skipped", now, due=moment_words(due), reason=reason)
                 state.ended[due] = {"event": "skipped"}
         return kept
 
@@ -199,8 +271,3 @@ class FieldSchedule:
     def _write(self, event: str, now: datetime, **facts: object) -> None:
         line = {"event": event, "at": moment_words(now), **facts}
         self.ledger.append({name: value for name, value in line.items() if value is not None or name == "count"})
-
-
-def _lateness(why: str, due: datetime, now: datetime) -> str:
-    minutes = (now - due).total_seconds() / 60
-    return f"{why} (noted {minutes:.1f} min after it was due)"

@@ -1,29 +1,49 @@
-"""What `spectralzoom report` does: histories of an archive's fields as pages that open from disk.
+"""What `spectralzoom report` does: histories of an archive's fields, with charts, as pages that open from disk.
 
 Links lead to reports in the archive, beside the page.
 """
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
+from xml.etree import ElementTree
 
-from rich.console import Console
+import matplotlib as mpl
+import numpy as np
+from markupsafe import Markup
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.dates import AutoDateFormatter, AutoDateLocator
+from matplotlib.figure import Figure
+from matplotlib.ticker import Formatter, FuncFormatter, MaxNLocator, StrMethodFormatter
+from numpy.typing import NDArray
 from rich.markup import escape
 
-from flows.archive.commands import check_outside
-from flows.publish.charts import Chart, line_chart
-from flows.publish.finding_words import LEAST_HECTARES, area_words
-from flows.publish.pages import render_page
+from flows.cli.app import ArchiveName, AsJson, OutFile, check_outside, stderr
+from flows.publish.receipt_table import LEAST_HECTARES, area_words
+from flows.publish.report import render_page
 from flows.schedule.field_history import FieldHistory, day_of, read_histories
-from flows.schedule.ledger_state import read_moment
+from flows.schedule.field_schedule import read_moment
 from flows.terminal.figures import DASH, counted, format_percent
+from flows.terminal.processes import DONE
+from flows.terminal.progress import print_json
 from pipeline.errors import SettingsError
-from storage.archive.archive import Archive
 from storage.archive.whole_files import write_whole
 from storage.remote.opening import open_archive
+
+COLOURS = ("#2f7d4f", "#c2571a", "#3465a4", "#8e6bb0", "#b58900", "#5b8a8a", "#a04050", "#777777")  # told apart by most
+MOST_DOTS = 500  # of a series; longer ones are a line alone
+_STYLE: Any = {"svg.fonttype": "none", "font.family": "DejaVu Sans", "font.size": 11, "timezone": "UTC"}
+_SIZE_IN, _AXES = (760 / 72, 220 / 72), (0.09, 0.13, 0.89, 0.81)  # the page scales it; left, bottom, width, height of 1
+_MOST = 1e100  # that can be drawn; receipts may claim anything
+_DAYS = (-719_160.0, 2_932_890.0)  # since 1970, of years 1 to 9999: what dates can be written of
+
+Points = Sequence[tuple[float, float]]  # seconds since 1970, value
+
 
 MOST_ROWS = 1000  # of each table; older ones are counted
 SAVINGS = {"capture_s": "time at the camera", "lines": "lines", "bytes_stored": "stored data", "multiply_adds": "model"}
@@ -31,38 +51,39 @@ SCORES = {"miou": "mIoU", "overall_accuracy": "overall"}
 Rows = Sequence[Mapping[str, Any]]
 
 
-def run_report(archive: str | Path, field: str | None, out: Path, console: Console) -> dict[str, Any]:
-    """Write one field's page, or an index with a page for each field beside it; what they show is given.
+def report(archive: ArchiveName, *, field: str | None = None, out: OutFile, as_json: AsJson = False) -> int:
+    """Write a field's history as one page that opens from disk: dates, class areas, savings, failures.
 
-    Raises
-    ------
-    SettingsError : ``out`` is a folder, or lies in the archive.
-    ArchiveError : no field is called so, or a file cannot be read or written.
+    Parameters
+    ----------
+    field
+        What it is called; without one an index of all fields is written, beside a page for each.
+    out
+        The page to write.
     """
     opened = open_archive(archive, create=False, write=False)
-    page = check_outside(out, opened)
+    page = check_outside(out, opened.root)
     if page.is_dir():
         raise SettingsError(f"--out {out} is a folder, expected the file to write, such as {out}/history.html")
     if page.suffix.lower() not in (".html", ".htm"):
         raise SettingsError(f"--out {out}: expected a page's name that ends in .html")
-    with console.status("reading the archive"):
+    with stderr.status("reading the archive"):
         histories = read_histories(opened, field)
-    if field is not None:
-        written = [_write(histories[0], page, opened)]
-        content = histories[0].to_dict()
-    else:
-        names = {one.field: f"{page.stem}-{one.field}{page.suffix}" for one in histories}
-        written = [_write(one, page.with_name(names[one.field]), opened) for one in histories]
+    names = {one.field: page.name if field else f"{page.stem}-{one.field}{page.suffix}" for one in histories}
+    written = []
+    for one in histories:
+        written.append(page.with_name(names[one.field]))
+        write_whole(written[-1], render_history(one, "" if opened.in_bucket else way_to(opened.root, written[-1])))
+    content = (
+        histories[0].to_dict() if field else {"archive": opened.name, "fields": [one.to_dict() for one in histories]}
+    )
+    if not field:
         write_whole(page, render_index(histories, opened.name, names))
         written.append(page)
-        content = {"archive": opened.name, "fields": [one.to_dict() for one in histories]}
-    console.print(f"  {escape(str(written[-1]))}", highlight=False, soft_wrap=True)
-    return {**content, "pages": [str(path) for path in written]}
-
-
-def _write(history: FieldHistory, page: Path, archive: Archive) -> Path:
-    write_whole(page, render_history(history, "" if archive.in_bucket else way_to(archive.root, page)))
-    return page
+    stderr.print(f"  {escape(str(written[-1]))}", highlight=False, soft_wrap=True)
+    if as_json:
+        print_json({**content, "pages": [str(path) for path in written]})
+    return DONE
 
 
 def render_history(history: FieldHistory, runs_at: str) -> str:
@@ -92,37 +113,37 @@ def render_index(histories: Sequence[FieldHistory], archive: str, pages: Mapping
         title="Fields",
         lead=f"{counted(len(histories), 'field')}.",
         about=f"{archive}; times in UTC",
-        fields=[_field(one, pages[one.field]) for one in histories],
+        fields=[
+            {
+                "name": one.field,
+                "page": pages[one.field],
+                "runs": len(one.runs),
+                "newest": _short(max((str(row["created"]) for row in one.runs), default="")) or DASH,
+                "counts": list(one.counts.values()),
+                "trouble": next(
+                    (line.get("reason") or "" for line in reversed(one.events) if line["event"] != "done"), ""
+                ),
+            }
+            for one in histories
+        ],
     )
 
 
-def _field(history: FieldHistory, page: str) -> dict[str, Any]:
-    newest = max((str(row["created"]) for row in history.runs), default="")
-    trouble: Mapping[str, Any] = next((line for line in reversed(history.events) if line["event"] != "done"), {})
-    return {
-        "name": history.field,
-        "page": page,
-        "runs": len(history.runs),
-        "newest": _short(newest) or DASH,
-        "counts": list(history.counts.values()),
-        "trouble": trouble.get("reason") or "",
-    }
-
-
 def _areas(runs: Rows) -> list[Chart]:
-    units = {str(row["unit"]) for row in runs if row["areas"]}
-    colours = {name.replace("_", " "): rgb for row in runs for name, rgb in row["colours"].items()}
-    return [_area_chart(_by_class(runs, unit), unit, colours) for unit in sorted(units)]
-
-
-def _area_chart(series: dict[str, list[tuple[float, float]]], unit: str, colours: Mapping[str, str]) -> Chart:
     """Areas on the ground in hectares, small ones in square metres; else shares of the map. Colours are the map's."""
-    if unit == "share":
-        return line_chart(series, "Share of the map of each class", "%", colours)
-    if max((value for points in series.values() for _, value in points), default=1.0) >= LEAST_HECTARES:
-        return line_chart(series, "Hectares of each class", "ha", colours)
-    small = {name: [(moment, value * 1e4) for moment, value in points] for name, points in series.items()}
-    return line_chart(small, "Square metres of each class", "m²", colours)
+    colours = {name.replace("_", " "): rgb for row in runs for name, rgb in row["colours"].items()}
+    charts = []
+    for unit in sorted({str(row["unit"]) for row in runs if row["areas"]}):
+        series = _by_class(runs, unit)
+        most = max((value for points in series.values() for _, value in points), default=1.0)
+        if unit == "share":
+            charts.append(line_chart(series, "Share of the map of each class", "%", colours))
+        elif most >= LEAST_HECTARES:
+            charts.append(line_chart(series, "Hectares of each class", "ha", colours))
+        else:
+            small = {name: [(moment, value * 1e4) for moment, value in points] for name, points in series.items()}
+            charts.append(line_chart(small, "Square metres of each class", "m²", colours))
+    return charts
 
 
 def _by_class(runs: Rows, unit: str) -> dict[str, list[tuple[float, float]]]:
@@ -183,3 +204,69 @@ def way_to(archive: Path, page: Path) -> str:
         if root.is_relative_to(parent) and parent != Path(parent.anchor):
             return "/".join([*[".."] * up, *(quote(part) for part in root.relative_to(parent).parts)]) or "."
     return root.as_uri()
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A drawing, and colours of its series by name. Without a point there is nothing to draw."""
+
+    title: str
+    legend: Mapping[str, str]
+    drawing: Markup | None
+
+
+def line_chart(
+    series: Mapping[str, Points], title: str, unit: str = "", colours: Mapping[str, str] | None = None
+) -> Chart:
+    """Draw series from 0 upwards, shares in percent for the unit "%"; the same points are the same bytes.
+
+    ``colours`` of series by their names; others take `COLOURS` in turn.
+    """
+    legend = {name: COLOURS[number % len(COLOURS)] for number, name in enumerate(series)}
+    legend |= {name: colour for name, colour in (colours or {}).items() if name in series}
+    lines = {name: np.array(sorted(points)).reshape(-1, 2) for name, points in series.items()}
+    lines = {name: line[(np.abs(line) < _MOST).all(axis=1)] for name, line in lines.items()}
+    every = np.concatenate([np.empty((0, 2)), *lines.values()])
+    if not len(every):
+        return Chart(title, legend, None)
+    with mpl.rc_context({**_STYLE, "svg.hashsalt": title}):
+        figure = Figure(figsize=_SIZE_IN)
+        FigureCanvasSVG(figure)
+        axes = figure.add_axes(_AXES, frameon=False)
+        for name, line in lines.items():
+            dots = "o" if len(line) <= MOST_DOTS else "none"
+            axes.plot(_days(line), line[:, 1], marker=dots, ms=5, lw=1.8, color=legend[name], clip_on=False)
+        first, last, most = _days(every).min(), _days(every).max(), every[:, 1].max()
+        around = 2.0 if first == last else 0.0
+        axes.set(xlim=(first - around, last + around), ylim=(0, most if most > 1e-9 else 1))
+        locator = AutoDateLocator(minticks=3, maxticks=7)  # type: ignore[no-untyped-call]
+        dates = AutoDateFormatter(locator)  # type: ignore[no-untyped-call]
+        dates.scaled |= dict.fromkeys((1 / 24, 1 / 1440), "%m-%d %H:%M")
+        axes.xaxis.set(major_locator=locator, major_formatter=dates)
+        values: Formatter = StrMethodFormatter(f"{{x:.3g}} {unit}".strip())
+        if unit == "%":
+            values = FuncFormatter(lambda share, place: f"{100 * share:.3g} %")
+        axes.yaxis.set(major_locator=MaxNLocator(4, steps=[1, 2, 2.5, 5, 10]), major_formatter=values)
+        axes.grid(axis="y", color="#88888855", clip_on=False)
+        axes.tick_params(length=0, pad=8)
+        figure.patch.set_visible(False)
+        file = io.StringIO()
+        figure.savefig(file, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+    return Chart(title, legend, _inline(file.getvalue()))
+
+
+def _days(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.clip(points[:, 0] / 86_400, *_DAYS)
+
+
+def _inline(svg: str) -> Markup:
+    """A drawing as it stands within a page: without namespaces, its own size and style, and names of its parts."""
+    root = ElementTree.fromstring(svg)
+    for part in root.iter():
+        part.tag = part.tag.partition("}")[2]
+        part.attrib = {name.partition("}")[2] or name: value for name, value in part.attrib.items()}
+        if part.tag == "g":
+            part.attrib.pop("id", None)
+    root.attrib = {"viewBox": root.attrib["viewBox"]}
+    root.remove(root[0])  # its style, which would be the whole page's
+    return Markup(ElementTree.tostring(root, encoding="unicode"))

@@ -18,21 +18,17 @@ from prefect.context import FlowRunContext
 from prefect.states import Cancelled, Completed, Failed
 
 from flows.schedule.due_runs import Outcome, run_due
-from flows.schedule.field_schedule import FieldSchedule
-from flows.schedule.fields import ServedField
-from flows.schedule.ledger_state import read_moment
-from flows.schedule.news import ScheduleNews, together
-from flows.schedule.notices import send_notice
-from flows.schedule.queue import SKIPPED
-from flows.schedule.served import ServeRequest, read_served, served_archive, served_field, served_weights
+from flows.schedule.field_schedule import FieldSchedule, read_moment
+from flows.schedule.notices import ScheduleNews, send_notice, together
+from flows.schedule.served import ServedField, ServeRequest, read_served, served_archive, served_field, served_weights
 from flows.schedule.times import WallClock
-from flows.terminal.shown_text import on_stderr
+from flows.schedule.watcher import LIMIT, REPROCESS_LOCK, SKIPPED
+from flows.terminal.processes import FAILED, PARTLY
+from flows.terminal.progress import on_stderr
 from pipeline.errors import PipelineError, RigError
 from storage.archive.staging import take_lock
 from storage.remote.opening import open_archive
 
-LIMIT = "rig"  # a Prefect concurrency limit that shows who waits; the kernel's lock decides
-REPROCESS_LOCK = "reprocess-flow.lock"
 A_LOOK_S = 1.0
 AHEAD = timedelta(minutes=2)  # a run that is begun earlier than this was begun by hand
 
@@ -55,7 +51,11 @@ def survey_scheduled(field: str, due: str | None = None) -> State:
         return Failed(message=str(error))
     for known in together(news.fresh()):
         send_notice(request.notify, known, one.settings.out)
-    return _state(outcome)
+    if outcome.ending == "failed":
+        return Failed(message=outcome.reason)
+    if outcome.ending == "done":
+        return Completed(message=outcome.run)
+    return _skipped(outcome.reason or "it is accounted for already")
 
 
 def _run(one: ServedField, schedule: FieldSchedule, moment: datetime, request: ServeRequest) -> Outcome:
@@ -64,17 +64,18 @@ def _run(one: ServedField, schedule: FieldSchedule, moment: datetime, request: S
     if known is None:
         line = schedule.state().ended.get(moment, {})
         return Outcome(one.name, moment, None, str(line.get("reason") or "it is accounted for in the ledger already"))
+    context = FlowRunContext.get()
+    facts = {} if context is None or context.flow_run is None else {"flow_run": str(context.flow_run.id)}
     with _shown_in_queue():
-        return run_due(schedule, known, one.lock(), lambda field, due: _survey(one, due, request), facts=_flow_run())
+        return run_due(schedule, known, one.lock(), lambda field, due: _survey(one, due, request), facts=facts)
 
 
 def _survey(one: ServedField, due: datetime, request: ServeRequest) -> Path:
-    from flows.publish.prefect_artifacts import publish_artifacts
-    from flows.publish.survey_command import run_survey
+    from flows.publish import prefect_artifacts, survey_command  # torch, once the run is noted as begun
 
-    published = run_survey(one.settings_of(due, request.timetable), on_stderr())
+    published = survey_command.run_survey(one.settings_of(due, request.timetable), on_stderr())
     with suppress(Exception):  # a server that is gone: the archive has it all
-        publish_artifacts(published, one.name, one.settings.out)
+        prefect_artifacts.publish_artifacts(published, one.name, one.settings.out)
     return published.folder
 
 
@@ -121,20 +122,6 @@ def _scheduled() -> datetime | None:
     return None if expected is None else datetime.fromtimestamp(expected.timestamp(), UTC)
 
 
-def _flow_run() -> dict[str, object]:
-    context = FlowRunContext.get()
-    known = None if context is None or context.flow_run is None else str(context.flow_run.id)
-    return {} if known is None else {"flow_run": known}
-
-
-def _state(outcome: Outcome) -> State:
-    if outcome.ending == "failed":
-        return Failed(message=outcome.reason)
-    if outcome.ending == "done":
-        return Completed(message=outcome.run)
-    return _skipped(outcome.reason or "it is accounted for already")
-
-
 def _skipped(why: str) -> State:
     """The end of a run that did nothing: not the green of one that surveyed."""
     return Cancelled(name=SKIPPED, message=why)
@@ -154,8 +141,7 @@ def reprocess_archive(
 
     ``weights`` may be those that a served field's settings name.
     """
-    from flows.archive.commands import FAILED, PARTLY
-    from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
+    from flows.archive.reprocess_command import ReprocessRequest, run_reprocess  # torch
 
     try:
         served = read_served()

@@ -78,9 +78,12 @@ class RigLock:
 
     def holder(self) -> str:
         """Who holds it, as far as is known."""
-        with suppress(OSError, UnicodeDecodeError):
-            words = _held_by(self.place) if isinstance(self.place, str) else self.place.read_text().strip()
-            return words or "another process"
+        with suppress(OSError, UnicodeDecodeError, IndexError):
+            if isinstance(self.place, Path):
+                return self.place.read_text().strip() or "another process"
+            below = rf" @{re.escape(self.place)}/(.+)$"  # the words below a name that is held
+            told: list[str] = re.findall(below, _NAMES.read_text(errors="replace"), re.MULTILINE)
+            return told[0]
         return "another process"
 
     def of_servers(self) -> Path | str:
@@ -137,12 +140,6 @@ def _bind(held: ExitStack, name: str) -> None:
     one.bind(b"\0" + name.encode())
 
 
-def _held_by(name: str) -> str:
-    """The words below a name that is held."""
-    told = re.findall(rf" @{re.escape(name)}/(.+)$", _NAMES.read_text(errors="replace"), re.MULTILINE)
-    return told[0] if told else ""
-
-
 @contextmanager
 def rig_to_oneself(settings: Settings, words: str) -> Iterator[None]:
     """Hold the rig while the block runs; the simulated one needs no holding.
@@ -164,7 +161,6 @@ def rig_to_oneself(settings: Settings, words: str) -> Iterator[None]:
 
 
 def _port(settings: Settings) -> str | None:
-    """Name of the rig's port; None of a source that is no rig."""
     return settings.rig.port if settings.source == "rig" else None
 
 

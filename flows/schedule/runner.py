@@ -1,31 +1,20 @@
 """The process that lets Prefect start a schedule's runs: `serve` keeps it up, and starts it anew with the server.
 
-By itself Prefect's runner does not come back once its server has been away.
+By itself Prefect's runner does not come back once its server has been away. Run as ``python -m flows.schedule.runner``.
 """
 
 from __future__ import annotations
 
-import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from typing import Any
 
-from flows.schedule.served import NAMED_BY, ServeRequest, read_served
-from flows.terminal.process_guard import KeptProcess
+from prefect import serve
+from prefect.types.entrypoint import EntrypointType
 
-PATIENCE_S = 15.0
-
-
-class RunnerProcess(KeptProcess):
-    """Prefect's runner, in a process of its own, and of the runs that it starts; ``log`` has what they say.
-
-    What they may survey stands in ``served``. A survey goes on by itself when the runner ends, or is resumed.
-    """
-
-    def __init__(self, served: Path, log: Path) -> None:
-        super().__init__([sys.executable, "-m", "flows.schedule.runner"], log, PATIENCE_S, {NAMED_BY: str(served)})
+from flows.schedule.prefect_flows import reprocess_archive, survey_scheduled
+from flows.schedule.served import ServeRequest, read_served
 
 
 @contextmanager
@@ -47,12 +36,8 @@ def own_temporary_folder() -> Iterator[None]:
 def deployments(request: ServeRequest) -> list[Any]:
     """A deployment of the survey for each field, and of reprocessing for each archive.
 
-    None has a schedule of Prefect's: the watcher plans each due time once, see `flows.schedule.queue`.
+    None has a schedule of Prefect's: the watcher plans each due time once, see `flows.schedule.watcher`.
     """
-    from prefect.types.entrypoint import EntrypointType
-
-    from flows.schedule.prefect_flows import reprocess_archive, survey_scheduled
-
     made = [
         survey_scheduled.to_deployment(
             one.name,
@@ -80,8 +65,6 @@ def deployments(request: ServeRequest) -> list[Any]:
 
 def main() -> None:
     """Let the deployments of what is served run until told to stop."""
-    from prefect import serve
-
     request = read_served()
     with suppress(KeyboardInterrupt), own_temporary_folder():
         serve(*deployments(request), limit=request.limit, print_starting_message=False)

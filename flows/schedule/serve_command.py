@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+import os
 import signal
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from datetime import datetime, timedelta
 from pathlib import Path
+from typing import Literal
 
 from rich.console import Console
 from rich.markup import escape
@@ -21,59 +24,149 @@ from flows.schedule.served import ServeRequest
 from flows.schedule.times import parse_timetable
 from pipeline.errors import SettingsError
 from storage.remote.object_stores import is_remote
+from flows.cli.app import stderr
+from flows.schedule.due_runs import Outcome, Survey, Tell, run_all
+from flows.schedule.field_schedule import FieldSchedule
+from flows.schedule.notices import ScheduleNews, notice_address, send_notice, together
+from flows.schedule.rig_lock import RigLock, hold_place
+from flows.schedule.served import ServedField, ServeRequest, load_field
+from flows.schedule.server import serve_prefect
+from flows.schedule.times import SystemWallClock, Timetable, WallClock, parse_timetable
+from flows.survey.run import open_run
+from flows.terminal.processes import DONE
+from pipeline.errors import ArchiveError, PipelineError, RigError, SettingsError
+from storage.archive.staging import take_lock
+from storage.remote.object_places import is_remote
+
+LOOK_AGAIN = timedelta(seconds=30)  # a clock that jumps, or a run that died, is seen after this at the latest
 
 
-@dataclass(frozen=True, kw_only=True)
-class ServeChoice:
-    """What was given on the command line."""
+def serve(
+    *fields: Path,
+    cron: str | None = None,
+    every: str | None = None,
+    timezone: str | None = None,
+    out: str | None = None,
+    limit: int = 1,
+    late: float = 0.5,
+    engine: Literal["prefect", "plain"] = "prefect",
+    port: int = 4200,
+    notify: str | None = None,
+) -> int:
+    """Survey fields on a schedule, one after another, until stopped; every due run is done, skipped by rule, or failed.
 
-    files: Sequence[Path]
-    cron: str | None = None
-    every: str | None = None
-    timezone: str | None = None
-    out: str | None = None
-    limit: int = 1
-    late: float = 0.5
-    engine: str = "prefect"
-    port: int = 4200
-    notify: str | None = None
+    Parameters
+    ----------
+    fields
+        A settings file for each field, in turn.
+    cron
+        When all of them are due: minute hour day month weekday, such as '0 6-20 * * *'.
+    every
+        Or how often: 30m, 2h, 1d; counted from midnight UTC of 1970, not from now.
+    timezone
+        Of --cron, such as Europe/Berlin; this machine's by default.
+    out
+        Archive for all fields, a folder or s3://bucket/prefix; by default that of each field's settings.
+    limit
+        Surveys at a time, by Prefect; of one rig it is always one.
+    late
+        Share of the time to the next due one after which a run may not begin any more: it is skipped.
+    engine
+        `prefect`, with pages to look at, or `plain`, in this process alone.
+    port
+        Of Prefect's pages on this machine; a server that PREFECT_API_URL names is used instead.
+    notify
+        Address that is told of failed and skipped runs, a POST of JSON, or a file that holds it: what stands on the
+        command line is in the process list. SPECTRALZOOM_NOTIFY in the environment does as well. By default nobody.
+    """
+    timetable = parse_timetable(cron, every, timezone)
+    if not (math.isfinite(late) and 0 < late <= 1):
+        raise SettingsError(f"--late {late}: expected a share of the interval, above 0 and at most 1")
+    if limit < 1:
+        raise SettingsError(f"--limit {limit}: expected 1 or more surveys at a time")
+    address = notice_address(notify)
+    archive = out if out is None or is_remote(out) else str(Path(out).absolute())
+    served = load_fields(fields, archive)
+    request = ServeRequest(
+        fields=served, timetable=timetable, late=late, limit=limit, port=port, out=archive, notify=address
+    )
+    with alone_on(served), _stopped_cleanly(_tell):
+        if engine == "prefect":
+            serve_prefect(request, _tell)
+        else:
+            _tell(request.headline)
+            by_name = {one.name: replace(one, settings=replace(one.settings, engine="plain")) for one in served}
+            serve_plain(
+                request.schedules(),
+                {one.name: one.lock() for one in served},
+                lambda name, due: survey_field(by_name[name], due, timetable, stderr),
+                _tell,
+                note=lambda outcome: send_notice(address, outcome, by_name[outcome.field].settings.out),
+            )
+    return DONE
 
 
-def run_serve(choice: ServeChoice, console: Console) -> int:
-    """Serve until interrupted; what happens is told on ``console``, a line a run.
+def survey_field(one: ServedField, due: datetime, timetable: Timetable, console: Console) -> Path:
+    """Survey a field for a due time; gives the folder of the published run."""
+    from flows.publish.survey_command import run_survey  # torch, which a schedule by Prefect leaves to its runs
+
+    return run_survey(one.settings_of(due, timetable), console).folder
+
+
+def _tell(words: str) -> None:
+    stderr.print(escape(words), highlight=False, soft_wrap=True)
+
+
+def load_fields(files: Sequence[Path], out: str | None = None) -> list[ServedField]:
+    """Read the settings of every field, in turn, and see whether they can be surveyed; nothing is captured.
 
     Raises
     ------
-    PipelineError : something given cannot be used; nothing is served.
+    PipelineError : there are none, two are called the same, or the first that cannot be surveyed, named.
     """
-    timetable = parse_timetable(choice.cron, choice.every, choice.timezone)
-    if not (math.isfinite(choice.late) and 0 < choice.late <= 1):
-        raise SettingsError(f"--late {choice.late}: expected a share of the interval, above 0 and at most 1")
-    if choice.limit < 1:
-        raise SettingsError(f"--limit {choice.limit}: expected 1 or more surveys at a time")
-    notify = notice_address(choice.notify)
-    out = choice.out if choice.out is None or is_remote(choice.out) else str(Path(choice.out).absolute())
-    fields = load_fields(choice.files, out)
+    if not files:
+        raise SettingsError("no fields: give the settings file of one or more, such as serve north.toml --every 30m")
+    fields = [load_field(file, out) for file in files]
+    for number, one in enumerate(fields):
+        same = [other for other in fields[:number] if other.name == one.name]
+        if same:
+            raise SettingsError(
+                f'{same[0].file} and {one.file} are both called {one.name}: give one of them another name = "..."'
+            )
+        try:
+            open_run(replace(one.settings, name=one.name), planning=True)  # no device is asked before its first survey
+        except PipelineError as error:
+            raise type(error)(f"{one.file}: {error}") from error
+    return fields
 
-    def tell(words: str) -> None:
-        console.print(escape(words), highlight=False, soft_wrap=True)
 
-    request = ServeRequest(
-        fields=fields,
-        timetable=timetable,
-        late=choice.late,
-        limit=choice.limit,
-        port=choice.port,
-        out=out,
-        notify=notify,
-    )
-    with alone_on(fields), _stopped_cleanly(tell):
-        if choice.engine == "prefect":
-            serve_prefect(request, tell)
-        else:
-            tell(request.headline)
-            _serve_plain(request, console, tell)
-    return 0
+@contextmanager
+def alone_on(fields: Sequence[ServedField]) -> Iterator[None]:
+    """Keep another serve off the archives and the rigs of these fields while the block runs.
+
+    Raises
+    ------
+    ArchiveError : another serves one of the archives.
+    RigError : another serves one of the rigs.
+    """
+    roots: Mapping[Path, str] = {one.archive: str(one.settings.out) for one in fields}
+    rigs = {one.lock().of_servers(): one.settings.rig.port for one in fields if one.settings.source == "rig"}
+    with ExitStack() as held:
+        for root, name in roots.items():
+            release = take_lock(root / ".locks" / "serve.lock", wait=False)
+            if release is None:
+                raise ArchiveError(
+                    f"another serve works on the archive {name}: give all its fields to that one, or end it first"
+                )
+            held.callback(release)
+        for place, port in rigs.items():
+            release = hold_place(place, f"a serve (process {os.getpid()})")
+            if release is None:
+                raise RigError(
+                    f"another serve uses the rig at {port}: give all its fields to that one, or end it first"
+                )
+            held.callback(release)
+        yield
 
 
 @contextmanager
@@ -92,16 +185,45 @@ def _stopped_cleanly(tell: Tell) -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def _serve_plain(request: ServeRequest, console: Console, tell: Tell) -> None:
-    by_name = {one.name: replace(one, settings=replace(one.settings, engine="plain")) for one in request.fields}
+def serve_plain(
+    schedules: Mapping[str, FieldSchedule],
+    locks: Mapping[str, RigLock],
+    survey: Survey,
+    tell: Tell,
+    *,
+    clock: WallClock | None = None,
+    note: Callable[[Outcome], object] = lambda outcome: None,
+    until: datetime | None = None,
+) -> None:
+    """Serve schedules until ``until``, or until interrupted; then they are closed, and what began is resumed later.
 
-    def note(outcome: Outcome) -> None:
-        send_notice(request.notify, outcome, by_name[outcome.field].settings.out)
+    Raises
+    ------
+    PipelineError : a ledger cannot be written at the start; what was opened until then is closed.
+    """
+    watch, news = clock or SystemWallClock(), ScheduleNews(schedules, lambda name, error: tell(f"{name}: {error}"))
+    with ExitStack() as opened:
+        for name, schedule in schedules.items():
+            opened.callback(_close, name, schedule, tell)
+            schedule.open()
+        while until is None or watch.now() < until:
+            outcomes = run_all(schedules, lambda name: locks[name], survey, tell)
+            ran = {(outcome.field, outcome.due) for outcome in outcomes if outcome.ending}
+            fresh = news.fresh()
+            for outcome in fresh:  # also what was skipped, or found dead
+                if (outcome.field, outcome.due) not in ran:
+                    tell(outcome.words())
+            for outcome in together(fresh):
+                note(outcome)
+            if not any(outcome.ending for outcome in outcomes):  # else others may have become due meanwhile
+                now = watch.now()
+                due = [schedule.timetable.next_after(now) for schedule in schedules.values()]
+                watch.sleep(min([LOOK_AGAIN, *(one - now for one in due if one is not None)]).total_seconds())
 
-    serve_plain(
-        request.schedules(),
-        {one.name: one.lock() for one in request.fields},
-        lambda name, due: survey_field(by_name[name], due, request.timetable, console),
-        tell,
-        note=note,
-    )
+
+def _close(name: str, schedule: FieldSchedule, tell: Tell) -> None:
+    """Close a schedule; one that cannot be closed keeps the others from nothing."""
+    try:
+        schedule.close()
+    except PipelineError as error:
+        tell(f"{name}: {error}")

@@ -1,26 +1,82 @@
-"""What is served, kept in a file that flow runs read: whoever asks for a run can name a field or an archive, no more.
+"""What is served: fields and their settings, kept in a file that flow runs read, and one survey of one of them.
 
-Parameters of a flow run come from Prefect's server, and from whoever may ask it for runs; files, archives, schedulers
-and addresses come from here.
+Whoever asks Prefect for a run can name a field or an archive, no more: files, archives, schedulers and addresses come
+from that file.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
-from typing import Any
 
-from flows.schedule.field_schedule import FieldSchedule
-from flows.schedule.fields import ServedField, load_field
-from flows.schedule.times import Timetable, exact_words, parse_timetable
+from flows.schedule.field_schedule import FieldSchedule, moment_words
+from flows.schedule.rig_lock import RigLock, rig_lock
+from flows.schedule.times import SystemWallClock, Timetable, WallClock, exact_words, parse_timetable
+from flows.settings.load import load_settings
+from flows.settings.survey_settings import Settings
 from pipeline.errors import SettingsError
+from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES
+from storage.archive.ledger import Ledger
+from storage.archive.toml_files import read_toml
 from storage.archive.whole_files import write_whole
+from storage.remote.opening import open_archive
 
 NAMED_BY = "SPECTRALZOOM_SERVED"  # the environment variable that names the file
 KEYS = ("files", "out", "cron", "every", "timezone", "late", "limit", "notify")
+
+
+@dataclass(frozen=True)
+class ServedField:
+    """One field: its name, its file of settings and what stands in it."""
+
+    name: str
+    file: Path
+    settings: Settings
+
+    @property
+    def archive(self) -> Path:
+        """Folder of the archive, or of its working copy."""
+        return open_archive(self.settings.out).root
+
+    def schedule(self, timetable: Timetable, late: float, clock: WallClock | None = None) -> FieldSchedule:
+        """The field's schedule and ledger."""
+        return FieldSchedule(Ledger(self.archive, self.name), timetable, late, clock or SystemWallClock())
+
+    def lock(self) -> RigLock:
+        """The lock of the rig that looks at it."""
+        return rig_lock(self.settings, self.archive)
+
+    def settings_of(self, due: datetime, timetable: Timetable) -> Settings:
+        """What the survey of a due time is asked for: a visit of its own; a simulated farm is as on that day.
+
+        What stands before a rig, an emulated one too, is as it is.
+        """
+        asked = replace(self.settings, name=self.name, visit=moment_words(due))
+        if asked.source == "sim" and asked.scene in FARM_NAMES and asked.day is None:
+            asked = replace(asked, day=due.astimezone(timetable.zone).timetuple().tm_yday)
+        return asked
+
+
+def load_field(file: Path, out: str | None = None) -> ServedField:
+    """Read one field's settings; ``out`` wins over the file's archive.
+
+    Raises
+    ------
+    SettingsError : the file cannot be used, or says neither what to look at nor that a rig looks.
+    """
+    settings = load_settings(file, {"out": out})
+    said = read_toml(file)
+    if "scene" not in said and settings.source != "rig":
+        raise SettingsError(
+            f"{file} says neither scene nor source = 'rig': nothing to look at; give the field's scene, or its rig"
+        )
+    name = settings.name or re.sub(r"[^A-Za-z0-9_.-]+", "-", file.stem).strip("-.") or "field"
+    return ServedField(name, file.absolute(), settings)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +132,13 @@ def read_served() -> ServeRequest:
             f"nothing says what may be surveyed here: expected a file in {NAMED_BY}, as `serve` writes it and "
             f"prefect.yaml describes it"
         )
-    words = _read(Path(path))
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise SettingsError(f"{NAMED_BY} names {path}, which cannot be read as JSON: {error}") from error
+    if not isinstance(content, Mapping) or set(content) - set(KEYS) or not isinstance(content.get("files"), list):
+        raise SettingsError(f"{path}: expected an object with {', '.join(KEYS)}")
+    words = {**dict.fromkeys(KEYS), "late": 0.5, "limit": 1, **content}
     fields = [load_field(Path(str(file)), words["out"]) for file in words["files"]]
     if not fields:
         raise SettingsError(f"{path} names no field: expected files = [...], settings files")
@@ -118,14 +180,3 @@ def served_weights(request: ServeRequest, name: str | None) -> Path | None:
             f"settings, or use spectralzoom reprocess --weights"
         )
     return Path(name)
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise SettingsError(f"{NAMED_BY} names {path}, which cannot be read as JSON: {error}") from error
-    if not isinstance(content, Mapping) or set(content) - set(KEYS) or not isinstance(content.get("files"), list):
-        raise SettingsError(f"{path}: expected an object with {', '.join(KEYS)}")
-    words = {"out": None, "cron": None, "every": None, "timezone": None, "late": 0.5, "limit": 1, "notify": None}
-    return {**words, "files": [], **content}

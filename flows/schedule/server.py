@@ -1,4 +1,8 @@
-"""The Prefect server of a schedule: the one that PREFECT_API_URL names, or one of our own on this machine."""
+"""Schedules on Prefect: a server, its runner and a watcher, kept up until the schedule is stopped.
+
+The server is the one that PREFECT_API_URL names, or one of our own on this machine. Prefect starts the runs and shows
+them; what is due, and what became of it, the ledgers say.
+"""
 
 from __future__ import annotations
 
@@ -15,14 +19,19 @@ from contextlib import contextmanager, suppress
 from http.client import HTTPException
 from pathlib import Path
 
+from flows.schedule.due_runs import Tell
+from flows.schedule.field_schedule import FieldSchedule
 from flows.schedule.guarded_server import HOST, own_origins
+from flows.schedule.served import NAMED_BY, ServeRequest, write_served
+from flows.schedule.times import SystemWallClock
+from flows.schedule.watcher import Watcher
 from flows.survey.prefect_engine import QUIET
-from flows.terminal.cache_places import place_pages
-from flows.terminal.process_guard import KeptProcess
-from pipeline.errors import SettingsError
+from flows.terminal.processes import KeptProcess, place_pages
+from pipeline.errors import PipelineError, SettingsError
 
 STARTED_WITHIN_S = 600.0  # on a busy machine; one that has ended is not waited for
-ENDS_WITHIN_S = 10.0
+ENDS_WITHIN_S, RUNNER_ENDS_WITHIN_S = 10.0, 15.0
+WATCH_S, SOON_S = 15.0, 2.0  # between looks; until Prefect knows of all fields
 PATIENCE_S = 10.0  # with a server that is named
 NO_ANSWER = (OSError, ValueError, HTTPException)  # also of what speaks another protocol
 POLL_S = "2"  # how often Prefect looks for due runs; by its own default the next field waits up to 10 s
@@ -48,12 +57,6 @@ class LocalServer(KeptProcess):
                 return False
             time.sleep(0.2)
         return False
-
-
-def pages_of(server: LocalServer | None) -> str:
-    """Where the pages of a server are to be seen: one of our own, or the one that PREFECT_API_URL names."""
-    pages = (os.environ["PREFECT_API_URL"] if server is None else server.url).rstrip("/").removesuffix("/api")
-    return pages if server is None else f"{pages}, the password is in {server.password_file}"
 
 
 @contextmanager
@@ -105,7 +108,7 @@ def server_for(home: Path, port: int) -> Iterator[LocalServer | None]:
 
 
 def _password_in(path: Path) -> str:
-    """The password that a file keeps; made, for this user's eyes alone, where there is none."""
+    """The password that a file keeps, which nobody else can read or write; made where there is none (SettingsError)."""
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         number = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
@@ -115,11 +118,6 @@ def _password_in(path: Path) -> str:
         pass
     except OSError as error:
         raise SettingsError(f"cannot keep the password of Prefect's pages in {path}: {error.strerror}") from error
-    return _read_password(path)
-
-
-def _read_password(path: Path) -> str:
-    """What stands in the file, where it is one that nobody else can read or write (SettingsError)."""
     why = "is empty"
     try:
         with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), encoding="utf-8") as file:
@@ -155,3 +153,54 @@ def _check_free(port: int) -> None:
             raise SettingsError(
                 f"--port {port} cannot be used ({error}): give another, or name the server there in PREFECT_API_URL"
             ) from error
+
+
+def serve_prefect(request: ServeRequest, tell: Tell) -> None:
+    """Serve until interrupted.
+
+    Raises
+    ------
+    PipelineError : no server, or a ledger cannot be written at the start; what was opened until then is closed.
+    """
+    schedules, home = request.schedules(), request.fields[0].archive / ".prefect"
+    log = home / "surveys.log"
+    with server_for(home, request.port) as server:
+        served = home / "served.json"
+        write_served(request, served)
+        watcher = Watcher(request, schedules, tell)
+        # Of the runs that it starts the log has what they say; they go on by themselves when it ends, or are resumed.
+        command = [sys.executable, "-m", "flows.schedule.runner"]
+        runner = KeptProcess(command, log, RUNNER_ENDS_WITHIN_S, {NAMED_BY: str(served)})
+        opened: list[FieldSchedule] = []
+        try:
+            for schedule in schedules.values():
+                opened.append(schedule)
+                schedule.open()
+            tell(request.headline)
+            pages = (os.environ["PREFECT_API_URL"] if server is None else server.url).rstrip("/").removesuffix("/api")
+            known = "" if server is None else f", the password is in {server.password_file}"
+            tell(f"Prefect's pages: {pages}{known}; what surveys say: {log}")
+            watcher.prepare()
+            runner.keep_up()
+            while True:
+                if server is not None and server.keep_up():
+                    tell("the Prefect server had ended and is started again")
+                    server.wait()
+                    runner.restart()  # it does not find its server again by itself
+                elif runner.keep_up():
+                    tell(f"Prefect's runner had ended and is started again; {log} may say why")
+                ready = watcher.look()
+                watcher.tell_news()
+                if watcher.unheard():
+                    tell("runs that were asked for do not begin: Prefect's runner is started again")
+                    runner.restart()
+                time.sleep(WATCH_S if ready else SOON_S)
+        finally:
+            stopped = SystemWallClock().now()
+            tell("stopping; what is under way is interrupted, and resumed when it is served again")
+            runner.stop()
+            watcher.stop()
+            for schedule in opened:
+                with suppress(PipelineError):
+                    schedule.close(stopped)
+            watcher.tell_news()

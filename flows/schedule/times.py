@@ -157,20 +157,16 @@ def _cron(text: str) -> str:
 
 def _zone(name: str | None) -> str:
     """A time zone's name: the one given, or this machine's, or UTC."""
-    given = name or _zone_of_machine()
+    given = name or os.environ.get("TZ", "").lstrip(":")
+    if not name and (not given or given.startswith("/")):
+        place = Path("/etc/localtime")
+        parts = place.resolve().parts if place.is_symlink() else ()
+        given = "/".join(parts[parts.index("zoneinfo") + 1 :]) if "zoneinfo" in parts else "UTC"
     try:
         ZoneInfo(given)
     except (ZoneInfoNotFoundError, ValueError, OSError):
         raise SettingsError(f"--timezone {given!r} is no time zone; expected such as Europe/Berlin, or UTC") from None
     return given
-
-
-def _zone_of_machine() -> str:
-    if (named := os.environ.get("TZ", "").lstrip(":")) and not named.startswith("/"):
-        return named
-    place = Path("/etc/localtime")
-    parts = place.resolve().parts if place.is_symlink() else ()
-    return "/".join(parts[parts.index("zoneinfo") + 1 :]) if "zoneinfo" in parts else "UTC"
 
 
 class WallClock(Protocol):

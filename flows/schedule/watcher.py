@@ -1,12 +1,13 @@
 """What looks after a schedule on Prefect: it skips and reaps by the ledgers, and plans one flow run a due time.
 
-A server that is away is told of; what could not be done is done at the next look.
+A server that is away is told of; what could not be done is done at the next look. Prefect's own scheduler is not used:
+it makes runs of a new deployment late, and knows nothing of what the ledger has already.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from itertools import islice
@@ -14,19 +15,112 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from flows.schedule.due_runs import Tell
-from flows.schedule.field_schedule import FieldSchedule
-from flows.schedule.fields import ServedField
-from flows.schedule.news import ScheduleNews, together
-from flows.schedule.notices import send_notice
-from flows.schedule.queue import FlowRuns
+from flows.schedule.field_schedule import FieldSchedule, moment_words, read_moment
+from flows.schedule.notices import ScheduleNews, send_notice, together
 from flows.schedule.rig_lock import RigLock
-from flows.schedule.served import ServeRequest
+from flows.schedule.served import ServedField, ServeRequest
 from flows.schedule.times import Timetable
 from storage.archive.staging import take_lock
 
+LIMIT = "rig"  # a Prefect concurrency limit that shows who waits; the kernel's lock decides
+REPROCESS_LOCK = "reprocess-flow.lock"
+SKIPPED = "Skipped"  # the name of the state of what was taken back here, not by a person
+MOST_RUNS = 200  # that wait, looked at in one go; the server gives no more
+MOST_TRIES = 3  # flow runs of one due time that ended without a beginning in the ledger
+
 AHEAD, LEAST_AHEAD, MOST_AHEAD = timedelta(minutes=1), 2, 12  # due times to come that stand in Prefect
 UNHEARD = timedelta(minutes=2)
+A_LOOK = "a look at the schedule"
 CANCELLED = "it was cancelled in Prefect"
+
+
+@dataclass
+class FlowRuns:
+    """The flow runs of one field, by the due times that they were made for."""
+
+    name: str
+    tries: dict[datetime, int] = field(default_factory=dict)
+    known: bool = False  # to Prefect: the runner that was just started tells it of the field in some seconds
+
+    def settle(
+        self, client: Any, wanted: Mapping[datetime, int], now: datetime, spared: Collection[datetime] = ()
+    ) -> list[datetime]:
+        """Have a flow run for each due time that is wanted, by how often it was begun, and none for any other.
+
+        Those of ``spared`` are neither made nor taken back. Gives the due times whose run somebody cancelled.
+        """
+        from prefect.exceptions import ObjectNotFound
+
+        waiting = self._waiting(client)
+        for due in waiting.keys() - wanted.keys() - set(spared):
+            self._take_back(client, due, waiting[due], now, "it is accounted for already, or not served any more")
+        self.tries = {due: number for due, number in self.tries.items() if due in wanted}
+        missing = [due for due in wanted if due not in waiting and due not in spared]
+        try:
+            deployment = client.read_deployment_by_name(f"survey/{self.name}").id
+        except ObjectNotFound:
+            self.known = False
+            return []
+        self.known = True
+        return [due for due in missing if not self._plan(client, deployment, due, wanted[due])]
+
+    def stop(self, client: Any, now: datetime) -> None:
+        """Take back all that has not begun."""
+        for due, runs in self._waiting(client).items():
+            self._take_back(client, due, runs, now, "the schedule was stopped")
+
+    def give_up(self, client: Any, due: datetime) -> None:
+        """A due time's run whose process is gone before it began: another is made at the next look."""
+        from prefect.states import Crashed
+
+        for run in self._waiting(client).get(due, []):
+            if run.state is not None and run.state.is_pending():
+                client.set_flow_run_state(run.id, Crashed(message="it never began"), force=True)
+
+    def _plan(self, client: Any, deployment: Any, due: datetime, begun: int) -> bool:
+        """Make a due time's flow run: asked again Prefect gives the same one. False where somebody cancelled it."""
+        from prefect.states import Scheduled
+
+        while (number := self.tries.setdefault(due, 0)) < MOST_TRIES:
+            run = client.create_flow_run_from_deployment(
+                deployment,
+                parameters={"due": moment_words(due)},
+                state=Scheduled(scheduled_time=due),
+                name=f"survey-{self.name}",
+                idempotency_key=f"{self.name} {moment_words(due)} {begun} {number}",
+            )
+            if run.state is None or not run.state.is_final():
+                return True
+            if run.state.is_cancelled() and run.state.name != SKIPPED:
+                return False
+            self.tries[due] = number + 1
+        return True
+
+    def _take_back(self, client: Any, due: datetime, runs: Iterable[Any], now: datetime, why: str) -> None:
+        """No process is started for these any more. Of those to come nothing is left: they may be planned again."""
+        from prefect.states import Cancelled
+
+        for run in runs:
+            if run.state is None or not run.state.is_scheduled():
+                continue  # a process was started for it, and finds out by itself
+            if due > now:
+                client.delete_flow_run(run.id)
+            else:
+                client.set_flow_run_state(run.id, Cancelled(name=SKIPPED, message=why))
+
+    def _waiting(self, client: Any) -> dict[datetime, list[Any]]:
+        """Flow runs of the field that have not begun, by the due times that they were made for."""
+        from prefect.client.schemas.filters import DeploymentFilter, DeploymentFilterName
+
+        named = DeploymentFilter(name=DeploymentFilterName(any_=[self.name]))
+        runs: dict[datetime, list[Any]] = {}
+        for run in _read_runs(client, "survey", "SCHEDULED", "PENDING", deployment_filter=named):
+            due = read_moment(run.parameters.get("due"))
+            if due is None and run.auto_scheduled:  # an earlier version left it to Prefect
+                due = run.expected_start_time
+            if due is not None:
+                runs.setdefault(due, []).append(run)
+        return runs
 
 
 class Asked(NamedTuple):
@@ -54,8 +148,6 @@ class Watcher:
 
     def prepare(self) -> None:
         """At the start: the limit that shows the queue, and runs that are told as alive and are not."""
-        from flows.schedule.prefect_flows import LIMIT
-
         with self._errors("Prefect"), self.client_of() as client:
             client.upsert_global_concurrency_limit_by_name(LIMIT, 1)
         for one in self.request.fields:
@@ -109,26 +201,18 @@ class Watcher:
                 lock = one.lock()
                 rigs[lock.place] = lock
                 archives.add(one.archive)
-        looking = sum(self._is_in_use(lock) for lock in rigs.values())
-        reprocessing = sum(self._is_reprocessed(archive) for archive in archives)
+        looking = reprocessing = 0
+        for lock in rigs.values():
+            with self._errors("the rig"):
+                looking += not lock.take(A_LOOK)
+                lock.release()
+        for archive in archives:
+            with self._errors("reprocess"):
+                release = take_lock(archive / ".locks" / REPROCESS_LOCK, wait=False)
+                reprocessing += release is None
+                if release is not None:
+                    release()
         return looking == len(rigs) or looking + reprocessing >= self.request.limit
-
-    def _is_in_use(self, lock: RigLock) -> bool:
-        with self._errors("the rig"):
-            if not lock.take("a look at the schedule"):
-                return True
-            lock.release()
-        return False
-
-    def _is_reprocessed(self, archive: Path) -> bool:
-        from flows.schedule.prefect_flows import REPROCESS_LOCK
-
-        with self._errors("reprocess"):
-            release = take_lock(archive / ".locks" / REPROCESS_LOCK, wait=False)
-            if release is None:
-                return True
-            release()
-        return False
 
     def look(self) -> bool:
         """Once over all fields: what is too late or dead is accounted for, and Prefect has a run of each due time.
@@ -175,7 +259,7 @@ class Watcher:
     def _alone(self, one: ServedField, work: Callable[[], object]) -> bool:
         """Do it while no survey holds the field's rig; False where one does."""
         lock: RigLock = one.lock()
-        if not lock.take("a look at the schedule"):
+        if not lock.take(A_LOOK):
             return False
         try:
             with self._errors(one.name):
@@ -185,7 +269,6 @@ class Watcher:
         return True
 
     def _why(self, line: Mapping[str, Any]) -> str | None:
-        """Why a run is not to be resumed: somebody cancelled it."""
         known = line.get("flow_run")
         with suppress(Exception), self.client_of() as client:
             state = client.read_flow_run(known).state if known else None
@@ -197,11 +280,6 @@ class Watcher:
         with self.client_of() as client:
             for name in reap_flow_runs(client, one.name, None):
                 self.tell(f"{one.name}: the flow run {name} was told as running and is gone: crashed")
-        self._reap_reprocess(one)
-
-    def _reap_reprocess(self, one: ServedField) -> None:
-        from flows.schedule.prefect_flows import REPROCESS_LOCK
-
         release = take_lock(one.archive / ".locks" / REPROCESS_LOCK, wait=False)
         if release is not None:
             try:
@@ -210,25 +288,13 @@ class Watcher:
             finally:
                 release()
 
-    def _errors(self, what: str) -> _Told:
-        return _Told(self.tell, what)
-
-
-@dataclass
-class _Told:
-    """Tells of an error and goes on: what is missed now is done at the next look."""
-
-    tell: Tell
-    what: str
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> bool:
-        if not isinstance(error, Exception):
-            return False
-        self.tell(f"{self.what}: {error}")
-        return True
+    @contextmanager
+    def _errors(self, what: str) -> Iterator[None]:
+        """Tell of an error and go on: what is missed now is done at the next look."""
+        try:
+            yield
+        except Exception as error:
+            self.tell(f"{what}: {error}")
 
 
 def _ahead(timetable: Timetable, now: datetime) -> list[datetime]:
@@ -242,19 +308,28 @@ def reap_flow_runs(client: Any, field: str | None, archive: str | None) -> list[
 
     Of the survey of ``field``, or of the reprocessing of ``archive``.
     """
-    from prefect.client.schemas.filters import FlowFilter, FlowFilterName, FlowRunFilter, FlowRunFilterState
-    from prefect.client.schemas.filters import FlowRunFilterStateType as StateFilter
-    from prefect.client.schemas.objects import StateType
     from prefect.states import Crashed
 
-    flow = FlowFilter(name=FlowFilterName(any_=["reprocess" if field is None else "survey"]))
-    alive = FlowRunFilter(state=FlowRunFilterState(type=StateFilter(any_=[StateType.RUNNING, StateType.PENDING])))
+    flow, parameter, value = ("reprocess", "archive", archive) if field is None else ("survey", "field", field)
     reaped: list[str] = []
-    for run in client.read_flow_runs(flow_filter=flow, flow_run_filter=alive):
-        if run.parameters.get("field" if field is not None else "archive") == (field if field is not None else archive):
+    for run in _read_runs(client, flow, "RUNNING", "PENDING"):
+        if run.parameters.get(parameter) == value:
             client.set_flow_run_state(run.id, Crashed(message="its process was gone: its lock is free"), force=True)
             reaped.append(run.name)
     return reaped
+
+
+def _read_runs(client: Any, flow: str, *states: str, **filters: Any) -> list[Any]:
+    from prefect.client.schemas.filters import FlowFilter, FlowFilterName, FlowRunFilter, FlowRunFilterState
+    from prefect.client.schemas.filters import FlowRunFilterStateType as StateFilter
+    from prefect.client.schemas.objects import StateType
+
+    named = FlowFilter(name=FlowFilterName(any_=[flow]))
+    of_type = FlowRunFilterState(type=StateFilter(any_=[StateType[state] for state in states]))
+    runs: list[Any] = client.read_flow_runs(
+        flow_filter=named, flow_run_filter=FlowRunFilter(state=of_type), limit=MOST_RUNS, **filters
+    )
+    return runs
 
 
 def _client() -> Any:

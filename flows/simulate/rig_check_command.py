@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from flows.settings.load import load_settings
-from flows.terminal.shown_text import on_stdout, print_json
+from flows.terminal.progress import on_stdout, print_json
 from pipeline.errors import SettingsError
 from pipeline.geometry.scan import CostModel
 from pipeline.rig.camera.headwall_camera import HeadwallCamera

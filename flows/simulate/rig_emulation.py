@@ -19,7 +19,7 @@ from flows.settings.load import load_settings
 from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
 from flows.simulate.command import open_simulation
 from flows.survey.stages.effects import choose_effects, source_with
-from flows.terminal.shown_text import print_json
+from flows.terminal.progress import print_json
 from pipeline.errors import SettingsError
 from pipeline.geometry.mounting import STRAIGHT
 from pipeline.rig.device_settings import SurveyRig

@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from flows.survey.survey import STAGES, Products, StageRunner, Step, survey
-from flows.terminal.process_guard import end_with_us
-from flows.terminal.termination import terminable
+from flows.terminal.processes import end_with_us, terminable
 from pipeline.errors import PipelineError
 from storage.archive.archive import StageRef
 from storage.archive.staging import remove_tree, take_lock

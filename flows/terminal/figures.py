@@ -59,5 +59,10 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
+def known_number(value: object) -> float | None:
+    """A number that a receipt tells; None of anything else, as receipts may claim anything."""
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
 def _known(value: float | None) -> TypeGuard[float]:
     return value is not None and math.isfinite(value)

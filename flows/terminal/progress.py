@@ -1,16 +1,61 @@
-"""Progress of long work: bars on a terminal, a line now and then where the output is a log."""
+"""The terminal: safe text whatever names are made of, and the progress of long work, as bars or as lines of a log."""
 
 from __future__ import annotations
 
+import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from types import TracebackType
+from typing import Any
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, Task, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.segment import Segment
 from rich.table import Column
 from rich.text import Text
+
+from pipeline.visible_text import visible
+from storage.archive.whole_files import to_json
+
+PIPED_WIDTH = 120  # of tables where no terminal says how wide it is
+
+
+class Terminal(Console):
+    """A console on which control characters and marks of direction stand as escapes."""
+
+    def render_str(self, text: str, **choices: Any) -> Text:
+        """Text of a string, before it is measured."""
+        return super().render_str(visible(text), **choices)
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        """Segments of anything that is printed; the console's own controls are its own."""
+        for segment in super().render(renderable, options):
+            yield segment if segment.control else Segment(visible(segment.text), segment.style)
+
+
+def on_stderr() -> Terminal:
+    """Where progress and messages go."""
+    return Terminal(stderr=True)
+
+
+def on_stdout() -> Terminal:
+    """Where results go."""
+    return Terminal(file=sys.stdout, width=None if sys.stdout.isatty() else PIPED_WIDTH)
+
+
+def print_json(content: Mapping[str, object]) -> None:
+    """Print one object on stdout; numbers that are not finite become null."""
+    sys.stdout.write(to_json(content))
+
+
+def put_out(content: dict[str, Any], show: Callable[[dict[str, Any], Console], None], *, as_json: bool) -> None:
+    """Put an answer on stdout: as one JSON object, or as ``show`` prints it for people."""
+    if as_json:
+        print_json(content)
+    else:
+        show(content, on_stdout())
+
 
 LINE_EVERY_S = 30.0
 TITLE, NARROW = 34, 110  # columns of a title; a console of fewer is narrow
@@ -68,6 +113,11 @@ class StageProgress:
         if not self.console.is_terminal and (ended or due):
             self._said[stage] = time.monotonic()
             self.console.print(f"{title}: {done:.0%} {escape(words)}".rstrip(), highlight=False, soft_wrap=True)
+
+    def watch(self, stage: str, state: str, done: float) -> None:
+        """Show how far a stage of a survey is that runs, or how it ended: ran, cached, skipped, failed."""
+        running = state == "running"
+        self.show(stage, done, "" if running else state, ended=not running)
 
     def say(self, words: str) -> None:
         """Put words beside the stage that runs, as far as it is; nothing where none runs."""

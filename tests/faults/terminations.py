@@ -23,7 +23,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from flows.publish.receipt import comparable, is_pending
-from flows.terminal.termination import EXIT_CODE
+from flows.terminal.processes import TERMINATED
 from storage.archive.archive import Archive
 from tests.faults.fault_table import Clock, Row
 from tests.faults.small_survey import problems
@@ -50,7 +50,7 @@ class Terminations:
     def words(self) -> str:
         """The figures."""
         return (
-            f"{self.told} ended with {EXIT_CODE} and the sentence, in {self.longest_s:.1f} s at most, {self.ended} by "
+            f"{self.told} ended with {TERMINATED} and the sentence, in {self.longest_s:.1f} s at most, {self.ended} by "
             f"themselves; {self.pending} left a run to be judged; {len(self.wrong)} wrong"
             f"{': ' + '; '.join(self.wrong[:3]) if self.wrong else ''}"
         )
@@ -120,7 +120,7 @@ def _terminate(
         found.told += 1
         found.longest_s = max(found.longest_s, time.monotonic() - told)
         last = said.strip().splitlines()[-1:]
-        if (code, last) != (EXIT_CODE, [GOING_ON]) or "error" in said or "Traceback" in said:
+        if (code, last) != (TERMINATED, [GOING_ON]) or "error" in said or "Traceback" in said:
             yield f"exit {code}, {said[-300:]}"
     yield from (f"a process is left: {one}" for one in survey.left())
     yield from problems(out)
@@ -163,7 +163,7 @@ def rows(quick: bool = False) -> list[Row]:
             f"SIGTERM, {engine}",
             "to all processes of a survey, at a random moment or while its map is judged",
             count,
-            f"one sentence, exit {EXIT_CODE}, no process left, archive verifies, the rerun goes on and adds accuracy "
+            f"one sentence, exit {TERMINATED}, no process left, archive verifies, the rerun goes on and adds accuracy "
             "to the run that is there",
             done.words(),
             not done.wrong and done.told > count // 2,

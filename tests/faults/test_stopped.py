@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from flows.publish.receipt import check_receipt, comparable, is_pending
-from flows.terminal.termination import EXIT_CODE
+from flows.terminal.processes import TERMINATED
 from storage.archive.archive import Archive
 from storage.arrays.spool import Spool
 from tests.faults.nursery import Ended, Nursery
@@ -25,12 +25,12 @@ from tests.flows.small_fields import write_field, write_weights
 GOING_ON = "terminated; the same command goes on from here"
 SYNCS = (2, 30, 60, 110)  # of a survey's files, before which it is stopped
 TAKEN = 20  # lines of a sweep
-CODES = {signal.SIGKILL: -signal.SIGKILL, signal.SIGTERM: EXIT_CODE}
+CODES = {signal.SIGKILL: -signal.SIGKILL, signal.SIGTERM: TERMINATED}
 BEGUN = ("flows.survey.stages.accuracy:load_class_map", 1)
 PLACES = {  # function and call before which a survey is stopped that has its map, and with what
     "before the map is looked at": (*BEGUN, signal.SIGTERM),
     "in the controls": ("flows.survey.stages.accuracy:run_controls", 1, signal.SIGKILL),
-    "stored and not added": ("flows.publish.judging:add_accuracy", 1, signal.SIGKILL),
+    "stored and not added": ("flows.publish.survey_command:add_accuracy", 1, signal.SIGKILL),
     "drawn anew": ("flows.publish.run_folder:draw_quicklook", 1, signal.SIGTERM),
     "after the run has changed": ("storage.archive.run_folders:remove_tree", 1, signal.SIGKILL),
 }
@@ -48,7 +48,7 @@ def told(ended: Ended) -> bool:
     """Whether a command ended by SIGTERM with its one sentence, and nothing else but progress."""
     lines = ended.text.strip().splitlines()
     return (
-        ended.code == EXIT_CODE
+        ended.code == TERMINATED
         and lines[-1] == GOING_ON
         and not any("error" in line or "defect" in line for line in lines)
     )

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any
 
-from flows.schedule.ledger_state import ENDINGS, moment_words, read_moment
+from flows.schedule.field_schedule import ENDINGS, moment_words, read_moment
 from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 from storage.maintenance.garbage import clear_up

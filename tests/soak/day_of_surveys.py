@@ -22,7 +22,7 @@ from dataclasses import asdict, dataclass, field
 from datetime import datetime, timedelta
 from pathlib import Path
 
-from flows.schedule.ledger_state import moment_words
+from flows.schedule.field_schedule import moment_words
 from storage.archive.archive import Archive
 from tests.faults.disk_full import can_mount, small_disk
 from tests.faults.fault_table import Clock, Row

@@ -16,7 +16,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
-from flows.schedule.ledger_state import read_moment
+from flows.schedule.field_schedule import read_moment
 from storage.archive.ledger import ledgers
 from tests.faults.fault_table import Clock, Row
 from tests.soak.prefect_schedule import free_port, serving

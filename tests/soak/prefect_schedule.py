@@ -20,8 +20,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from flows.schedule.field_schedule import FieldSchedule
-from flows.schedule.ledger_state import read_moment
+from flows.schedule.field_schedule import FieldSchedule, read_moment
 from flows.schedule.times import parse_timetable
 from storage.archive.archive import Archive
 from storage.archive.ledger import Ledger, ledgers

@@ -18,7 +18,8 @@ from rich.console import Console
 
 from flows.schedule.due_runs import Outcome, run_all
 from flows.schedule.field_schedule import FieldSchedule
-from flows.schedule.fields import ServedField, load_fields, survey_field
+from flows.schedule.serve_command import load_fields, survey_field
+from flows.schedule.served import ServedField
 from flows.schedule.times import parse_timetable
 from storage.archive.ledger import ledgers
 from tests.flows.schedule.schedule_days import HandClock

@@ -14,7 +14,7 @@ from typing import cast
 
 import pytest
 
-from flows.schedule.ledger_state import moment_words
+from flows.schedule.field_schedule import moment_words
 from storage.archive.archive import Archive
 from tests.flows.schedule.schedule_days import NOON
 from tests.soak.accounts import Account, Leftovers, clear

@@ -16,10 +16,10 @@ import pytest
 from rich.console import Console
 
 from flows.archive import tables as archive_tables
-from flows.archive.commands import DONE, FAILED, PARTLY, run_explain, run_gc, run_ls, run_verify
-from flows.archive.contents import command, contents
+from flows.archive.commands import command, contents, explain, gc, ls, run_verify
 from flows.settings.load import load_settings
 from flows.terminal.figures import DASH
+from flows.terminal.processes import DONE, FAILED, PARTLY
 from pipeline.errors import ArchiveError
 from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
@@ -29,13 +29,10 @@ from tests.storage.small_archive import flip, small_survey
 QUIET = Console(quiet=True)
 
 
-@pytest.fixture(scope="module")
-def surveyed(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey) -> Path:
-    """An archive of two surveys of one scene with different budgets; not to be changed."""
-    folder = tmp_path_factory.mktemp("surveyed")
-    for budget in ("0.8", "0.7"):
-        survey_png(folder, budget=budget)
-    return folder
+@pytest.fixture
+def surveyed(two_budgets: Path) -> Path:
+    """Not to be changed."""
+    return two_budgets
 
 
 @pytest.fixture
@@ -53,7 +50,7 @@ def _json(capsys: pytest.CaptureFixture[str], run: Callable[[], int], code: int 
 
 def test_ls_shows_runs_and_stores(surveyed: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """As JSON with figures, and for people with units."""
-    content = _json(capsys, lambda: run_ls(surveyed, as_json=True))
+    content = _json(capsys, lambda: ls(surveyed, as_json=True))
     first, second = content["runs"]
     assert (first["survey"], first["budget"], second["budget"], first["seed"]) == ("scene", 0.8, 0.7, 0)
     assert first["state"] == second["state"] == "there"
@@ -61,7 +58,7 @@ def test_ls_shows_runs_and_stores(surveyed: Path, capsys: pytest.CaptureFixture[
     assert first["bytes"] > second["bytes"] > 10_000
     assert [len(content["stages"][stage]) for stage in ("capture", "rectify", "segment")] == [3, 1, 2]
     assert content["stages"]["rectify"][0]["runs"] == 2
-    run_ls(surveyed)
+    ls(surveyed)
     out = capsys.readouterr().out
     assert first["id"] in out
     assert content["stages"]["rectify"][0]["key"] in out
@@ -75,7 +72,7 @@ def test_of_many_stores_the_newest_are_shown(tmp_path: Path, capsys: pytest.Capt
         with archive.publish("segment", f"key{number:02d}", inputs=["gone"]):
             pass
         time.sleep(0.002)
-    run_ls(tmp_path)
+    ls(tmp_path)
     out = capsys.readouterr().out
     assert "and 2 older" in out
     assert ("key01" in out, "key02" in out, "key21" in out) == (False, True, True)
@@ -113,22 +110,22 @@ def test_ages_are_short(seconds: float | None, words: str) -> None:
 def test_an_empty_and_a_damaged_archive_are_listed(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """What is damaged or lost is said where it would have stood."""
     Archive.open(archive.parent / "empty")
-    assert run_ls(archive.parent / "empty") == DONE
+    assert ls(archive.parent / "empty") == DONE
     assert "no runs" in capsys.readouterr().out
     mosaic, coarse = (Archive.open(archive).refs(stage)[0] for stage in ("rectify", "locate"))
     flip(mosaic.path / "manifest.json", at=40)
     (coarse.path / "manifest.json").unlink()
     flip(Archive.open(archive).runs()[0] / "receipt.json", at=40)
-    content = _json(capsys, lambda: run_ls(archive, as_json=True))
+    content = _json(capsys, lambda: ls(archive, as_json=True))
     assert [run["state"] for run in content["runs"]] == ["damaged", "1 missing and 1 damaged"]
     assert content["lost"] == [coarse.uri]
-    run_ls(archive)
+    ls(archive)
     assert "has lost its manifest; run verify" in capsys.readouterr().out
 
 
 def test_explain_shows_lineage_and_what_changed(surveyed: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The second map differs by its budget, which the plan turned into other sweeps."""
-    content = _json(capsys, lambda: run_explain(surveyed, "class_map", as_json=True))
+    content = _json(capsys, lambda: explain(surveyed, "class_map", as_json=True))
     (top,) = content["lineage"]
     assert (top["stage"], top["called"], [one["stage"] for one in top["inputs"]]) == (
         "segment",
@@ -139,7 +136,7 @@ def test_explain_shows_lineage_and_what_changed(surveyed: Path, capsys: pytest.C
     assert content["before"].startswith("stages/segment/")
     kinds = {(one["where"], one["kind"], one["name"]) for one in content["changes"]}
     assert {("segment", "input", "patches"), ("attend", "parameter", "fine_s")} <= kinds
-    run_explain(surveyed, "class_map")
+    explain(surveyed, "class_map")
     out = capsys.readouterr().out
     assert "segment" in out
     assert "└── capture" in out
@@ -151,22 +148,22 @@ def test_a_fine_capture_is_not_taken_for_a_version_of_the_coarse_one(
     surveyed: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Both are of the stage capture; the first survey's coarse sweeps are the first of their kind."""
-    assert _json(capsys, lambda: run_explain(surveyed, "raw_coarse", as_json=True))["before"] is None
-    run_explain(surveyed, "raw_coarse")
+    assert _json(capsys, lambda: explain(surveyed, "raw_coarse", as_json=True))["before"] is None
+    explain(surveyed, "raw_coarse")
     assert "no earlier version" in capsys.readouterr().out
-    fine = _json(capsys, lambda: run_explain(surveyed, "raw_fine", as_json=True))
+    fine = _json(capsys, lambda: explain(surveyed, "raw_fine", as_json=True))
     (earlier,) = [run for run in contents(Archive.open(surveyed))["runs"] if run["budget"] == 0.8]
-    runs = _json(capsys, lambda: run_explain(surveyed, fine["before"], as_json=True))["runs"]
+    runs = _json(capsys, lambda: explain(surveyed, fine["before"], as_json=True))["runs"]
     assert runs == [f"runs/{earlier['id']}"]
 
 
 def test_a_run_is_explained_by_its_command_and_stores(surveyed: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Each store opens once; what nothing else was made of is at the top."""
     (first, _) = (run["id"] for run in contents(Archive.open(surveyed))["runs"])
-    content = _json(capsys, lambda: run_explain(surveyed, first, as_json=True))
+    content = _json(capsys, lambda: explain(surveyed, first, as_json=True))
     assert [tree["stage"] for tree in content["lineage"]] == ["evaluate", "turned"]
     assert "--budget 0.8" in content["run"]["command"]
-    run_explain(surveyed, first)
+    explain(surveyed, first)
     out = capsys.readouterr().out
     assert "spectralzoom survey --scene" in " ".join(out.split())
     assert out.count("capture_coarse") == 1
@@ -181,32 +178,32 @@ def test_explain_bears_damage_and_circles(tmp_path: Path, capsys: pytest.Capture
     for key, given in (("aaaa", "bbbb"), ("bbbb", "aaaa")):
         with archive.publish("segment", key, inputs=[given]):
             pass
-    (top,) = _json(capsys, lambda: run_explain(tmp_path, small.map.uri, as_json=True))["lineage"]
+    (top,) = _json(capsys, lambda: explain(tmp_path, small.map.uri, as_json=True))["lineage"]
     assert [one["problem"].split(":")[0] for one in top["inputs"]] == [
         "is not there",
         "manifest.json cannot be believed",
     ]
-    (top,) = _json(capsys, lambda: run_explain(tmp_path, "aaaa", as_json=True))["lineage"]
+    (top,) = _json(capsys, lambda: explain(tmp_path, "aaaa", as_json=True))["lineage"]
     assert top["inputs"][0]["inputs"][0]["see"] == "in a circle"
     for product in (small.map.uri, small.raw.uri, "aaaa"):
-        run_explain(tmp_path, product)
+        explain(tmp_path, product)
     assert "damaged" in capsys.readouterr().out
     with pytest.raises(ArchiveError, match="cannot be a name"):
-        run_explain(tmp_path, "../../etc/passwd")
+        explain(tmp_path, "../../etc/passwd")
 
 
 def test_gc_keeps_what_surveys_name(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """After one run has gone, its own stores go and those it shares stay."""
     shutil.rmtree(Archive.open(archive).runs()[0])
-    assert _json(capsys, lambda: run_gc(archive, QUIET, as_json=True))["removals"] == []
-    planned = _json(capsys, lambda: run_gc(archive, QUIET, keep_days=0, dry_run=True, as_json=True))
+    assert _json(capsys, lambda: gc(archive, as_json=True))["removals"] == []
+    planned = _json(capsys, lambda: gc(archive, keep_days=0, dry_run=True, as_json=True))
     assert len(planned["removals"]) == 6
-    done = _json(capsys, lambda: run_gc(archive, QUIET, keep_days=0, as_json=True))
+    done = _json(capsys, lambda: gc(archive, keep_days=0, as_json=True))
     assert done["removals"] == planned["removals"]
     assert done["bytes"] == sum(one["size"] for one in done["removals"]) > 10_000
     assert run_verify(archive, QUIET) == DONE
     flip(Archive.open(archive).runs()[0] / "manifest.json", at=40)
-    assert run_gc(archive, QUIET, keep_days=0) == PARTLY
+    assert gc(archive, keep_days=0) == PARTLY
     assert "no store is removed" in capsys.readouterr().out
 
 
@@ -285,7 +282,7 @@ def test_commands_name_the_archive_in_hand(archive: Path, capsys: pytest.Capture
     """Not where it lay when the survey ran: pasted, they work on what was asked about."""
     moved = archive.rename(archive.with_name("moved away"))
     run = Archive.open(moved).runs()[0]
-    told = [_json(capsys, lambda: run_explain(moved, run.name, as_json=True))["run"]["command"]]
+    told = [_json(capsys, lambda: explain(moved, run.name, as_json=True))["run"]["command"]]
     flip(run / "quicklook.png")
     told += [one["command"] for one in _json(capsys, lambda: run_verify(moved, QUIET, as_json=True), FAILED)["surveys"]]
     assert len(told) == 2
@@ -310,7 +307,7 @@ def test_an_archive_surveyed_by_relative_paths_is_repaired_from_anywhere(
 
 def test_tables_of_a_plain_archive_fit_a_narrow_terminal(surveyed: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """80 columns, into a pipe as well."""
-    run_ls(surveyed)
+    ls(surveyed)
     out = capsys.readouterr().out
     assert max(map(len, out.splitlines())) <= 80
     assert "age" in out

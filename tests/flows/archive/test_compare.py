@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from flows.archive.compare_command import _classes, _confidence, _pair_of, find_run, run_compare
+from flows.archive.compare_command import _classes, _confidence, _pair_of, compare, find_run
 from flows.archive.difference_picture import OTHER, SAME, MapPair, change_rgb, draw_difference, thin_changes
 from pipeline.errors import ArchiveError, SceneError, SettingsError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
@@ -26,18 +26,17 @@ from tests.storage.small_archive import flip
 POSE = {"lon_deg": 9.5, "lat_deg": 52.1, "heading_deg": 25.0, "tilt_deg": 50.0, "height_m": 14.0}
 
 
-@pytest.fixture(scope="module")
-def surveyed(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey) -> Path:
-    """An archive of two surveys of one scene with different budgets; not to be changed."""
-    folder = tmp_path_factory.mktemp("compared") / "archive"
-    for budget in ("0.8", "0.6"):
-        survey_png(folder, budget=budget)
-    return folder
+@pytest.fixture
+def surveyed(two_budgets: Path) -> Path:
+    """Not to be changed."""
+    return two_budgets
 
 
-def _compared(capsys: pytest.CaptureFixture[str], *words: Any) -> dict[str, Any]:
+def _compared(
+    capsys: pytest.CaptureFixture[str], archive: Path, old: str, new: str, out: Path | None = None
+) -> dict[str, Any]:
     capsys.readouterr()
-    assert run_compare(*words, as_json=True) == 0
+    assert compare(str(archive), old, new, out=out, as_json=True) == 0
     content: dict[str, Any] = json.loads(capsys.readouterr().out)
     return content
 
@@ -54,14 +53,14 @@ def test_a_run_is_the_same_as_itself(surveyed: Path, tmp_path: Path, capsys: pyt
     assert (content["settings"], content["versions"], content["largest"]) == ([], [], [])
     assert {row["iou"] for row in content["classes"]} == {1.0}
     assert content["confidence"]["change"] == 0
-    assert run_compare(surveyed, "latest", "latest", tmp_path) == 0
+    assert compare(surveyed, "latest", "latest", out=tmp_path) == 0
     assert "settings and versions are the same" in capsys.readouterr().out
 
 
 def test_two_budgets_are_told_apart(surveyed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Areas add up to the field, pairs to the pixels that differ, and the setting that was changed is named."""
     content = _compared(capsys, surveyed, "previous", "latest", tmp_path)
-    assert content["settings"] == [{"name": "budget", "old": 0.8, "new": 0.6}]
+    assert content["settings"] == [{"name": "budget", "old": 0.8, "new": 0.7}]
     for side in (0, 1):
         assert sum(row["pixels"][side] for row in content["classes"]) == 96 * 128
     assert sum(row["pixels"] for row in content["largest"]) == content["differing"]["pixels"] > 0
@@ -70,7 +69,7 @@ def test_two_budgets_are_told_apart(surveyed: Path, tmp_path: Path, capsys: pyte
     with Image.open(content["picture"]) as picture:
         assert picture.format == "PNG"
         assert picture.width > 3 * 400
-    run_compare(surveyed, "previous", "latest", tmp_path)
+    compare(surveyed, "previous", "latest", out=tmp_path)
     out = capsys.readouterr().out
     for words in ("budget", "time of capture", "IoU of A and B", "confidence", "compare-"):
         assert words in out
@@ -111,7 +110,7 @@ def test_new_weights_and_hectares_are_told(
     content = _compared(capsys, tmp_path / "archive", "previous", "latest", tmp_path)
     assert "weights" in {row["name"] for row in content["versions"]}
     assert sum(row["ha"][1] for row in content["classes"]) > 0
-    run_compare(tmp_path / "archive", "previous", "latest", tmp_path)
+    compare(tmp_path / "archive", "previous", "latest", out=tmp_path)
     assert "ha in B" in capsys.readouterr().out
 
 
@@ -124,11 +123,11 @@ def test_runs_of_different_fields_are_refused(survey_png: Survey, scene_files: P
         survey_png(tmp_path / "archive", scene=str(scene), labels=None)
     old, new = (path.name for path in Archive.open(tmp_path / "archive").runs())
     with pytest.raises(SceneError, match=r"different fields.*turned\.png"):
-        run_compare(tmp_path / "archive", old, new)
+        compare(tmp_path / "archive", old, new)
     with pytest.raises(ArchiveError, match="no run of the field"):
-        run_compare(tmp_path / "archive", "previous", "latest")
+        compare(tmp_path / "archive", "previous", "latest")
     with pytest.raises(ArchiveError, match="there is no run nothing"):
-        run_compare(tmp_path / "archive", "nothing", "latest")
+        compare(tmp_path / "archive", "nothing", "latest")
 
 
 def test_what_sets_two_farms_apart_is_told(tmp_path: Path) -> None:
@@ -140,7 +139,7 @@ def test_what_sets_two_farms_apart_is_told(tmp_path: Path) -> None:
             draft.write_file("receipt.json", json.dumps(receipt | {"products": {"class_map": "stages/segment/aaaa/m"}}))
     old, new = (path.name for path in archive.runs())
     with pytest.raises(SceneError, match=r"shape=96x64, runs/.*shape=96x96;"):
-        run_compare(tmp_path, old, new)
+        compare(tmp_path, old, new)
 
 
 def test_a_map_that_cannot_be_believed_is_not_compared(surveyed: Path, tmp_path: Path) -> None:
@@ -149,7 +148,7 @@ def test_a_map_that_cannot_be_believed_is_not_compared(surveyed: Path, tmp_path:
     address = Catalogue.read(archive).runs[-1].products["class_map"]
     flip(archive / address.rpartition("/")[0] / "manifest.json", at=40)
     with pytest.raises(ArchiveError, match=r"the class map .* is missing or damaged; run verify --repair"):
-        run_compare(archive, "previous", "latest", tmp_path)
+        compare(archive, "previous", "latest", out=tmp_path)
 
 
 def test_previous_is_the_run_just_before(tmp_path: Path) -> None:
@@ -169,10 +168,10 @@ def test_a_file_in_the_place_of_the_folder_is_refused(surveyed: Path, tmp_path: 
     """And is left as it is."""
     (tmp_path / "mine").write_text("mine")
     with pytest.raises(SettingsError, match="lies in the archive, where nothing else belongs"):
-        run_compare(surveyed, "previous", "latest", surveyed / "runs")
+        compare(surveyed, "previous", "latest", out=surveyed / "runs")
     for out in (tmp_path / "mine", tmp_path / "mine" / "below"):
         with pytest.raises(ArchiveError, match=r"mine.* is or lies below a file, expected a folder; choose another"):
-            run_compare(surveyed, "previous", "latest", out)
+            compare(surveyed, "previous", "latest", out=out)
     assert (tmp_path / "mine").read_text() == "mine"
 
 
@@ -206,6 +205,8 @@ def test_hectares_are_told_where_both_runs_have_them() -> None:
     assert ["ha" in row for runs in ((posed, bare), (bare, posed), (bare, bare)) for row in _classes(runs, pair)] == [
         False
     ] * 3
+    half = _pair_of([_map(np.zeros((2, 2)), ("a", "b")), _map(np.eye(2), ("a", "b"))])
+    assert [(row["name"], row["pixels"]) for row in _classes((bare, bare), half)] == [("a", [4, 2]), ("b", [0, 2])]
     (row,) = _classes((posed, posed), pair)
     assert (row["ha"], row["pixels"], row["iou"]) == ([2.5, 2.5], [4, 4], 1.0)
 

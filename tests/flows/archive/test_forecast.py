@@ -12,12 +12,12 @@ from typing import Any
 
 import pytest
 
-from flows.archive.forecast import StageForecast, forecast
-from flows.archive.plan_command import run_plan
+from flows.archive.plan_command import StageForecast, forecast, plan_content, show_plan
 from flows.archive.stage_costs import scaled_cost
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
 from flows.survey.run import open_run
+from flows.terminal.progress import put_out
 from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from pipeline.simulator.simulated import SimulatedSource
 from storage.archive.archive import Archive
@@ -35,17 +35,10 @@ def settings(scene_files: Path, weights: Path) -> Settings:
     return load_settings(None, given | {"engine": "plain", "budget": "0.8", "controls": False})
 
 
-@pytest.fixture(scope="module")
-def surveyed(tmp_path_factory: pytest.TempPathFactory, survey_png: Any) -> tuple[Path, Any]:
-    """An archive with one survey of the small picture, not to be changed, and its receipt."""
-    out = tmp_path_factory.mktemp("surveyed")
-    return out, survey_png(out).receipt
-
-
 @pytest.fixture
-def archive(surveyed: tuple[Path, Any], tmp_path: Path) -> Path:
-    """A copy of that archive."""
-    return Path(shutil.copytree(surveyed[0], tmp_path / "archive"))
+def archive(one_survey: tuple[Path, Any], tmp_path: Path) -> Path:
+    """A copy of an archive with one survey."""
+    return Path(shutil.copytree(one_survey[0], tmp_path / "archive"))
 
 
 def _plan(settings: Settings, out: Path, **changes: Any) -> dict[str, StageForecast]:
@@ -161,6 +154,10 @@ def test_two_records_tell_what_starting_takes() -> None:
     assert scaled_cost([10.0, 30.0], [1.0, 3.5], 0.0) == 0.0
 
 
+def _show(asked: Settings, *, as_json: bool = False) -> None:
+    put_out(plan_content(asked), show_plan, as_json=as_json)
+
+
 def test_a_field_beyond_this_machine_is_planned_without_drawing_it(
     settings: Settings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -181,9 +178,9 @@ def test_a_field_beyond_this_machine_is_planned_without_drawing_it(
     with pytest.raises(SettingsError, match="this machine has 9; take a smaller one") as refused:
         open_run(asked)
     assert found.refused == str(refused.value)
-    assert run_plan(asked) == 0
+    _show(asked)
     assert f"refused here: {refused.value}" in capsys.readouterr().out
-    run_plan(asked, as_json=True)
+    _show(asked, as_json=True)
     assert json.loads(capsys.readouterr().out)["refused"] == str(refused.value)
     assert not list(tmp_path.iterdir())
 
@@ -229,17 +226,17 @@ def test_what_the_survey_refuses_the_plan_refuses(settings: Settings, tmp_path: 
 def test_plan_as_json_and_as_a_table(settings: Settings, archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """One object with the sums of what is ahead; the table names every stage and says what is left to make."""
     asked = replace(settings, out=str(archive), kernel="nearest")
-    assert run_plan(asked, as_json=True) == 0
+    _show(asked, as_json=True)
     content = json.loads(capsys.readouterr().out)
     ahead = [row for row in content["stages"] if row["state"] in ("to run", "blocked")]
     assert content["to_make"] == content["estimated"] == len(ahead) == 7
     assert content["seconds"] == pytest.approx(sum(row["seconds"] for row in ahead))
     assert content["bytes"] == sum(row["bytes"] for row in ahead)
-    assert run_plan(asked) == 0
+    _show(asked)
     shown = capsys.readouterr().out
     assert all(row["stage"] in shown for row in content["stages"])
     assert "7 stages to make, about" in shown
-    run_plan(replace(settings, out=str(archive)))
+    _show(replace(settings, out=str(archive)))
     assert "everything is stored" in capsys.readouterr().out
 
 

@@ -21,7 +21,7 @@ from PIL import Image
 from rich.console import Console
 
 import flows.archive.ingest_command
-from flows.archive.ingest_command import IngestRequest, run_ingest
+from flows.archive.ingest_command import run_ingest
 from pipeline.errors import ArchiveError, SceneError, WavelengthError
 from storage.archive.archive import Archive
 from storage.readers.cube_sources import CubeSource
@@ -46,7 +46,7 @@ def write_envi(path: Path, values: NDArray[Any], *, lines: int | None = None, mo
 
 def ingest(source: Path | str, archive: Path, **flags: Any) -> dict[str, Any]:
     """Ingest without showing anything."""
-    return run_ingest(IngestRequest(str(source), archive, **flags), Console(quiet=True))
+    return run_ingest(str(source), archive, Console(quiet=True), **flags)
 
 
 def opened(record: dict[str, Any]) -> xr.Dataset:
@@ -203,13 +203,13 @@ def test_a_source_that_fails_half_way(tmp_path: Path, raw: NDArray[np.uint16], m
     """An error in the middle leaves no store, and the next ingest makes it."""
     header = write_envi(tmp_path / "a.img", raw)
 
-    def torn(request: IngestRequest) -> CubeSource:
-        source = open_cube_source(request.source)
+    def torn(path: str, **references: Any) -> CubeSource:
+        source = open_cube_source(path, **references)
         object.__setattr__(source, "read", lambda start, stop: _raise() if start else raw[start:stop])
         return source
 
     with monkeypatch.context() as patch:
-        patch.setattr(flows.archive.ingest_command, "_opened", torn)
+        patch.setattr(flows.archive.ingest_command, "open_cube_source", torn)
         with pytest.raises(SceneError, match="torn"):
             ingest(header, tmp_path / "archive")
     archive = Archive.open(tmp_path / "archive")
@@ -243,12 +243,12 @@ def test_a_source_that_changes_meanwhile(
 def test_progress_and_notes_are_shown(tmp_path: Path, raw: NDArray[np.uint16]) -> None:
     """The size, what is doubtful and where the store lies stand on the console."""
     shown = io.StringIO()
-    request = IngestRequest(str(write_envi(tmp_path / "a.img", raw[:5], lines=9)), tmp_path / "archive")
-    run_ingest(request, Console(file=shown, width=200))
+    source = str(write_envi(tmp_path / "a.img", raw[:5], lines=9))
+    run_ingest(source, tmp_path / "archive", Console(file=shown, width=200))
     text = shown.getvalue()
     for words in ("storing the cube: 100%", "9 x 40 px, 3 bands, 450-650 nm", "4 of 9 lines are in no file", "stored:"):
         assert words in text
-    run_ingest(request, Console(file=shown, width=200))
+    run_ingest(source, tmp_path / "archive", Console(file=shown, width=200))
     assert "already there:" in shown.getvalue()
 
 
@@ -256,9 +256,9 @@ CODE = """
 import sys
 from pathlib import Path
 from rich.console import Console
-from flows.archive.ingest_command import IngestRequest, run_ingest
+from flows.archive.ingest_command import run_ingest
 print("go", flush=True)
-run_ingest(IngestRequest(sys.argv[1], Path(sys.argv[2])), Console(quiet=True))
+run_ingest(sys.argv[1], Path(sys.argv[2]), Console(quiet=True))
 """
 
 

@@ -14,12 +14,13 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from flows.archive.judge_command import split_address
 from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
+from flows.cli.model_verbs import _run_address
 from flows.publish import run_folder as publish
 from flows.publish.receipt import check_receipt, comparable, is_pending
 from flows.survey.stages import accuracy as evaluation
 from flows.survey.survey import STAGES
+from pipeline.errors import SettingsError
 from storage.archive.archive import Archive
 from storage.remote.opening import verify_archive
 from tests.conftest import WeightsMaker
@@ -358,5 +359,9 @@ def test_a_run_that_is_not_there_is_refused(surveyed: Path, command_line: Comman
     ],
 )
 def test_addresses_of_runs(text: str, found: tuple[str, str] | None) -> None:
-    """Archive and name, as `survey` prints them."""
-    assert split_address(text) == found
+    """Archive and name, as `survey` prints them; anything else without --weights is refused."""
+    if found is not None:
+        assert _run_address(text, None, given=False) == found
+        return
+    with pytest.raises(SettingsError, match="give --weights FILE to judge weights on this data set"):
+        _run_address(text, None, given=False)

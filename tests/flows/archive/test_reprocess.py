@@ -17,9 +17,10 @@ from PIL import Image
 from rich.console import Console
 
 from flows.archive import stale_runs as generations
-from flows.archive.commands import DONE, FAILED, PARTLY, run_verify
+from flows.archive.commands import run_verify
 from flows.archive.reprocess_command import ReprocessRequest, _survey, run_reprocess
 from flows.settings.survey_settings import Settings
+from flows.terminal.processes import DONE, FAILED, PARTLY
 from models.weights.files import content_key
 from pipeline.errors import ArchiveError, SettingsError, WeightsError
 from pipeline.simulator.scenes.farm.farm_plan import CLASSES

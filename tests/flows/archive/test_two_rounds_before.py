@@ -70,10 +70,10 @@ def _publish_second_round(archive: Archive, one: Published) -> None:
 
 
 @pytest.fixture(scope="module")
-def before(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey) -> Path:
+def before(tmp_path_factory: pytest.TempPathFactory, one_survey: tuple[Path, Published]) -> Path:
     """An archive with a run of one round and, newer, one of two; not to be changed."""
-    out = tmp_path_factory.mktemp("before")
-    _publish_second_round(Archive.open(out), survey_png(out))
+    out = Path(shutil.copytree(one_survey[0], tmp_path_factory.mktemp("before") / "archive"))
+    _publish_second_round(Archive.open(out), one_survey[1])
     return out
 
 

@@ -13,12 +13,11 @@ from typing import Any
 
 import pytest
 
-import flows.cli.survey_verbs  # noqa: F401 - main registers them when it runs
 from flows.cli import main as cli
-from flows.cli.app import GOES_ON, app
+from flows.cli.app import GOES_ON, VERBS, build_app
 from flows.cli.survey_verbs import IN_TABLES
 from flows.settings.declared import SURVEY, TABLES
-from flows.terminal.shown_text import print_json
+from flows.terminal.progress import print_json
 
 ONE_THREAD = """
 import os, sys
@@ -39,16 +38,26 @@ def test_numpy_computes_on_one_thread_whatever_the_shell_says() -> None:
     assert (ended.returncode, ended.stdout.split()[-1]) == (0, "1"), ended.stderr
 
 
-GROUPS = ("rig",)  # verbs that have verbs below them
-VERBS = [verb for verb in app if not verb.startswith("-") and verb not in GROUPS]
-VERBS += [f"{group} {verb}" for group in GROUPS for verb in app[group] if not verb.startswith("-")]
-
-
 def _flags(verb: str) -> dict[str, str | None]:
     """What a verb takes, and what its help says of each."""
-    named = reduce(lambda found, word: found[word], verb.split(), app)
+    named = reduce(lambda found, word: found[word], verb.split(), build_app(listed=False))
     found = named.assemble_argument_collection(parse_docstring=True)
     return {argument.name: argument.parameter.help for argument in found if argument.name != "*"}
+
+
+def test_help_lists_every_verb_and_loads_none(capsys: pytest.CaptureFixture[str]) -> None:
+    """With the first sentence of each verb's own help; a verb's own help is whole."""
+    script = (
+        "import sys\nfrom flows.cli.main import main\ntry:\n    main(sys.argv[1:])\nfinally:\n    print(*sys.modules)"
+    )
+    ended = subprocess.run([sys.executable, "-c", script, "--help"], capture_output=True, text=True, check=True)
+    shown, loaded = ended.stdout.rsplit("\n", 2)[0], ended.stdout.split()
+    assert not {"numpy", "torch", "prefect", "matplotlib", *VERBS.values()} & set(loaded)
+    assert all(verb.split()[0] in shown for verb in VERBS)
+    assert "that they were not" in shown  # of evaluate
+    with pytest.raises(SystemExit):
+        cli.main(["train", "--help"])
+    assert "OUT.checkpoint" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("verb", ["survey", "plan"])
@@ -95,13 +104,12 @@ def test_sigterm_ends_every_verb(
     verb: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """143 and one sentence, which says whether the same command goes on; afterwards SIGTERM is what it was before."""
-    named = reduce(lambda found, word: found[word], verb.split(), app)
 
     def terminated() -> None:
         os.kill(os.getpid(), signal.SIGTERM)
         pytest.fail("SIGTERM was not heard")
 
-    monkeypatch.setattr(named, "default_command", terminated)
+    monkeypatch.setattr(f"{VERBS[verb]}.{verb.split()[-1]}", terminated)
     before = signal.getsignal(signal.SIGTERM)
     with pytest.raises(SystemExit) as left:
         cli.main(verb.split())

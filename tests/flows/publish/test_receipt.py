@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from flows.publish.receipt import COSTS, Header, Receipt, build_receipt, check_receipt, comparable
-from flows.publish.receipt_table import headline, print_table
+from flows.publish.receipt_table import area_words, headline, print_table
 from flows.settings.survey_settings import Settings
 from pipeline.errors import ShapeError
 from storage.archive.records import StageRecord
@@ -221,6 +221,11 @@ def test_a_table_in_which_both_definitions_agree_shows_one():
 def test_a_table_is_not_wider_than_a_terminal():
     """80 columns, with both definitions and a control's long name."""
     assert max(map(len, _printed(make_receipt(), 80).splitlines())) <= 80
+
+
+def test_small_areas_are_told_in_square_metres():
+    """A hectare has ten thousand of them."""
+    assert [area_words(hectares) for hectares in (2.5, 0.1, 0.0999, 0.0012)] == ["2.5 ha", "0.1 ha", "999 m²", "12 m²"]
 
 
 def test_headline_is_one_paragraph_with_the_figures():

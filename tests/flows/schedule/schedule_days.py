@@ -6,8 +6,7 @@ from collections import Counter
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-from flows.schedule.field_schedule import FieldSchedule
-from flows.schedule.ledger_state import ENDINGS, read_moment, read_state
+from flows.schedule.field_schedule import ENDINGS, FieldSchedule, read_moment, read_state
 from flows.schedule.times import Timetable, parse_timetable
 from storage.archive.ledger import Ledger
 
@@ -34,6 +33,14 @@ def field_schedule(
 ) -> FieldSchedule:
     """A schedule of one field below ``root``."""
     return FieldSchedule(Ledger(root, field), parse_timetable(None, every, "UTC"), late, clock)
+
+
+def opened(root: Path, every: str = "20m", late: float = 0.5) -> tuple[HandClock, FieldSchedule]:
+    """A clock that shows noon, and a schedule by it that is served since then."""
+    clock = HandClock()
+    schedule = field_schedule(root, clock, every=every, late=late)
+    schedule.open()
+    return clock, schedule
 
 
 def accounted(lines: list[dict[str, object]], timetable: Timetable) -> Counter[datetime]:

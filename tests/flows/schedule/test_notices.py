@@ -14,12 +14,11 @@ from typing import Any
 import pytest
 
 from flows.schedule.due_runs import Outcome
-from flows.schedule.news import ScheduleNews, Several, together
-from flows.schedule.notices import NAMED_BY, notice_address, send_notice
-from flows.schedule.plain_schedule import serve_plain
+from flows.schedule.notices import NAMED_BY, ScheduleNews, Several, notice_address, send_notice, together
 from flows.schedule.rig_lock import RigLock
+from flows.schedule.serve_command import serve_plain
 from pipeline.errors import PipelineError, SettingsError
-from tests.flows.schedule.schedule_days import NOON, HandClock, field_schedule
+from tests.flows.schedule.schedule_days import NOON, HandClock, field_schedule, opened
 
 LATER = NOON + timedelta(hours=33)
 
@@ -32,6 +31,11 @@ def listener() -> Iterator[tuple[str, list[dict[str, Any]]]]:
     class Handler(BaseHTTPRequestHandler):
         def do_POST(self) -> None:
             posted.append(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
+            self.send_response(204)
+            self.end_headers()
+
+        def do_GET(self) -> None:  # as what follows a redirect of a POST asks
+            posted.append({"asked": self.path})
             self.send_response(204)
             self.end_headers()
 
@@ -240,8 +244,7 @@ def test_very_many_due_times_are_news(tmp_path: Path, hours: int, count: int | N
 
 def test_a_line_for_no_due_time_is_no_news(tmp_path: Path) -> None:
     """Nothing is told where all that passed had been accounted for, or of a line that cannot be understood."""
-    schedule = field_schedule(tmp_path, HandClock())
-    schedule.open()
+    _, schedule = opened(tmp_path)
     news = ScheduleNews({"north": schedule}, lambda name, error: None)
     passed = {"event": "passed", "at": "2026-06-01T12:00:00Z", "after": "2026-06-01T12:00:00Z", "count": 0}
     schedule.ledger.append({**passed, "until": "2026-06-01T13:00:00Z"})

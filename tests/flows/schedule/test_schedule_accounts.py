@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from flows.schedule.due_runs import run_due
-from flows.schedule.ledger_state import moment_words
+from flows.schedule.field_schedule import moment_words
 from flows.schedule.rig_lock import RigLock
-from tests.flows.schedule.schedule_days import NOON, HandClock, accounted, field_schedule
+from tests.flows.schedule.schedule_days import NOON, HandClock, accounted, field_schedule, opened
 
 FIRST, SECOND, THIRD = (NOON + timedelta(minutes=20 * number) for number in (1, 2, 3))
 
@@ -18,9 +18,7 @@ FIRST, SECOND, THIRD = (NOON + timedelta(minutes=20 * number) for number in (1, 
 @pytest.mark.parametrize("back_s", [61, 120, 300])
 def test_a_clock_set_back_keeps_what_is_pending(tmp_path: Path, back_s: int) -> None:
     """A due time that waits to be begun waits also after that, and what was skipped before it is not due again."""
-    clock = HandClock()
-    schedule = field_schedule(tmp_path, clock)
-    schedule.open()
+    clock, schedule = opened(tmp_path)
     clock.sleep(45 * 60)
     assert schedule.pending() == [SECOND]
     clock.moment -= timedelta(seconds=back_s)
@@ -33,9 +31,7 @@ def test_a_clock_set_back_keeps_what_is_pending(tmp_path: Path, back_s: int) -> 
 
 def test_what_ended_is_not_due_again_after_the_clock_was_set_back(tmp_path: Path) -> None:
     """Neither what was done later than the clock shows now, nor what was done before."""
-    clock = HandClock()
-    schedule = field_schedule(tmp_path, clock)
-    schedule.open()
+    clock, schedule = opened(tmp_path)
     for due in (FIRST, SECOND):
         clock.moment = due
         schedule.begin(due)
@@ -50,9 +46,7 @@ def test_what_ended_is_not_due_again_after_the_clock_was_set_back(tmp_path: Path
 
 def test_a_run_that_ends_after_the_clock_was_set_back_hides_nothing(tmp_path: Path) -> None:
     """Its due time lies ahead then: those that come before it are due all the same."""
-    clock = HandClock()
-    schedule = field_schedule(tmp_path, clock)
-    schedule.open()
+    clock, schedule = opened(tmp_path)
     clock.moment = THIRD
     schedule.begin(THIRD)
     clock.moment = NOON + timedelta(minutes=10)
@@ -64,9 +58,7 @@ def test_a_run_that_ends_after_the_clock_was_set_back_hides_nothing(tmp_path: Pa
 
 def test_a_run_resumed_after_the_clock_was_set_back_hides_nothing(tmp_path: Path) -> None:
     """Another attempt at a due time that lies ahead then: those that come before it are due all the same."""
-    clock = HandClock()
-    schedule = field_schedule(tmp_path, clock)
-    schedule.open()
+    clock, schedule = opened(tmp_path)
     clock.moment = THIRD
     assert schedule.begin(THIRD) == 1
     clock.moment = NOON + timedelta(minutes=10)
@@ -78,9 +70,7 @@ def test_a_run_resumed_after_the_clock_was_set_back_hides_nothing(tmp_path: Path
 
 def test_a_clock_that_is_put_right_is_no_event(tmp_path: Path) -> None:
     """Less than a minute back: no line tells of it, and what was skipped stays skipped."""
-    clock = HandClock()
-    schedule = field_schedule(tmp_path, clock)
-    schedule.open()
+    clock, schedule = opened(tmp_path)
     clock.sleep(30 * 60 + 1)
     assert schedule.pending() == []
     lines = schedule.ledger.lines()
@@ -95,9 +85,7 @@ def test_a_clock_that_is_put_right_is_no_event(tmp_path: Path) -> None:
 
 def test_a_due_time_that_has_not_come_is_not_begun(tmp_path: Path) -> None:
     """Nor one that is none: only what is due, and not accounted for, begins."""
-    clock = HandClock()
-    schedule = field_schedule(tmp_path, clock)
-    schedule.open()
+    clock, schedule = opened(tmp_path)
     clock.moment = FIRST
     assert schedule.begin(SECOND) is None
     assert schedule.begin(FIRST - timedelta(minutes=1)) is None
@@ -107,9 +95,7 @@ def test_a_due_time_that_has_not_come_is_not_begun(tmp_path: Path) -> None:
 
 def test_what_very_many_due_times_passed_with_is_not_begun(tmp_path: Path) -> None:
     """One line accounts for all of them: none of them begins after it."""
-    clock = HandClock()
-    schedule = field_schedule(tmp_path, clock)
-    schedule.open()
+    clock, schedule = opened(tmp_path)
     clock.sleep(30 * 86400)
     schedule.pending()
     lines = schedule.ledger.lines()
@@ -121,9 +107,7 @@ def test_what_very_many_due_times_passed_with_is_not_begun(tmp_path: Path) -> No
 
 def test_the_newest_of_very_many_begins_at_once(tmp_path: Path) -> None:
     """Without a look before it: those that passed have their one line, and none of them another."""
-    clock = HandClock()
-    schedule = field_schedule(tmp_path, clock)
-    schedule.open()
+    clock, schedule = opened(tmp_path)
     clock.sleep(30 * 86400)
     assert schedule.begin(clock.now()) == 1
     assert [line["event"] for line in schedule.ledger.lines()] == ["opened", "passed", "begun"]
@@ -131,9 +115,7 @@ def test_the_newest_of_very_many_begins_at_once(tmp_path: Path) -> None:
 
 def test_an_ending_is_noted_once(tmp_path: Path) -> None:
     """The second is refused, and the ledger is as it was."""
-    clock = HandClock()
-    schedule = field_schedule(tmp_path, clock)
-    schedule.open()
+    clock, schedule = opened(tmp_path)
     clock.moment = FIRST
     schedule.begin(FIRST)
     assert schedule.end(FIRST, "failed", "no reply")
@@ -145,9 +127,7 @@ def test_an_ending_is_noted_once(tmp_path: Path) -> None:
 @pytest.mark.parametrize("ending", ["done", "skipped"])
 def test_a_later_run_in_the_place_of_an_earlier_one(tmp_path: Path, ending: str) -> None:
     """Where both may begin yet, and the later one does, or is skipped, the earlier one is skipped and told of."""
-    clock = HandClock()
-    schedule = field_schedule(tmp_path, clock, late=1.0)
-    schedule.open()
+    clock, schedule = opened(tmp_path, late=1.0)
     clock.moment = SECOND
     assert schedule.pending() == [FIRST, SECOND]
     if ending == "done":
@@ -162,9 +142,7 @@ def test_a_later_run_in_the_place_of_an_earlier_one(tmp_path: Path, ending: str)
 
 def test_an_ending_accounts_for_nothing_that_was_not_served(tmp_path: Path) -> None:
     """Once a schedule is closed nothing is due: a late ending has a line, and no due time before it has."""
-    clock = HandClock()
-    schedule = field_schedule(tmp_path, clock)
-    schedule.open()
+    clock, schedule = opened(tmp_path)
     schedule.close()
     clock.moment = THIRD
     assert schedule.end(SECOND, "skipped", "the rig was in use")
@@ -173,9 +151,7 @@ def test_an_ending_accounts_for_nothing_that_was_not_served(tmp_path: Path) -> N
 
 def test_an_earlier_run_leaves_the_later_one(tmp_path: Path) -> None:
     """Where both may begin, and they begin in turn, both are done."""
-    clock = HandClock()
-    schedule = field_schedule(tmp_path, clock, late=1.0)
-    schedule.open()
+    clock, schedule = opened(tmp_path, late=1.0)
     clock.moment = SECOND
     for due in (FIRST, SECOND):
         assert schedule.begin(due) == 1
@@ -185,9 +161,7 @@ def test_an_earlier_run_leaves_the_later_one(tmp_path: Path) -> None:
 
 def test_a_run_skipped_as_it_was_to_begin_says_why(tmp_path: Path) -> None:
     """Its outcome has the ending and the reason of the ledger."""
-    clock, lock = HandClock(), RigLock(tmp_path / "rig.lock")
-    schedule = field_schedule(tmp_path, clock)
-    schedule.open()
+    (clock, schedule), lock = opened(tmp_path), RigLock(tmp_path / "rig.lock")
     clock.sleep(30 * 60 + 1)
     outcome = run_due(schedule, FIRST, lock, lambda *given: tmp_path)
     assert outcome.ending == "skipped"
@@ -199,9 +173,7 @@ def test_a_run_skipped_as_it_was_to_begin_says_why(tmp_path: Path) -> None:
 
 def test_a_run_that_another_process_ended_is_told_as_that(tmp_path: Path) -> None:
     """Done by another is done, with its folder; nothing is surveyed again."""
-    clock, lock = HandClock(), RigLock(tmp_path / "rig.lock")
-    schedule = field_schedule(tmp_path, clock)
-    schedule.open()
+    (clock, schedule), lock = opened(tmp_path), RigLock(tmp_path / "rig.lock")
     clock.moment = FIRST
     schedule.begin(FIRST)
     schedule.end(FIRST, "done", run="runs/one")
@@ -213,9 +185,7 @@ def test_a_run_that_another_process_ended_is_told_as_that(tmp_path: Path) -> Non
 
 def test_a_run_that_cannot_be_resumed_before_the_next_is_left_open(tmp_path: Path) -> None:
     """While another holds the rig, until the next is due: it has no ending here, and the ledger gets no line."""
-    clock, other = HandClock(), RigLock(tmp_path / "rig.lock")
-    schedule = field_schedule(tmp_path, clock)
-    schedule.open()
+    (clock, schedule), other = opened(tmp_path), RigLock(tmp_path / "rig.lock")
     clock.moment = FIRST
     schedule.begin(FIRST)
     lines = schedule.ledger.lines()
@@ -228,9 +198,7 @@ def test_a_run_that_cannot_be_resumed_before_the_next_is_left_open(tmp_path: Pat
 
 def test_a_run_that_was_ended_meanwhile_is_told_as_the_ledger_has_it(tmp_path: Path) -> None:
     """The first ending holds, also for whoever surveyed on."""
-    clock, lock = HandClock(), RigLock(tmp_path / "rig.lock")
-    schedule = field_schedule(tmp_path, clock)
-    schedule.open()
+    (clock, schedule), lock = opened(tmp_path), RigLock(tmp_path / "rig.lock")
     clock.moment = FIRST
 
     def survey(field: str, due: datetime) -> Path:
@@ -243,9 +211,7 @@ def test_a_run_that_was_ended_meanwhile_is_told_as_the_ledger_has_it(tmp_path: P
 
 def test_what_came_due_while_it_was_being_stopped_is_not_due(tmp_path: Path) -> None:
     """Stopping takes its time; what was due before it was told to stop is accounted for, and nothing after that."""
-    clock = HandClock()
-    schedule = field_schedule(tmp_path, clock)
-    schedule.open()
+    clock, schedule = opened(tmp_path)
     clock.moment = SECOND + timedelta(seconds=9)
     schedule.close(SECOND - timedelta(seconds=9))
     lines = schedule.ledger.lines()

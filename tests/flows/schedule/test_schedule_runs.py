@@ -21,7 +21,7 @@ from flows.schedule.rig_lock import RigLock, rig_lock
 from flows.settings.survey_settings import Settings
 from pipeline.errors import ArchiveError, RigError
 from storage.archive.ledger import Ledger
-from tests.flows.schedule.schedule_days import NOON, HandClock, accounted, field_schedule
+from tests.flows.schedule.schedule_days import NOON, HandClock, accounted, field_schedule, opened
 
 FIELDS = ("north", "south", "west")
 ROOT = Path(__file__).parents[3]
@@ -82,9 +82,7 @@ def test_a_day_of_72_surveys_over_3_fields_in_turn(tmp_path: Path) -> None:
 
 def test_a_run_that_could_not_begin_in_time_is_skipped(tmp_path: Path) -> None:
     """Half of the interval after its time nothing begins; until then it does."""
-    clock = HandClock()
-    schedule = field_schedule(tmp_path, clock)
-    schedule.open()
+    clock, schedule = opened(tmp_path)
     clock.sleep(30 * 60)
     assert schedule.pending() == [NOON + timedelta(minutes=20)]
     clock.sleep(1)
@@ -95,9 +93,7 @@ def test_a_run_that_could_not_begin_in_time_is_skipped(tmp_path: Path) -> None:
 
 def test_a_rig_in_use_is_waited_for_until_it_is_too_late(tmp_path: Path) -> None:
     """Another survey that holds the rig: the run is skipped by rule, and the reason names the holder."""
-    clock, other = HandClock(), RigLock(tmp_path / "rig.lock")
-    schedule = field_schedule(tmp_path, clock)
-    schedule.open()
+    (clock, schedule), other = opened(tmp_path), RigLock(tmp_path / "rig.lock")
     clock.sleep(20 * 60)
     assert other.take("a survey by hand")
     outcome = run_due(schedule, clock.now(), RigLock(tmp_path / "rig.lock"), lambda *given: tmp_path)
@@ -151,9 +147,7 @@ def test_a_killed_run_fails_when_it_cannot_be_resumed(tmp_path: Path, wait_s: in
 
 def test_what_reaping_knows_better_is_the_reason(tmp_path: Path) -> None:
     """A run that the operator cancelled is not resumed."""
-    clock = HandClock()
-    schedule = field_schedule(tmp_path, clock)
-    schedule.open()
+    clock, schedule = opened(tmp_path)
     clock.sleep(20 * 60)
     schedule.begin(clock.now(), flow_run="abc")
     assert schedule.reap(lambda line: "cancelled" if line["flow_run"] == "abc" else None) == []
@@ -182,9 +176,7 @@ def test_one_failed_field_does_not_stop_the_others(tmp_path: Path) -> None:
 
 def test_what_was_due_while_nothing_served_is_skipped(tmp_path: Path) -> None:
     """A serve that died left the schedule open, and the next accounts for what it missed; one that closed did not."""
-    clock = HandClock()
-    schedule = field_schedule(tmp_path, clock)
-    schedule.open()
+    clock, schedule = opened(tmp_path)
     clock.sleep(65 * 60)
     schedule.open()
     assert [reason.split(" (")[0] for _, reason in endings(schedule)] == [NOT_SERVED] * 2  # the third may begin yet
@@ -197,9 +189,7 @@ def test_what_was_due_while_nothing_served_is_skipped(tmp_path: Path) -> None:
 
 def test_another_timetable_accounts_for_the_one_before(tmp_path: Path) -> None:
     """Due times of the old timetable end with it; those of the new one begin then."""
-    clock = HandClock()
-    schedule = field_schedule(tmp_path, clock)
-    schedule.open()
+    clock, schedule = opened(tmp_path)
     clock.sleep(21 * 60)
     other = field_schedule(tmp_path, clock, every="15m")
     other.open()
@@ -210,9 +200,7 @@ def test_another_timetable_accounts_for_the_one_before(tmp_path: Path) -> None:
 
 def test_very_many_missed_due_times_have_one_line(tmp_path: Path) -> None:
     """A machine that slept for a month does not write a line for each; the last one may still run."""
-    clock = HandClock()
-    schedule = field_schedule(tmp_path, clock)
-    schedule.open()
+    clock, schedule = opened(tmp_path)
     clock.sleep(30 * 86400 + 60)
     assert schedule.pending() == [NOON + timedelta(days=30)]
     lines = schedule.ledger.lines()
@@ -226,9 +214,7 @@ def test_very_many_missed_due_times_have_one_line(tmp_path: Path) -> None:
 
 def test_a_clock_from_the_far_future_and_back(tmp_path: Path) -> None:
     """What was passed over in a future that did not come is due when its time comes."""
-    clock = HandClock()
-    schedule = field_schedule(tmp_path, clock)
-    schedule.open()
+    clock, schedule = opened(tmp_path)
     clock.moment = NOON.replace(year=2099)
     schedule.pending()
     clock.moment = NOON + timedelta(minutes=5)

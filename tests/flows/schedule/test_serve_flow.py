@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from flows.schedule import fields as serve_fields
-from flows.schedule.fields import load_fields
-from flows.schedule.ledger_state import moment_words
+from flows.schedule import served as serve_fields
+from flows.schedule.field_schedule import moment_words
+from flows.schedule.serve_command import load_fields
 from flows.schedule.served import KEYS, NAMED_BY
 from flows.schedule.times import parse_timetable
 from storage.archive.archive import Archive
@@ -146,7 +146,8 @@ def test_one_reprocessing_at_a_time(
     on_server: Path, tmp_path: Path, field_file: Callable[..., Path], served: Callable[..., Path]
 ) -> None:
     """A second one of an archive is skipped and says why; the lock is free again after a run."""
-    from flows.schedule.prefect_flows import REPROCESS_LOCK, reprocess_archive
+    from flows.schedule.prefect_flows import reprocess_archive
+    from flows.schedule.watcher import REPROCESS_LOCK
 
     out = tmp_path / "archive"
     served(field_file(), every="1h")

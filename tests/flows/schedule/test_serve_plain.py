@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from flows.schedule.due_runs import Outcome
-from flows.schedule.plain_schedule import serve_plain
 from flows.schedule.rig_lock import RigLock
+from flows.schedule.serve_command import serve_plain
 from pipeline.errors import ArchiveError
 from storage.archive.ledger import Ledger
 from tests.flows.schedule.schedule_days import NOON, HandClock, field_schedule

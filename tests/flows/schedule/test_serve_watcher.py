@@ -16,10 +16,9 @@ from prefect.states import Cancelled, Completed, Pending, Running, State
 
 from flows.schedule import watcher as serve_watcher
 from flows.schedule.due_runs import Outcome
-from flows.schedule.field_schedule import FieldSchedule
-from flows.schedule.fields import ServedField, load_fields
-from flows.schedule.ledger_state import moment_words
-from flows.schedule.served import ServeRequest
+from flows.schedule.field_schedule import FieldSchedule, moment_words
+from flows.schedule.serve_command import load_fields
+from flows.schedule.served import ServedField, ServeRequest
 from flows.schedule.times import parse_timetable
 from flows.schedule.watcher import Watcher
 from pipeline.errors import ArchiveError
@@ -28,6 +27,7 @@ from storage.archive.ledger import Ledger
 from storage.archive.staging import take_lock
 from tests.flows.schedule.schedule_days import NOON, HandClock
 
+BUSY = {(1, 1, 0), (1, 0, 1), (2, 1, 1), (2, 2, 0), (3, 2, 0), (2, 0, 2)}  # limit, surveys, reprocessings
 EVERY = parse_timetable(None, "20m", "UTC")
 
 
@@ -84,13 +84,15 @@ class AClient:
         return [run for run in self.runs.values() if run.parameters["due"] == due][-1]
 
 
-def watcher(file: Path, clock: HandClock, client: AClient) -> tuple[Watcher, FieldSchedule, ServedField]:
-    """A watcher of one field, with its schedule open."""
+def watcher(file: Path, state: str = "CRASHED") -> tuple[HandClock, AClient, Watcher, FieldSchedule, ServedField]:
+    """A watcher of one field, with its schedule open since noon, and its clock and client."""
+    clock, client = HandClock(), AClient(state)
     (one,) = load_fields([file])
     schedule = one.schedule(EVERY, 0.5, clock)
     schedule.open()
     request = ServeRequest(fields=[one], timetable=EVERY, late=0.5)
-    return (Watcher(request, {one.name: schedule}, lambda words: None, lambda: nullcontext(client)), schedule, one)
+    watch = Watcher(request, {one.name: schedule}, lambda words: None, lambda: nullcontext(client))
+    return clock, client, watch, schedule, one
 
 
 def two_rigs(
@@ -107,8 +109,7 @@ def two_rigs(
 
 def test_each_due_time_has_one_run_ahead_of_it(field_file: Callable[..., Path]) -> None:
     """However often it is looked, and whoever looks: no due time is asked for twice, none is left out."""
-    clock, client = HandClock(), AClient()
-    watch, schedule, _ = watcher(field_file(), clock, client)
+    clock, client, watch, schedule, _ = watcher(field_file())
     for _ in range(3 * 60 * 4):
         clock.sleep(15)
         watch.look()
@@ -126,8 +127,7 @@ def test_each_due_time_has_one_run_ahead_of_it(field_file: Callable[..., Path]) 
 
 def test_what_is_accounted_for_is_taken_back(field_file: Callable[..., Path]) -> None:
     """A run that was skipped by rule has no process started for it any more, and says why; others stay."""
-    clock, client = HandClock(), AClient()
-    watch, _, _ = watcher(field_file(), clock, client)
+    clock, client, watch, _, _ = watcher(field_file())
     watch.look()
     clock.sleep(31 * 60)
     watch.look()
@@ -139,8 +139,7 @@ def test_what_is_accounted_for_is_taken_back(field_file: Callable[..., Path]) ->
 
 def test_a_run_under_way_is_left_alone(field_file: Callable[..., Path]) -> None:
     """While its rig is held, neither its own run nor one that waits for the rig is taken back or made again."""
-    clock, client = HandClock(), AClient()
-    watch, schedule, one = watcher(field_file(), clock, client)
+    clock, client, watch, schedule, one = watcher(field_file())
     watch.look()
     clock.sleep(20 * 60)
     lock = one.lock()
@@ -156,8 +155,7 @@ def test_a_run_under_way_is_left_alone(field_file: Callable[..., Path]) -> None:
 
 def test_a_run_that_somebody_cancelled_is_skipped(field_file: Callable[..., Path]) -> None:
     """On Prefect's pages, before it began: the ledger says so when it is due, and it is not made again."""
-    clock, client = HandClock(), AClient()
-    watch, schedule, _ = watcher(field_file(), clock, client)
+    clock, client, watch, schedule, _ = watcher(field_file())
     watch.look()
     client.run_of("2026-06-01T12:20:00Z").state = Cancelled()
     clock.sleep(10 * 60)
@@ -176,8 +174,7 @@ def test_a_run_that_somebody_cancelled_is_skipped(field_file: Callable[..., Path
 @pytest.mark.parametrize("stopped", [1, 5])
 def test_a_schedule_that_is_stopped_leaves_nothing_to_begin(field_file: Callable[..., Path], stopped: int) -> None:
     """However often it is stopped and served again, what is due next has a run."""
-    clock, client = HandClock(), AClient()
-    watch, _, _ = watcher(field_file(), clock, client)
+    _, client, watch, _, _ = watcher(field_file())
     for _ in range(stopped):
         watch.look()
         watch.stop()
@@ -188,8 +185,7 @@ def test_a_schedule_that_is_stopped_leaves_nothing_to_begin(field_file: Callable
 
 def test_a_field_that_prefect_does_not_know_yet(field_file: Callable[..., Path]) -> None:
     """The runner tells of it some seconds after its start: nothing is told, and the next look comes soon."""
-    clock, client, told = HandClock(), AClient(), list[str]()
-    watch, _, _ = watcher(field_file(), clock, client)
+    (_, client, watch, _, _), told = watcher(field_file()), list[str]()
     watch.tell, client.known = told.append, False
     assert not watch.look()
     client.known = True
@@ -202,8 +198,7 @@ def test_a_crashed_run_is_resumed_a_cancelled_one_is_not(
     field_file: Callable[..., Path], state: str, resumed: bool
 ) -> None:
     """While its lock is held it lives; when that is free it is asked for again, unless somebody cancelled it."""
-    clock, client = HandClock(), AClient(state)
-    watch, schedule, one = watcher(field_file(), clock, client)
+    clock, client, watch, schedule, one = watcher(field_file(), state)
     clock.sleep(20 * 60)
     lock = one.lock()
     assert lock.take("a survey")
@@ -239,9 +234,7 @@ def test_notice_is_given_of_whatever_the_ledger_says(
     field_file: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also of a due time that nobody began and of a run that died: once each, in the words of the terminal."""
-    clock, noted = HandClock(), []
-    told: list[str] = []
-    watch, schedule, _ = watcher(field_file(), clock, AClient())
+    (clock, _, watch, schedule, _), told, noted = watcher(field_file()), list[str](), []
     watch.tell, watch.request = told.append, replace(watch.request, notify="http://127.0.0.1:9/")
 
     def note(address: str | None, outcome: Outcome, archive: str) -> bool:
@@ -266,8 +259,7 @@ def test_notice_is_given_of_whatever_the_ledger_says(
 
 def test_a_server_that_is_away_is_told_of(field_file: Callable[..., Path]) -> None:
     """What it could not be asked for it is asked for at the next look."""
-    clock, client, told = HandClock(), AClient(), list[str]()
-    watch, _, _ = watcher(field_file(), clock, client)
+    (clock, client, watch, _, _), told = watcher(field_file()), list[str]()
     watch.tell, here = told.append, watch.client_of
 
     def away() -> Any:
@@ -285,8 +277,7 @@ def test_a_server_that_is_away_is_told_of(field_file: Callable[..., Path]) -> No
 @pytest.mark.parametrize("begins", [True, False])
 def test_what_has_begun_is_not_unheard(field_file: Callable[..., Path], begins: bool) -> None:
     """Two minutes after it was due, what has not begun is told of once; a process that is gone is given up."""
-    clock, client = HandClock(), AClient()
-    watch, schedule, _ = watcher(field_file(), clock, client)
+    clock, client, watch, schedule, _ = watcher(field_file())
     watch.look()
     clock.sleep(20 * 60)
     due = clock.now()
@@ -307,8 +298,7 @@ def test_what_has_begun_is_not_unheard(field_file: Callable[..., Path], begins: 
 
 def test_a_resumed_run_is_heard_when_it_begins_again(field_file: Callable[..., Path]) -> None:
     """That it had begun once, before it was asked for, is no sign of life; that it was skipped or failed is the end."""
-    clock, client, told = HandClock(), AClient(), list[str]()
-    watch, schedule, _ = watcher(field_file(), clock, client)
+    (clock, client, watch, schedule, _), told = watcher(field_file()), list[str]()
     watch.tell = told.append
     clock.sleep(20 * 60)
     due = clock.now()
@@ -373,26 +363,26 @@ def test_a_field_that_cannot_be_read_is_told_of_and_the_others_go_on(
 
 
 @pytest.mark.parametrize(
-    ("limit", "looking", "reprocessing", "busy"),
+    ("limit", "looking", "reprocessing"),
     [
-        (1, 0, 0, False),
-        (1, 1, 0, True),
-        (1, 0, 1, True),
-        (2, 1, 0, False),
-        (2, 0, 1, False),
-        (2, 1, 1, True),
-        (2, 2, 0, True),
-        (3, 1, 1, False),
-        (3, 2, 0, True),
-        (3, 0, 2, False),
-        (2, 0, 2, True),
+        (1, 0, 0),
+        (1, 1, 0),
+        (1, 0, 1),
+        (2, 1, 0),
+        (2, 0, 1),
+        (2, 1, 1),
+        (2, 2, 0),
+        (3, 1, 1),
+        (3, 2, 0),
+        (3, 0, 2),
+        (2, 0, 2),
     ],
 )
 def test_who_would_have_to_wait(
-    field_file: Callable[..., Path], tmp_path: Path, limit: int, looking: int, reprocessing: int, busy: bool
+    field_file: Callable[..., Path], tmp_path: Path, limit: int, looking: int, reprocessing: int
 ) -> None:
     """A survey waits where all rigs are in use, or as much runs, reprocessing included, as may run at a time."""
-    from flows.schedule.prefect_flows import REPROCESS_LOCK
+    from flows.schedule.watcher import REPROCESS_LOCK
 
     watch, _ = two_rigs(field_file, tmp_path, HandClock(), AClient(), limit)
     with ExitStack() as held:
@@ -404,13 +394,12 @@ def test_who_would_have_to_wait(
             release = take_lock(one.archive / ".locks" / REPROCESS_LOCK, wait=False)
             assert release is not None
             held.callback(release)
-        assert watch.busy() is busy
+        assert watch.busy() is ((limit, looking, reprocessing) in BUSY)
 
 
 def test_after_an_outage_there_is_one_notice(field_file: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:
     """Every due time that was missed is told, and one notice counts them."""
-    clock, told, noted = HandClock(), list[str](), list[str]()
-    watch, _, _ = watcher(field_file(), clock, AClient())
+    (clock, _, watch, _, _), told, noted = watcher(field_file()), list[str](), list[str]()
     watch.tell = told.append
     monkeypatch.setattr(serve_watcher, "send_notice", lambda address, outcome, archive: noted.append(outcome.words()))
     clock.sleep(33 * 3600 + 15 * 60)

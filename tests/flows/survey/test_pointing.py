@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from flows.publish.finding_words import sentences
+from flows.publish.receipt_table import sentences
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from flows.survey.stages.class_map import patch_columns

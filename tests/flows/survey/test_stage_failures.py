@@ -19,8 +19,8 @@ import pytest
 
 from flows.cli.main import main
 from flows.publish import run_folder as publish
-from flows.schedule.fields import load_fields
-from flows.schedule.ledger_state import moment_words
+from flows.schedule.field_schedule import moment_words
+from flows.schedule.serve_command import load_fields
 from flows.schedule.times import parse_timetable
 from flows.survey import prefect_engine as engine
 from flows.survey.stage import Stage, Wanted

@@ -16,7 +16,7 @@ from rich.console import Console
 from flows.survey import prefect_engine as engine
 from flows.survey.stages import accuracy as evaluation
 from flows.survey.survey import STAGES
-from flows.terminal.termination import Terminated
+from flows.terminal.processes import Terminated
 from pipeline.errors import RigError, SceneError
 from storage.archive.archive import Archive
 from storage.remote.opening import verify_archive

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from flows.schedule.runner import own_temporary_folder
-from flows.terminal.cache_places import place_caches, place_pages
+from flows.terminal.processes import place_caches, place_pages
 from pipeline.errors import SettingsError
 
 ROOT = Path(__file__).parents[3]

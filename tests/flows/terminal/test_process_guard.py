@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from flows.terminal import process_guard
-from flows.terminal.process_guard import KeptProcess, end_with_us
+from flows.terminal import processes
+from flows.terminal.processes import KeptProcess, end_with_us
 from tests.soak.processes import children_of, is_alive
 
 SLEEPS = [sys.executable, "-c", "import time; print('up', flush=True); time.sleep(60)"]
@@ -24,7 +24,7 @@ DEAF = [
 ]
 ENDS = """
 import os, signal, subprocess, sys
-from flows.terminal.process_guard import end_with_us
+from flows.terminal.processes import end_with_us
 child = subprocess.Popen(["sleep", "60"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 let_go = end_with_us(child.pid)
 if "let go" in sys.argv:
@@ -135,7 +135,7 @@ def test_a_log_that_has_grown_is_begun_anew(kept: KeptProcess, monkeypatch: pyte
     kept.keep_up()
     kept.stop()
     assert kept.log.read_text().startswith("before\n")
-    monkeypatch.setattr(process_guard, "LARGEST_LOG", 3)
+    monkeypatch.setattr(processes, "LARGEST_LOG", 3)
     kept.keep_up()
     kept.stop()
     assert "before" not in kept.log.read_text()

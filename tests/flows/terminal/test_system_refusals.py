@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from flows.terminal.termination import refusal_words
+from flows.terminal.processes import refusal_words
 
 ROOT = Path(__file__).parents[3]
 

@@ -16,11 +16,13 @@ from rich.progress import Progress
 from rich.table import Table
 from rich.tree import Tree
 
-from flows.publish.pages import render_markdown
+from flows.publish.report import render_markdown
 from flows.schedule.field_history import FieldHistory
 from flows.schedule.history_page import render_history, render_index
 from flows.terminal.shown_text import Terminal
 from pipeline.errors import is_visible
+from flows.terminal.progress import Terminal
+from pipeline.visible_text import is_visible
 from storage.archive.whole_files import to_json
 
 HOSTILE = "field\x1b]0;owned\x07\x1b[2J\u202egnp.map\x9b31m\u2028\udcff"
@@ -135,6 +137,6 @@ def test_every_console_is_a_terminal() -> None:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Console":
                 made.append(path.name)
-            if isinstance(node, ast.ImportFrom) and node.module in ("html", "jinja2") and path.name != "pages.py":
+            if isinstance(node, ast.ImportFrom) and node.module in ("html", "jinja2") and path.name != "report.py":
                 made.append(path.name)
     assert made == []

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flows.archive.compare_command import find_run, run_compare
+from flows.archive.compare_command import compare, find_run
 from flows.archive.stale_runs import asked_again, newest_runs
 from flows.settings.load import load_settings, parse_settings
 from flows.settings.survey_settings import Settings
@@ -89,7 +89,7 @@ def test_runs_of_the_removed_farm_are_told_apart(tmp_path: Path) -> None:
     keys = [f"farm@1/seed={seed}/shape=8x8/bands=9" for seed in (0, 1)]
     made = [_publish(archive, key, scene=REMOVED_LAW) for key in keys]
     with pytest.raises(SceneError, match="of different fields"):
-        run_compare(tmp_path, *made)
+        compare(tmp_path, *made)
 
 
 def test_night_is_refused_before_anything_is_drawn() -> None:
@@ -134,9 +134,9 @@ def test_days_of_one_land_are_compared(tmp_path: Path) -> None:
     catalogue = Catalogue.read(tmp_path)
     assert find_run(catalogue, "previous").folder.name == made[0]
     with pytest.raises(SceneError, match="of different fields"):
-        run_compare(tmp_path, made[1], made[2])
+        compare(tmp_path, made[1], made[2])
     with pytest.raises(ArchiveError, match="missing or damaged"):  # of one field: it comes as far as the maps
-        run_compare(tmp_path, made[0], made[2])
+        compare(tmp_path, made[0], made[2])
 
 
 def test_a_farm_is_asked_for_again_by_its_law(tmp_path: Path) -> None:

@@ -1,0 +1,234 @@
+"""This process and those it starts: what ends it, what the machine refuses it, caches without a home, children."""
+
+from __future__ import annotations
+
+import atexit
+import importlib.util
+import os
+import pwd
+import resource
+import shutil
+import signal
+import stat
+import subprocess
+import tempfile
+import threading
+from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import FrameType
+
+from pipeline.errors import SettingsError
+from storage.archive.staging import disk_advice
+
+DONE, FAILED, PARTLY = 0, 1, 3  # exit codes
+TERMINATED = 128 + signal.SIGTERM  # as a shell tells of a command that SIGTERM ended
+
+
+class Terminated(KeyboardInterrupt):
+    """The process was told to end. All that clears up after Ctrl-C clears up after it."""
+
+
+@contextmanager
+def terminable(*, last: bool = False) -> Iterator[None]:
+    """Raise `Terminated` in the main thread where SIGTERM comes while the block runs; other threads are left alone.
+
+    Where the block is the ``last`` that the process does, its exit code stands then: SIGTERM has no effect any more.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, _terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN if last else before)
+
+
+def _terminate(number: int, frame: FrameType | None) -> None:
+    raise Terminated
+
+
+# Of exceptions that are no MemoryError: of torch and of threads; and, where memory is limited, of the loader.
+_OF_MEMORY = ("can't allocate memory", "not enough memory", "can't start new thread", "cannot allocate memory")
+_OF_LIMITED_MEMORY = ("failed to map segment", "could not find/load shared object")
+
+
+def refusal_words(error: BaseException) -> str | None:
+    """What was refused and what to do; None where the error is something else."""
+    text, limit = str(error), resource.getrlimit(resource.RLIMIT_AS)[0]
+    limited = limit != resource.RLIM_INFINITY
+    known = (*_OF_MEMORY, *(_OF_LIMITED_MEMORY if limited else ()))
+    if isinstance(error, MemoryError) or any(words in text.lower() for words in known):
+        allowed = f"; this process may take {limit / 1e9:.1f} GB (ulimit -v)" if limited else ""
+        told = text.partition(". ")[0].rstrip(".") or "the machine has no more"
+        return (
+            f"memory ran out: {told}{allowed}. Make room or raise the limit, or ask for less: a smaller scene, fewer "
+            f"--bands, less --memory, fewer --workers"
+        )
+    if isinstance(error, OSError) and (advice := disk_advice(error)) is not None:
+        where = f" {error.filename}" if error.filename else ""
+        return f"the system refused to read or write{where}: {advice}"
+    return None
+
+
+NO_HOME = "/nonexistent"  # as Debian calls the home of users that have none
+OF_LIBRARIES = {"NUMBA_CACHE_DIR": "numba", "MPLCONFIGDIR": "matplotlib"}  # those that ask for more than XDG's folder
+
+
+def place_caches(environment: MutableMapping[str, str] | None = None) -> Path | None:
+    """Name a private folder in the environment, for this process and those that it starts, where it is needed.
+
+    It is `spectralzoom-UID` in the temporary folder, so that the next process finds what this one compiled: where it
+    is not ours alone, a new one that goes with this process. What is in it is run as code, so nobody else may write it.
+    ``environment`` is this process's own unless given.
+
+    Returns
+    -------
+    The folder, or None where the usual one (XDG_CACHE_HOME, or ~/.cache) can be written.
+
+    Raises
+    ------
+    SettingsError : nothing can be written, the temporary folder included.
+    """
+    environment = os.environ if environment is None else environment
+    try:
+        home = environment.get("HOME") or pwd.getpwuid(os.getuid()).pw_dir
+    except KeyError:
+        home = None
+    if not home:
+        environment["HOME"] = NO_HOME  # Prefect asks for one before anybody tells it where to keep its files
+    usual = _usual_folder(environment)
+    with suppress(OSError):
+        if usual is not None:
+            usual.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if os.access(usual, os.W_OK | os.X_OK):
+                return None
+    folder = _private_folder(usual)
+    environment["XDG_CACHE_HOME"] = str(folder)
+    for name, part in OF_LIBRARIES.items():
+        environment.setdefault(name, str(folder / part))
+    return folder
+
+
+def place_pages(environment: Mapping[str, str] | None = None) -> dict[str, str]:
+    """Tell Prefect's server to unpack its pages into the cache folder, where it cannot do so beside its own code."""
+    found = importlib.util.find_spec("prefect")
+    places = [] if found is None else [Path(place) / "server" for place in found.submodule_search_locations or ()]
+    folder = _usual_folder(os.environ if environment is None else environment)
+    if folder is None or all(os.access(place, os.W_OK | os.X_OK) for place in places):
+        return {}
+    return {"PREFECT_SERVER_UI_STATIC_DIRECTORY": str(folder / "spectralzoom" / "prefect-pages")}
+
+
+def _usual_folder(environment: Mapping[str, str]) -> Path | None:
+    """Where caches belong; None where there is no home to hold them."""
+    named = Path(environment.get("XDG_CACHE_HOME", ""))
+    if named.is_absolute():
+        return named
+    home = Path(environment.get("HOME") or pwd.getpwuid(os.getuid()).pw_dir)
+    return home / ".cache" if home.is_absolute() and home.is_dir() else None
+
+
+def _private_folder(usual: Path | None) -> Path:
+    try:
+        folder = Path(tempfile.gettempdir()) / f"spectralzoom-{os.geteuid()}"
+        with suppress(FileExistsError):
+            folder.mkdir(mode=0o700)
+        found = folder.lstat()  # a folder, no link, that this user owns and no other may enter
+        if stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid() and not found.st_mode & 0o077:
+            return folder
+        other = Path(tempfile.mkdtemp(prefix="spectralzoom-"))
+    except OSError as error:
+        raise SettingsError(
+            f"no folder for what libraries keep: neither {usual or 'a home'} nor a temporary folder can be written "
+            f"({error}); set XDG_CACHE_HOME to a folder that this user can write"
+        ) from None
+    atexit.register(shutil.rmtree, other, ignore_errors=True)
+    return other
+
+
+LARGEST_LOG = 10_000_000  # bytes; a larger one is begun anew
+
+
+def end_with_us(process: int) -> Callable[[], None]:
+    """Have a process ended (SIGTERM) when this one is gone, however it went.
+
+    Gives what lets the process go. It is to be called as soon as the process has been waited for: from then on its
+    number may be that of another.
+    """
+    reading, writing = os.pipe()  # the system closes the end held here, and the shell's read fails
+    words = ["sh", "-c", 'read -r nothing || kill "$0" 2>/dev/null', str(process)]
+    try:
+        guard = os.posix_spawn(
+            "/bin/sh", words, os.environ, file_actions=[(os.POSIX_SPAWN_DUP2, reading, 0)], setpgroup=0
+        )
+    except OSError:
+        os.close(writing)
+        raise
+    finally:
+        os.close(reading)
+
+    def let_go() -> None:
+        with suppress(OSError):  # a guard that is gone already
+            os.write(writing, b"\n")
+        os.close(writing)
+        with suppress(ChildProcessError):
+            os.waitpid(guard, 0)
+
+    return let_go
+
+
+class KeptProcess:
+    """A process that ends with this one and is started again where it has died; what it says goes to ``log``.
+
+    ``patience_s`` is how long it may take to end when it is told to [s]; ``environment`` is added to that of this one.
+    """
+
+    def __init__(
+        self, command: Sequence[str], log: Path, patience_s: float, environment: Mapping[str, str] | None = None
+    ) -> None:
+        self.log = log
+        self._command, self._patience_s, self._environment = list(command), patience_s, dict(environment or {})
+        self._process: subprocess.Popen[bytes] | None = None
+        self._let_go: Callable[[], None] | None = None
+
+    def keep_up(self) -> bool:
+        """Start it where it does not run; whether it was started."""
+        if self.runs():
+            return False
+        self.log.parent.mkdir(parents=True, exist_ok=True)
+        grown = self.log.exists() and self.log.stat().st_size > LARGEST_LOG
+        with self.log.open("wb" if grown else "ab") as log:
+            self._process = subprocess.Popen(
+                self._command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env={**os.environ, **self._environment}
+            )
+        self._let_go = end_with_us(self._process.pid)
+        return True
+
+    def runs(self) -> bool:
+        """Whether it was started and has not ended."""
+        if self._process is not None and self._process.poll() is not None:
+            self._forget()
+        return self._process is not None
+
+    def restart(self) -> None:
+        """End it and start it again; processes that it has started go on by themselves."""
+        self.stop()
+        self.keep_up()
+
+    def stop(self) -> None:
+        """End it."""
+        if self._process is not None and self.runs():
+            self._process.terminate()
+            try:
+                self._process.wait(self._patience_s)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+        self._forget()
+
+    def _forget(self) -> None:
+        let_go, self._let_go, self._process = self._let_go, None, None
+        if let_go is not None:
+            let_go()
