@@ -13,9 +13,9 @@ import numpy as np
 
 from flows.evaluate.frames import Candidate, Sight, file_key
 from flows.evaluate.rows import Seats, Trial, cost_of, fine_samples, judge_map
-from models.network.cost import MultiplyAdds, multiply_adds
+from models.network.cost import MultiplyAdds, control_multiply_adds, multiply_adds
 from models.policies.policies import score_seats
-from models.reading.control_maps import control_multiply_adds, draw_with_control
+from models.reading.control_maps import draw_with_control
 from models.reading.inference import Glance
 from models.weights.files import AnyWeights, describe_weights
 from pipeline.errors import SettingsError

@@ -10,7 +10,7 @@ import numpy as np
 from flows.evaluate.frames import Look
 from flows.evaluate.rows import Seats
 from models.evaluation.metrics import confusion
-from models.policies.free_seats import RANDOM_DRAWS
+from models.evaluation.placement import RANDOM_DRAWS
 from models.policies.policies import score_seats
 from models.reading.inference import segment
 from models.weights.files import Weights

@@ -10,11 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.evaluate.frames import Look, Sight
-from models.evaluation.boundary import boundary_counts
-from models.evaluation.metrics import confusion
-from models.evaluation.placement_metrics import average_precision, gain_sums, oracle_gain, rank_correlation, top_seats
+from models.evaluation.metrics import boundary_counts, confusion
+from models.evaluation.placement import (
+    RANDOM_DRAWS,
+    average_precision,
+    gain_sums,
+    oracle_gain,
+    rank_correlation,
+    top_seats,
+)
 from models.network.cost import MultiplyAdds, multiply_adds
-from models.policies.free_seats import RANDOM_DRAWS
 from models.policies.policies import score_seats
 from models.reading.inference import segment
 from models.weights.files import Weights

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from flows.survey.region_work import Drawing, Scoring, Strange, WeightsFile
 from flows.survey.run import SurveyRun, weights_path
-from models.network.vgg_sizes import saliency_bytes
+from models.network.sizes import saliency_bytes
 from models.policies.policies import IMAGE_POLICIES
 from models.policies.vgg_file import VggFile
 from models.reading.regions import HALO_CELLS, REGION_PX, Region, most_bytes, plan_regions, whole_field

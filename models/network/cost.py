@@ -5,8 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 
-from models.network.sizes import BOTTOM, SCORER_WIDTH, SegmenterConfig, level_widths, scorer_inputs
-from models.network.vgg_sizes import saliency_multiply_adds
+from models.network.sizes import (
+    BOTTOM,
+    SCORER_WIDTH,
+    SegmenterConfig,
+    level_widths,
+    saliency_multiply_adds,
+    scorer_inputs,
+)
 from pipeline.geometry.grid import SceneGrid
 
 

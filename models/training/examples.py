@@ -50,9 +50,7 @@ def observe(
 
     Goes in strips of rows; each strip draws its noise from a stream of its own.
 
-    Raises
-    ------
-    SceneError : the scene has no labels.
+    Raises SceneError where the scene has no labels.
     """
     if scene.labels is None:
         raise SceneError(f"scene {scene.name} has no labels; training needs them")

@@ -16,12 +16,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from models.baselines.designs import Network, build_network
+from models.network.controls import Network, build_network
 from models.network.process import keep_freed_memory
 from models.network.sizes import SegmenterConfig
-from models.training.checkpoint import load_checkpoint, save_checkpoint
 from models.training.examples import Batch, CropSampler, Example
 from models.training.objective import PHASES, batch_loss, class_weights, phase_at
+from models.weights.sealed_files import load_checkpoint, save_checkpoint
 from pipeline.errors import PipelineError, WeightsError
 from pipeline.geometry.grid import UNLABELLED
 
@@ -113,9 +113,7 @@ class Trainer:
     def step(self, done: float) -> None:
         """Take one step of a run that is ``done`` so far (0..1): the learning rate follows from it.
 
-        Raises
-        ------
-        TrainingError : the loss or its gradient was not finite three steps in a row.
+        Raises TrainingError where the loss or its gradient was not finite three steps in a row.
         """
         course = self.course
         for group in self.optimiser.param_groups:
@@ -215,18 +213,11 @@ def train(
     The same settings and examples start from the same weights and draw the same crops and seats. What follows is equal
     to rounding only: sums differ in their last bit with where memory lies, and ``minutes`` may end the run elsewhere.
 
-    Parameters
-    ----------
-    start
-        Named tensors that the network begins with; others are drawn.
-    checkpoint
-        File that the state is kept in; a killed run of the same settings and examples goes on from it.
+    ``start``: Named tensors that the network begins with; others are drawn. ``checkpoint``: File that the state is kept
+    in; a killed run of the same settings and examples goes on from it.
 
-    Raises
-    ------
-    TrainingError : the loss or its gradient was not finite three steps in a row; the last batch is kept beside the
-        checkpoint.
-    WeightsError : a tensor of ``start`` that the network has no place for.
+    Raises TrainingError where: the loss or its gradient was not finite three steps in a row; the last batch is kept
+    beside the checkpoint. WeightsError : a tensor of ``start`` that the network has no place for.
     """
     keep_freed_memory()
     trainer = Trainer(config, examples, gain_shift, settings, start)

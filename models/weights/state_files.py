@@ -39,10 +39,8 @@ PREFIX = "module."  # what training on several devices puts before every name
 def read_state(path: Path) -> dict[str, Tensor]:
     """Read named tensors of a ``.safetensors`` file or of one that torch saved; wrappers around them are opened.
 
-    Raises
-    ------
-    WeightsError : missing, cut short, no tensors in it, one larger than the file, or it holds Python objects, which are
-        refused unread.
+    Raises WeightsError for a file that is missing, cut short, without tensors or with one larger than itself, or that holds
+    Python objects, which are refused unread.
     """
     if not path.is_file():
         raise WeightsError(f"no file of weights at {path}; give the path of a .safetensors or .pth file")
@@ -65,9 +63,7 @@ def _check_extent(state: Mapping[str, Tensor], path: Path) -> None:
 def read_notes(path: Path) -> dict[str, str]:
     """Texts that lie beside the tensors of a file: safetensors' own, or entries of what torch saved, by their names.
 
-    Raises
-    ------
-    WeightsError : as `read_state`.
+    Raises WeightsError as `read_state`.
     """
     if path.suffix != ".safetensors":
         content = _read(path)
@@ -105,9 +101,7 @@ def _first_line(error: Exception) -> str:
 def unwrap_state(content: object, place: str) -> dict[str, Tensor]:
     """Give the named tensors inside ``model``, ``state_dict`` and the like, without prefixes of parallel training.
 
-    Raises
-    ------
-    WeightsError : no named tensors; says what there is instead.
+    Raises WeightsError where there are no named tensors; says what there is instead.
     """
     inside = content
     while isinstance(inside, Mapping):
@@ -136,9 +130,7 @@ class Variant:
 def read_variant(checkpoint: Path) -> Variant:
     """Read ``variant.yml`` beside a Segmenter checkpoint.
 
-    Raises
-    ------
-    WeightsError : it is missing, damaged, or lacks an entry (named).
+    Raises WeightsError where it is missing, damaged, or lacks an entry (named).
     """
     path = checkpoint.with_name("variant.yml")
     try:

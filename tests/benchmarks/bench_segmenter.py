@@ -15,7 +15,7 @@ from measure import Clock, Row, ratio, time_in_turn
 from numpy.typing import NDArray
 
 from models.network.cost import multiply_adds
-from models.network.encoder import Encoder, Memory
+from models.network.layers import Encoder, Memory
 from models.network.process import keep_freed_memory, one_thread
 from models.network.segmenter import Segmenter, SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis

@@ -14,9 +14,9 @@ from typing import Any
 
 import torch
 
-from models.training.checkpoint import load_checkpoint, save_checkpoint
 from models.training.start_weights import StartFile
 from models.weights.files import content_key, load_any_weights, save_weights
+from models.weights.sealed_files import load_checkpoint, save_checkpoint
 from pipeline.errors import WeightsError
 from tests.conftest import RGB_NM, random_weights
 from tests.faults.fault_table import Clock, Row

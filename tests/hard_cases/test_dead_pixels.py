@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 import torch
 
-from models.evaluation.placement_metrics import oracle_gain
-from models.network.dead_pixels import fill_dead
+from models.evaluation.placement import oracle_gain
 from models.network.segmenter import Segmenter, SegmenterConfig
-from models.network.spectral import Normalisation, SpectralBasis
+from models.network.spectral import Normalisation, SpectralBasis, fill_dead
 from models.policies.policies import score_seats
 from models.reading.inference import CoarseLook, Glance, glance, look_coarsely, segment
 from models.weights.files import Weights

@@ -17,10 +17,9 @@ import torch
 from torch import Tensor
 
 from models.evaluation.metrics import average_accuracy, confusion, iou_per_class, kappa, mean_iou, overall_accuracy
-from models.network.encoder import Encoder
+from models.network.layers import Encoder, code_1d, code_2d
 from models.network.segmenter import Segmenter, SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
-from models.network.tokens import code_1d, code_2d
 from models.policies.policies import pixel_entropy, score_seats
 from models.reading.inference import Glance, check_seats, glance, glance_of_columns, segment
 from models.training import train as training

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from models.baselines.designs import build_network
+from models.network.controls import build_network
 from models.network.segmenter import Segmenter, SegmenterConfig
 from models.network.sizes import PRESETS, Preset
 from models.network.spectral import Normalisation, SpectralBasis

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from flows.settings.load import load_settings, parse_settings
-from models.network.vgg import VggFeatures
-from models.network.vgg_sizes import saliency_multiply_adds
+from models.network.sizes import saliency_multiply_adds
+from models.policies.vgg import VggFeatures
 from models.weights.files import describe_weights
 from pipeline.errors import SettingsError, WeightsError
 

@@ -9,12 +9,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from models.baselines.dense import DenseNetwork, cut, joined
-from models.baselines.designs import build_network
-from models.baselines.paper import PaperNetwork
+from models.network.controls import DenseNetwork, PaperNetwork, build_network, cut, joined
+from models.network.layers import code_1d
 from models.network.segmenter import Segmenter
 from models.network.sizes import PRESETS, Preset, SegmenterConfig
-from models.network.tokens import code_1d
 from pipeline.errors import ShapeError
 
 SMALL = {"classes": 3, "columns": 4, "patch": 8, "factor": 2, "width": 8, "dim": 16, "layers": 1, "heads": 2}

@@ -8,8 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from models.evaluation.boundary import boundary_counts, boundary_iou, boundary_px, mean_boundary_iou, near_border
-from models.evaluation.metrics import confusion, labelled_classes
+from models.evaluation.metrics import (
+    boundary_counts,
+    boundary_iou,
+    boundary_px,
+    confusion,
+    labelled_classes,
+    mean_boundary_iou,
+    near_border,
+)
 from pipeline.errors import ShapeError
 
 MAPS = arrays(np.uint8, (7, 9), elements=st.sampled_from([0, 1, 2, 255]))

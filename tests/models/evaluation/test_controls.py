@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from models.evaluation.metrics import agreement, confusion, mean_iou
-from models.policies.free_seats import RANDOM_DRAWS, Controls, run_controls
+from models.evaluation.placement import RANDOM_DRAWS, Controls, run_controls
 from models.reading.inference import Glance, glance_of_columns, segment
 from models.weights.files import Weights
 from pipeline.geometry.grid import SceneGrid

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from models.network.encoder import Encoder, TokenAttention
+from models.network.layers import Encoder, TokenAttention
 from pipeline.errors import ShapeError
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from models.network.pixel_side import ChannelNorm, PatchHead, PatchStem, level_widths
+from models.network.layers import ChannelNorm, PatchHead, PatchStem
+from models.network.sizes import level_widths
 from pipeline.errors import ShapeError
 
 

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from models.network.scorer import SeatScorer, scoring_loss
+from models.network.segmenter import SeatScorer
 from models.network.sizes import SegmenterConfig
 from models.policies.policies import score_seats
 from models.reading.inference import Glance, glance
+from models.training.objective import scoring_loss
 from pipeline.errors import SettingsError
 from pipeline.geometry.grid import SceneGrid
 from tests.models.conftest import Maker

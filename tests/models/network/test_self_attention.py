@@ -10,8 +10,8 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from models.network.encoder import LAST_QUERIES
 from models.network.self_attention import (
+    LAST_QUERIES,
     TokenReading,
     attention_of_seats,
     queries_kept,

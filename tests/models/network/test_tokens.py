@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models.network.tokens import code_1d, code_2d, paper_numbers
+from models.network.layers import code_1d, code_2d, paper_numbers
 from pipeline.errors import ShapeError
 
 PLACE = st.tuples(st.integers(0, 4000), st.integers(0, 4000))

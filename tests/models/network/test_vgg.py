@@ -8,9 +8,8 @@ import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
-from models.network.vgg import PHOTO_MEAN, PHOTO_STD, HalvingMaximum, VggFeatures, common_names
-from models.network.vgg_sizes import AROUND_PX, BLOCK_PX, VggSizes, saliency_multiply_adds, stretches
-from models.policies.vgg_saliency import input_gradient
+from models.network.sizes import AROUND_PX, BLOCK_PX, VggSizes, saliency_multiply_adds, stretches
+from models.policies.vgg import PHOTO_MEAN, PHOTO_STD, HalvingMaximum, VggFeatures, common_names, input_gradient
 
 NARROW = VggSizes(widths=(4, 6, 8, 10, 10))
 

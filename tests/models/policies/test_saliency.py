@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from models.policies.saliency import fine_grained, grey_image, spectral_residual
+from models.policies.policies import fine_grained, grey_image, spectral_residual
 from pipeline.errors import SettingsError
 
 Measure = Callable[[NDArray[np.floating]], NDArray[np.float64]]

@@ -9,14 +9,12 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from models.network import vgg_sizes
-from models.network.vgg import VggFeatures
-from models.network.vgg_sizes import VggSizes
+from models.network.sizes import VggSizes
 from models.policies.policies import score_seats
+from models.policies.vgg import VggFeatures, VggSaliency, channels_of, close_ring, colours_of
 from models.policies.vgg_file import VggFile
-from models.policies.vgg_saliency import VggSaliency, channels_of, close_ring, colours_of
 from models.reading.inference import CoarseLook, Glance
-from models.training.kernel_fits import rgb_response
+from models.training.pretrained import rgb_response
 from models.weights.files import Weights
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
@@ -115,7 +113,7 @@ def test_blocks_join(monkeypatch: pytest.MonkeyPatch):
     saliency = VggSaliency(shallow, np.eye(4, 3, dtype=np.float32))
     seen = look(noise(5, 96, 160, 4))
     whole = saliency(seen)
-    monkeypatch.setattr(vgg_sizes, "BLOCK_PX", 64)
+    monkeypatch.setattr(sizes, "BLOCK_PX", 64)
     parts = saliency(seen)
     inside = np.s_[28:-28, 28:-28]  # the ends of the scene are joined to each other
     assert parts[inside] == pytest.approx(whole[inside], rel=1e-4, abs=1e-6)

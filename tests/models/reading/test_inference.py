@@ -10,7 +10,7 @@ import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 
-from models.network import batches
+from models.network import segmenter
 from models.reading.inference import Glance, glance, look_coarsely, read_glance, segment
 from models.weights.files import Weights
 from pipeline.errors import ShapeError
@@ -101,7 +101,7 @@ def test_chunks_of_patches_make_no_difference(tiny: Maker, monkeypatch: pytest.M
     weights = tiny()
     seen, fine = _look(weights, 32, 32)
     whole = segment(weights, seen, fine, np.arange(16))
-    monkeypatch.setattr(batches, "PATCHES_AT_ONCE", 3)
+    monkeypatch.setattr(segmenter, "PATCHES_AT_ONCE", 3)
     pieces = segment(weights, seen, fine, np.arange(16))
     assert np.abs(whole.confidence - pieces.confidence).max() <= 1e-5
 

@@ -11,9 +11,9 @@ import pytest
 import torch
 
 from models.network.segmenter import SegmenterConfig
-from models.training.checkpoint import load_checkpoint, save_checkpoint
 from models.training.examples import Example
 from models.training.train import Progress, TrainingSettings, run_identity, train
+from models.weights.sealed_files import load_checkpoint, save_checkpoint
 from pipeline.errors import WeightsError
 
 CONFIG = SegmenterConfig(classes=2, columns=2, patch=8, factor=2, width=8, dim=16, layers=1, heads=2)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from models.baselines.designs import build_network
+from models.network.controls import build_network
 from models.network.sizes import PRESETS, Preset, SegmenterConfig
 from models.reading.control_maps import draw_with_control
 from models.reading.inference import CoarseLook

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 
 from models.network.spectral import SpectralBasis
-from models.training.kernel_fits import map_rgb_kernel, resize_patch_kernel, rgb_response
+from models.training.pretrained import map_rgb_kernel, resize_patch_kernel, rgb_response
 
 
 def drawn(seed: int, *shape: int) -> torch.Tensor:

@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from models.network.vgg import VggFeatures
-from models.network.vgg_sizes import VggSizes
-from models.training.pretrained import load_into, load_vgg
+from models.network.sizes import VggSizes
+from models.policies.vgg import VggFeatures, load_vgg
+from models.training.pretrained import load_into
 from models.weights.state_files import read_state
 from pipeline.errors import WeightsError
 

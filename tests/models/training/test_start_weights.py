@@ -14,9 +14,8 @@ from torch import Tensor
 
 from models.network.segmenter import Segmenter, SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
-from models.training.kernel_fits import mixed_channels, rgb_response
-from models.training.start_columns import column_change
-from models.training.start_weights import StartFile, TokenSizes
+from models.training.pretrained import mixed_channels, rgb_response
+from models.training.start_weights import StartFile, TokenSizes, column_change
 from models.weights.files import Weights, save_weights, with_record
 from pipeline.errors import SettingsError, WeightsError
 
