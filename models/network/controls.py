@@ -22,7 +22,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor, nn
 
-from models.network.layers import Encoder, PatchHead, PatchStem, Residual, code_1d, code_2d, paper_numbers
+from models.network.layers import Encoder, PatchHead, PatchStem, Residual, code_1d, code_2d, cut, joined, paper_numbers
 from models.network.segmenter import Segmenter
 from models.network.sizes import SegmenterConfig, level_widths
 from pipeline.errors import ShapeError
@@ -93,20 +93,6 @@ class DenseNetwork(nn.Module):
         return logits
 
 
-def cut(image: Tensor, patch: int) -> Tensor:
-    """An image as patches, row by row: (B, c, y, x) -> (B, N, c, p, p)."""
-    b, c, y, x = image.shape
-    cells = image.view(b, c, y // patch, patch, x // patch, patch).permute(0, 2, 4, 1, 3, 5)
-    return cells.reshape(b, -1, c, patch, patch)
-
-
-def joined(patches: Tensor, columns: int) -> Tensor:
-    """Undo ``cut``: patches in rows of ``columns``, (B, N, c, p, p) -> (B, c, y, x)."""
-    b, n, c, p, _ = patches.shape
-    cells = patches.view(b, n // columns, columns, c, p, p).permute(0, 3, 1, 4, 2, 5)
-    return cells.reshape(b, c, n // columns * p, columns * p)
-
-
 class PaperNetwork(nn.Module):
     """Shapes as in the module."""
 
@@ -132,8 +118,7 @@ class PaperNetwork(nn.Module):
         the captured seats, unique within a scene; K may be 0.
         """
         rows, columns = (size // self.config.patch for size in coarse.shape[-2:])
-        tokens = self.tokens(coarse, fine, seats)
-        read = self.encoder(tokens)[0][:, : rows * columns]
+        read = self.encoder(self.tokens(coarse, fine, seats))[0][:, : rows * columns]
         logits: Tensor = self.classes(read).transpose(1, 2).reshape(-1, self.config.classes, rows, columns)
         return logits
 

@@ -174,6 +174,20 @@ def encode_packed(
     return list(torch.split(encoder.norm(x)[0], lengths)), memories
 
 
+def cut(image: Tensor, patch: int) -> Tensor:
+    """An image as patches, row by row: (B, c, y, x) -> (B, N, c, p, p)."""
+    b, c, y, x = image.shape
+    cells = image.view(b, c, y // patch, patch, x // patch, patch).permute(0, 2, 4, 1, 3, 5)
+    return cells.reshape(b, -1, c, patch, patch)
+
+
+def joined(patches: Tensor, columns: int) -> Tensor:
+    """Undo ``cut``: patches in rows of ``columns``, (B, N, c, p, p) -> (B, c, y, x)."""
+    b, n, c, p, _ = patches.shape
+    cells = patches.view(b, n // columns, columns, c, p, p).permute(0, 3, 1, 4, 2, 5)
+    return cells.reshape(b, c, n // columns * p, columns * p)
+
+
 class ChannelNorm(nn.Module):
     """Root-mean-square norm over the channels of each pixel (P, c, y, x), whatever its neighbours and the batch."""
 

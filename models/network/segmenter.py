@@ -29,7 +29,9 @@ from models.network.layers import (
     Residual,
     code_1d,
     code_2d,
+    cut,
     encode_packed,
+    joined,
     paper_numbers,
 )
 from models.network.sizes import PATCHES_AT_ONCE, SCORER_WIDTH, level_widths, scorer_inputs
@@ -83,16 +85,9 @@ class Segmenter(nn.Module):
     def read_coarse(self, coarse: Tensor, origin: Tensor | None = None) -> CoarseReading:
         """Read the coarse image alone."""
         rows, columns = (size // self.config.patch for size in coarse.shape[2:])
-        features, tokens = self.coarse_stem(self.coarse_patches(coarse))
+        features, tokens = self.coarse_stem(cut(coarse, self.config.patch).flatten(0, 1))
         read, memory = self.encoder(self.code_coarse(tokens, rows, columns, origin))
-        image = self.coarse_head(features, read.view(tokens.shape))
-        return self.reading_of(image, memory, rows, columns)
-
-    def coarse_patches(self, coarse: Tensor) -> Tensor:
-        """Cut coarse images into patches, (B, J, H/s, W/s) -> (B * patches, J, p, p), row by row."""
-        p = self.config.patch
-        b, j, y, x = coarse.shape
-        return coarse.view(b, j, y // p, p, x // p, p).permute(0, 2, 4, 1, 3, 5).reshape(-1, j, p, p)
+        return self.reading_of(self.coarse_head(features, read.view(tokens.shape)), memory, rows, columns)
 
     def code_coarse(self, tokens: Tensor, rows: int, columns: int, origin: Tensor | None = None) -> Tensor:
         """Tokens of ``rows`` x ``columns`` coarse patches a scene, (B * P, m^2, d), with codes, (B, P m^2, d)."""
@@ -137,7 +132,7 @@ class Segmenter(nn.Module):
         p = self.config.patch
         sizes = [(image.shape[2] // p, image.shape[3] // p) for image in images]
         counts = [rows * columns for rows, columns in sizes]
-        patches = torch.cat([self.coarse_patches(image) for image in images])
+        patches = torch.cat([cut(image, p)[0] for image in images])
         described = [self.coarse_stem(chunk) for chunk in torch.split(patches, PATCHES_AT_ONCE)]
         tokens = torch.split(torch.cat([token for _, token in described]), counts)
         coded = [
@@ -248,11 +243,9 @@ class Segmenter(nn.Module):
         """Coarse logits brought up to the fine grid, overwritten where a fine patch is, (B, classes, H, W) float32."""
         p, s = self.config.patch, self.config.factor
         full = F.interpolate(coarse_logits.float(), scale_factor=s, mode="bilinear", align_corners=False)
-        b, c, y, x = full.shape
-        cells = full.view(b, c, y // p, p, x // p, p).permute(0, 2, 4, 1, 3, 5).flatten(1, 2)
-        index = seats[:, :, None, None, None].expand(-1, -1, c, p, p)
-        cells = cells.scatter(1, index, fine_logits.float())
-        return cells.view(b, y // p, x // p, c, p, p).permute(0, 3, 1, 4, 2, 5).reshape(b, c, y, x)
+        cells = cut(full, p)
+        index = seats[:, :, None, None, None].expand(-1, -1, *cells.shape[2:])
+        return joined(cells.scatter(1, index, fine_logits.float()), full.shape[-1] // p)
 
 
 class SeatScorer(nn.Module):

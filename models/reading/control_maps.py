@@ -13,7 +13,8 @@ import torch.nn.functional as F  # noqa: N812 - its usual name
 from numpy.typing import NDArray
 from torch import Tensor
 
-from models.network.controls import DenseNetwork, PaperNetwork, cut, joined
+from models.network.controls import DenseNetwork, PaperNetwork
+from models.network.layers import cut, joined
 from models.network.segmenter import Segmenter
 from models.network.sizes import PATCHES_AT_ONCE
 from models.reading.inference import CoarseLook, DrawnMap, check_patches, decide, draw_coarse, origin_of
@@ -41,21 +42,15 @@ def draw_with_control(
     check_patches(fine, numbers, look.grid, weights.config)
     with torch.inference_mode():
         if isinstance(network, PaperNetwork):
-            drawn = _draw_paper(network, look, fine, numbers)
+            coarse = torch.from_numpy(look.columns).permute(2, 0, 1)[None].contiguous()
+            logits = network.token_logits(coarse, _tensor(fine)[None], torch.from_numpy(numbers)[None])
+            span = look.grid.patch * look.grid.factor
+            drawn = draw_coarse(logits, SceneGrid(look.grid.height, look.grid.width, 1, span))
         elif network.config.sight == "halved":
             drawn = _draw_halved(network, look, fine, numbers)
         else:
             drawn = _draw_dense(network, look, fine, numbers)
     return drawn.of_scene(look.grid)
-
-
-def _draw_paper(
-    network: PaperNetwork, look: CoarseLook, fine: NDArray[np.floating], seats: NDArray[np.int64]
-) -> DrawnMap:
-    coarse = torch.from_numpy(look.columns).permute(2, 0, 1)[None].contiguous()
-    logits = network.token_logits(coarse, _tensor(fine)[None], torch.from_numpy(seats)[None])
-    span = look.grid.patch * look.grid.factor
-    return draw_coarse(logits, SceneGrid(look.grid.height, look.grid.width, 1, span))
 
 
 def _draw_dense(

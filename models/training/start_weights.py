@@ -34,7 +34,7 @@ from models.training.pretrained import (
     wavelength_response,
 )
 from models.weights.files import FORMAT, NORMALISATION, Description, describe_weights, read_tensors, unsealed_note
-from models.weights.state_files import read_notes, read_state, read_variant
+from models.weights.state_files import read_heads, read_notes, read_state
 from pipeline.errors import SettingsError, WeightsError
 
 STEMS = ("coarse_stem", "fine_stem")
@@ -166,7 +166,7 @@ class StartFile:
         plain = {name.removeprefix("encoder."): value for name, value in self.state.items()}
         dim = int(plain["blocks.0.attn.qkv.weight"].shape[-1])
         wide = plain.get("blocks.0.mlp.fc1.weight")
-        heads = read_variant(self.path).heads if self.kind == "Segmenter" else max(dim // HEAD_WIDTH, 1)
+        heads = read_heads(self.path) if self.kind == "Segmenter" else max(dim // HEAD_WIDTH, 1)
         layers = len({name.split(".")[1] for name in plain if name.startswith("blocks.")})
         return TokenSizes(dim, heads, 4 if wide is None else int(wide.shape[0]) // dim, layers)
 
@@ -223,13 +223,16 @@ class StartFile:
         _settle(report, self.state, spared, changed)
         missing = set(report.missing)
         taken = {name: value for name, value in model.state_dict().items() if name not in missing}
+        skipped: dict[str, list[str]] = {}
+        for name, why in report.skipped.items():
+            skipped.setdefault(why, []).append(name)
         record = {
             "file": self.path.name,
             "sha256": hashlib.sha256(self.path.read_bytes()).hexdigest(),
             "kind": self.kind,
             "matched": len(report.matched),
             "resized": dict(report.resized),
-            "skipped": by_reason(report.skipped),
+            "skipped": skipped,
             "licence": self._licence(),
             **({} if self.described is None or self.described.sealed else {"unsealed": unsealed_note(self.path)}),
         }
@@ -243,14 +246,6 @@ class StartFile:
                 if notes.get(name):
                     return str(notes[name])
         return None
-
-
-def by_reason(skipped: Mapping[str, str]) -> dict[str, list[str]]:
-    """Names of tensors by why they were skipped."""
-    found: dict[str, list[str]] = {}
-    for name, why in skipped.items():
-        found.setdefault(why, []).append(name)
-    return found
 
 
 def _without_heads(state: Mapping[str, Tensor], same: bool) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -93,7 +93,11 @@ class Trainer:
                 raise WeightsError(f"{config.preset} has no place for {len(strange)} tensors, the first {strange[0]}")
         self.model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.averaged = copy.deepcopy(self.model).eval()
-        groups = _parameter_groups(self.model, settings.weight_decay)
+        parameters = list(self.model.parameters())  # matrices and kernels decay, gains and shifts do not
+        groups: list[dict[str, object]] = [
+            {"params": [p for p in parameters if p.ndim > 1], "weight_decay": settings.weight_decay},
+            {"params": [p for p in parameters if p.ndim <= 1], "weight_decay": 0.0},
+        ]
         self.optimiser = torch.optim.AdamW(groups, settings.learning_rate)
         self.samplers = {}
         for larger in {phase.larger for phase in PHASES}:
@@ -133,7 +137,10 @@ class Trainer:
         if course.in_a_row == 3:
             last = course.step
             raise TrainingError(f"the loss was not finite in steps {last - 2} to {last}; lower the learning rate")
-        _average(self.averaged, self.model, min(self.settings.average, course.step / (course.step + 20)))
+        keep = min(self.settings.average, course.step / (course.step + 20))
+        with torch.no_grad():
+            for slow, quick in zip(self.averaged.parameters(), self.model.parameters(), strict=True):
+                slow.lerp_(quick, 1 - keep)
         value = float(loss.detach())
         if math.isfinite(value):
             course.loss = value if math.isnan(course.loss) else 0.97 * course.loss + 0.03 * value
@@ -276,16 +283,3 @@ def _step(model: nn.Module, optimiser: torch.optim.Optimizer, loss: Tensor) -> b
         return False
     optimiser.step()
     return True
-
-
-def _parameter_groups(model: nn.Module, decay: float) -> list[dict[str, object]]:
-    """Matrices and kernels decay, gains and shifts do not."""
-    matrices = [p for p in model.parameters() if p.ndim > 1]
-    rest = [p for p in model.parameters() if p.ndim <= 1]
-    return [{"params": matrices, "weight_decay": decay}, {"params": rest, "weight_decay": 0.0}]
-
-
-@torch.no_grad()
-def _average(averaged: nn.Module, model: nn.Module, keep: float) -> None:
-    for slow, quick in zip(averaged.parameters(), model.parameters(), strict=True):
-        slow.lerp_(quick, 1 - keep)

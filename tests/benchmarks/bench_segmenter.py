@@ -15,7 +15,7 @@ from measure import Clock, Row, ratio, time_in_turn
 from numpy.typing import NDArray
 
 from models.network.cost import multiply_adds
-from models.network.layers import Encoder, Memory
+from models.network.layers import Encoder, Memory, cut
 from models.network.process import keep_freed_memory, one_thread
 from models.network.segmenter import Segmenter, SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
@@ -170,7 +170,7 @@ def _padded_batch(weights: Weights, frames: Sequence[Frame]) -> list[DrawnMap]:
         used[number, : len(row)] = True
     side = config.token_side**2
     known, asked = (mask.flatten(1).repeat_interleave(side, dim=1) for mask in (there, used))
-    features, tokens = model.coarse_stem(model.coarse_patches(coarse))
+    features, tokens = model.coarse_stem(cut(coarse, model.config.patch)[0])
     read, memory = _masked(model.encoder, model.code_coarse(tokens, rows, columns), known, None)
     image = model.coarse_head(features, read.view(tokens.shape)) * there.flatten()[:, None, None, None]
     reading = model.reading_of(image, memory, rows, columns)

@@ -9,6 +9,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from models.network import sizes
 from models.network.sizes import VggSizes
 from models.policies.policies import score_seats
 from models.policies.vgg import VggFeatures, VggSaliency, channels_of, close_ring, colours_of
