@@ -11,8 +11,7 @@ import numpy as np
 import torch
 from measure import Clock, Row, ratio, time_in_turn
 from numpy.typing import NDArray
-from resample_engines import ENGINES
-from resample_peers import BANDS, Peer, Turned, cv2_parts, peers, spline, turned_waves
+from resample_peers import BANDS, ENGINES, Peer, Turned, cv2_parts, peers, spline, turned_waves
 
 from pipeline.rectify.kernels import windows
 from pipeline.rectify.resample import Kernel, resample

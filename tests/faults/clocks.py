@@ -1,4 +1,4 @@
-"""Surveys on a machine whose clock is wrong: ``python tests/faults/clocks.py``.
+"""Surveys on a machine whose clock is wrong: ``python tests/faults clocks``.
 
 What the process sees of the time of day is changed from the inside; the dates of files are set as that clock would
 have set them. Each case gives what was wrong, and is counted by the surveys that it took.
@@ -9,14 +9,11 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import sys
 import tempfile
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 from typing import Any
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from storage.archive.archive import Archive
 from storage.archive.staging import MANIFEST_NAME
@@ -164,9 +161,3 @@ def _row(subject: Subject, fault: str, quick: bool) -> Row:
         not wrong,
         timer.seconds,
     )
-
-
-if __name__ == "__main__":
-    results = rows("--quick" in sys.argv)
-    print("\n".join(f"{row.fault} ({row.injected}): {row.found}" for row in results))
-    sys.exit(0 if all(row.met for row in results) else 1)

@@ -1,4 +1,4 @@
-"""Bits that flip in files that only grow: ``python tests/faults/growing_files.py 2000``.
+"""Bits that flip in files that only grow: ``python tests/faults growing_files``.
 
 A spool's index, numbers and ENVI header, a field's ledger, a rig's journal. Each is opened again as a capture, a
 schedule or a rig would, and gone on with. Demanded: no other number without a word, no defect, every other line kept.
@@ -6,18 +6,13 @@ schedule or a rig would, and gone on with. Demanded: no other number without a w
 
 from __future__ import annotations
 
-import json
-import logging
 import random
 import shutil
-import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from pipeline.errors import PipelineError
 from pipeline.geometry.scan import Sweep
@@ -182,11 +177,3 @@ def rows(quick: bool = False) -> Sequence[Row]:
             clock.seconds,
         )
     ]
-
-
-if __name__ == "__main__":
-    logging.disable(logging.WARNING)
-    FLIPS = int(sys.argv[1]) if len(sys.argv) > 1 else FLIPS
-    (row,) = rows()
-    print(json.dumps({"flips": row.count, "found": row.found}, indent=1))
-    sys.exit(0 if row.met else 1)
