@@ -1,4 +1,4 @@
-"""The two-scale segmenter: sizes, places, windows, composites, what its parts may depend on, and its scorer of seats."""
+"""The two-scale segmenter: sizes, places, windows, composites, what parts may depend on, and its scorer of seats."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 
-from models.network.segmenter import SeatScorer, SegmenterConfig
+from models.network.segmenter import SeatScorer
 from models.network.sizes import SegmenterConfig
 from models.policies.policies import score_seats
 from models.reading.inference import Glance, glance

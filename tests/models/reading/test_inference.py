@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -15,8 +14,8 @@ from models.reading.inference import Glance, glance, look_coarsely, read_glance,
 from models.weights.files import Weights
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import SceneGrid
+from tests.models.conftest import Maker
 
-Maker = Callable[..., Weights]
 NM = np.linspace(400, 1000, 9)
 NONE = np.empty(0, np.int64)
 

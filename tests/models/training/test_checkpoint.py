@@ -12,9 +12,10 @@ import torch
 
 from models.network.segmenter import SegmenterConfig
 from models.training.examples import Example
-from models.training.train import Progress, TrainingSettings, run_identity, train
+from models.training.train import TrainingSettings, run_identity, train
 from models.weights.sealed_files import load_checkpoint, save_checkpoint
 from pipeline.errors import WeightsError
+from tests.models.conftest import killed_after
 
 CONFIG = SegmenterConfig(classes=2, columns=2, patch=8, factor=2, width=8, dim=16, layers=1, heads=2)
 SETTINGS = TrainingSettings(steps=6, batch=2, crop=16)
@@ -26,16 +27,6 @@ def example(seed: int = 1) -> Example:
     fine = np.random.default_rng(seed).normal(0, 1, (32, 32, 2))
     coarse = fine.reshape(16, 2, 16, 2, 2).mean(axis=(1, 3)).astype(np.float32)
     return Example("e", fine.astype(np.float16), coarse, (fine[..., 0] > 0).astype(np.uint8), (32, 32))
-
-
-def killed_after(step: int):
-    """A report that ends the process, as far as training can tell, after some steps."""
-
-    def report(now: Progress) -> None:
-        if now.step == step:
-            raise KeyboardInterrupt
-
-    return report
 
 
 def left_behind(file: Path, identity: str) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,11 +13,10 @@ from models.network.controls import build_network
 from models.network.sizes import PRESETS, Preset, SegmenterConfig
 from models.reading.control_maps import draw_with_control
 from models.reading.inference import CoarseLook
-from models.training.examples import Batch, CropSampler, Example
+from models.training.examples import Batch, CropSampler
 from models.training.objective import SHARES, batch_loss, class_weights, draw_paper_seats, phase_at
 from models.training.train import TrainingSettings, run_identity, train
 from models.weights.files import (
-    AnyWeights,
     Weights,
     check_two_scale,
     describe_weights,
@@ -28,8 +26,8 @@ from models.weights.files import (
 )
 from pipeline.errors import WeightsError
 from pipeline.geometry.grid import SceneGrid
+from tests.models.conftest import ControlMaker, block_example, killed_after
 
-Maker = Callable[..., AnyWeights]
 CONFIG = SegmenterConfig(classes=3, columns=2, patch=8, factor=2, width=8, dim=16, layers=1, heads=2)
 SETTINGS = TrainingSettings(steps=3, batch=2, crop=32, learning_rate=3e-3)
 SHIFT = np.zeros(2, np.float32)
@@ -40,24 +38,17 @@ def _config(preset: Preset) -> SegmenterConfig:
     return replace(CONFIG, **PRESETS[preset])
 
 
-def _example(size: int = 64) -> Example:
-    """Two classes in blocks as large as a coarse patch, told apart by the first column, with noise in the second."""
-    rng = np.random.default_rng(4)
-    labels = np.kron(rng.integers(0, 2, (size // 16, size // 16)), np.ones((16, 16))).astype(np.uint8)
-    fine = np.stack([2.0 * labels - 1, rng.normal(0, 1, labels.shape)], axis=-1)
-    coarse = fine.reshape(size // 2, 2, size // 2, 2, 2).mean(axis=(1, 3))
-    return Example("e", fine.astype(np.float16), coarse.astype(np.float32), labels, labels.shape)
-
-
 def _batch(count: int = 2) -> Batch:
-    return CropSampler([_example()], 8, 2, 32).draw(count, np.random.default_rng(0), SHIFT)
+    return CropSampler([block_example(64, 16)], 8, 2, 32).draw(count, np.random.default_rng(0), SHIFT)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_every_preset_trains(preset: Preset):
     """Three steps change each weight that the loss reaches, and the summary counts them."""
-    model, summary = train(_config(preset), [_example()], SHIFT, SETTINGS)
-    first, _ = train(_config(preset), [_example()], SHIFT, replace(SETTINGS, learning_rate=0.0, weight_decay=0.0))
+    model, summary = train(_config(preset), [block_example(64, 16)], SHIFT, SETTINGS)
+    first, _ = train(
+        _config(preset), [block_example(64, 16)], SHIFT, replace(SETTINGS, learning_rate=0.0, weight_decay=0.0)
+    )
     assert model.config.preset == preset
     assert summary["steps"] == 3
     assert summary["skipped_steps"] == 0
@@ -71,8 +62,8 @@ def test_controls_learn(preset: Preset):
     """Sixty small steps bring the loss of two easily told classes down to less than two thirds."""
     losses: list[float] = []
     settings = replace(SETTINGS, steps=60, learning_rate=1e-2)
-    model, _ = train(_config(preset), [_example()], SHIFT, settings, lambda now: losses.append(now.loss))
-    weight = class_weights([_example()], 3, 5.0)
+    model, _ = train(_config(preset), [block_example(64, 16)], SHIFT, settings, lambda now: losses.append(now.loss))
+    weight = class_weights([block_example(64, 16)], 3, 5.0)
     with torch.no_grad():
         last = batch_loss(model, _batch(8), weight, np.random.default_rng(0), phase_at(0.0), soft_dice=False)
     assert last < losses[0] / 1.5
@@ -82,17 +73,17 @@ def test_controls_learn(preset: Preset):
 def test_a_killed_run_goes_on(preset: Preset, tmp_path: Path):
     """A control's checkpoint is gone on from; every preset's runs are told apart."""
 
-    def kill(now: object) -> None:
-        if getattr(now, "step", 0) == 3:
-            raise KeyboardInterrupt
-
     path, settings = tmp_path / "c", replace(SETTINGS, steps=4)
     with pytest.raises(KeyboardInterrupt):
-        train(_config(preset), [_example()], SHIFT, settings, kill, checkpoint=path, keep_every_s=0)
+        train(
+            _config(preset), [block_example(64, 16)], SHIFT, settings, killed_after(3), checkpoint=path, keep_every_s=0
+        )
     steps: list[int] = []
-    train(_config(preset), [_example()], SHIFT, settings, lambda now: steps.append(now.step), checkpoint=path)
+    train(
+        _config(preset), [block_example(64, 16)], SHIFT, settings, lambda now: steps.append(now.step), checkpoint=path
+    )
     assert steps == [3, 4]  # the killed step was not kept
-    assert len({run_identity(_config(kind), [_example()], settings) for kind in PRESETS}) == len(PRESETS)
+    assert len({run_identity(_config(kind), [block_example(64, 16)], settings) for kind in PRESETS}) == len(PRESETS)
 
 
 @pytest.mark.parametrize("preset", ["dense", "coarser", "upsampled"])
@@ -126,7 +117,7 @@ def test_half_of_the_papers_seats_lie_on_edges():
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_weights_of_any_design_come_back(make_control: Maker, preset: Preset, tmp_path: Path):
+def test_weights_of_any_design_come_back(make_control: ControlMaker, preset: Preset, tmp_path: Path):
     """What was saved is loaded bit by bit and draws the same map."""
     path, before = tmp_path / "w.safetensors", make_control(preset)
     save_weights(before, path)
@@ -146,7 +137,7 @@ def test_weights_of_any_design_come_back(make_control: Maker, preset: Preset, tm
 
 
 @pytest.mark.parametrize("preset", CONTROLS)
-def test_a_survey_refuses_a_control(make_control: Maker, preset: Preset, tmp_path: Path):
+def test_a_survey_refuses_a_control(make_control: ControlMaker, preset: Preset, tmp_path: Path):
     """The message names the file, the control in it, and how weights for a survey are made."""
     path = tmp_path / "w.safetensors"
     save_weights(make_control(preset), path)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import struct
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,6 @@ from models.reading.inference import glance
 from models.weights.files import (
     FORMAT,
     UNSEALED,
-    Weights,
     content_key,
     describe_weights,
     load_any_weights,
@@ -32,8 +30,7 @@ from models.weights.files import (
 from models.weights.sealed_files import SEAL, TENSORS
 from pipeline.errors import WeightsError
 from pipeline.geometry.grid import SceneGrid
-
-Maker = Callable[..., Weights]
+from tests.models.conftest import Maker
 
 
 def _about(path: Path) -> dict[str, Any]:
