@@ -102,18 +102,6 @@ def test_a_class_shown_where_the_labels_have_none_is_false():
     )
 
 
-def test_two_stray_pixels_do_not_turn_two_maps_round():
-    """A map that is better in every class stays ahead of one without stray pixels: 66.0 to 73.7 once said otherwise."""
-    labels = np.repeat([0, 1], 50)
-    better, worse = labels.copy(), labels.copy()
-    better[[0, 50]] = 2  # the stray pixels
-    worse[:10], worse[50:60] = 1, 0
-    one, other = confusion(labels, better, 3), confusion(labels, worse, 3)
-    assert (iou_per_class(one)[:2] > iou_per_class(other)[:2]).all()
-    assert mean_iou(one) > mean_iou(other)
-    assert miou_of_shown_classes(one) < miou_of_shown_classes(other)
-
-
 LABELLED = st.lists(st.tuples(st.integers(0, 2), st.integers(0, 4)), min_size=1, max_size=60)  # classes 3, 4: false
 
 

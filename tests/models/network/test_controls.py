@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -68,7 +67,6 @@ def test_tokens_are_counted_as_in_the_paper(factor: int, coarse: int, seats: int
     with torch.inference_mode():
         tokens = network.tokens(noise(0, 1, 1, side, side), noise(0, 1, seats, 1, 4, 4), torch.arange(seats)[None])
     assert tokens.shape == (1, coarse + seats, 16)
-    assert coarse + seats in {base + step for base in (64, 256) for step in (100, 200, 300, 400, 500)}
 
 
 def test_places_are_the_papers_numbers():
@@ -193,9 +191,3 @@ def test_batches_of_scenes_are_read_apart():
             )
             alone = network.draw(coarse + 1, fine - 1, seats, torch.zeros(1, 2))
         assert (both[1:] - alone).abs().max() < 1e-5
-
-
-def test_sizes_other_than_the_design_stay():
-    """A control is the same sizes with another design: that of the weights it is compared with."""
-    config = SegmenterConfig(5, patch=32)
-    assert replace(config, **PRESETS["paper"]) == SegmenterConfig(5, patch=32, design="paper", positions="paper")

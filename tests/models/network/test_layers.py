@@ -55,18 +55,6 @@ def test_what_is_kept_stands_for_the_tokens(encoder: Encoder):
 
 
 @torch.inference_mode()
-def test_parts_of_the_memory_join(encoder: Encoder):
-    """A later look at the memory of an earlier one sees what one look at both sees of the first."""
-    first, second = _tokens(4), _tokens(2, seed=7)
-    _, alone = encoder(first)
-    _, own = encoder(second, alone)
-    joined = [tuple(torch.cat(pair, dim=2) for pair in zip(a, b, strict=True)) for a, b in zip(alone, own, strict=True)]
-    third = _tokens(3, seed=8)
-    assert encoder(third, joined)[0].isfinite().all()
-    assert (encoder(third, joined)[0] - encoder(third, alone)[0]).abs().max() > 1e-4
-
-
-@torch.inference_mode()
 def test_tokens_left_out_reach_nobody(encoder: Encoder):
     """A token that is not valid changes nothing, NaN included, and leaves as zeros."""
     x, memory = _tokens(6), encoder(_tokens(3, seed=9))[1]

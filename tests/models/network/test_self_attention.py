@@ -20,8 +20,9 @@ from models.network.self_attention import (
 from models.policies.policies import score_seats
 from models.reading.inference import CoarseLook, Glance, glance_of_columns, read_glance
 from models.weights.files import Weights
-from pipeline.errors import SettingsError, ShapeError
+from pipeline.errors import ShapeError
 from pipeline.geometry.grid import SceneGrid
+from tests.models.conftest import Maker
 
 Array = NDArray[np.float32]
 
@@ -178,11 +179,3 @@ def test_two_readings_score_alike(tiny: Maker):
     assert (score_seats("self-attention", again) == score_seats("self-attention", seen)).all()
     moved = read_glance(weights, CoarseLook(seen.grid, seen.columns, origin=(5, 3)))
     assert np.abs(score_seats("self-attention", moved) - score_seats("self-attention", seen)).max() > 1e-6
-
-
-def test_a_look_that_nobody_read_has_no_attention():
-    """The message says that the weights were not asked."""
-    grid = SceneGrid(16, 16, 8, 2)
-    seen = Glance(grid, np.zeros((8, 8, 2), np.float32), np.zeros((8, 8, 3), np.float32))
-    with pytest.raises(SettingsError, match="'self-attention' asks the weights, and nothing was read"):
-        score_seats("self-attention", seen)

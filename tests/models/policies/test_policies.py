@@ -161,6 +161,10 @@ def test_policies_and_masks_that_do_not_fit_are_refused():
     """The messages name the policies there are, the flag that is missing, and both sizes."""
     with pytest.raises(SettingsError, match="unknown policy 'best'; choose one of gain, entropy, margin, sobel"):
         score_seats("best", _glance())
+    unread = Glance(_glance().grid, np.zeros((8, 8, 2), np.float32), np.zeros((8, 8, 3), np.float32))
+    for policy in ("gain", "self-attention"):
+        with pytest.raises(SettingsError, match=f"'{policy}' asks the weights, and nothing was read"):
+            score_seats(policy, unread)
     with pytest.raises(SettingsError, match="needs --mask"):
         score_seats("mask", _glance())
     with pytest.raises(ShapeError, match=r"mask is \(32, 47\) px, the scene is \(32, 48\)"):

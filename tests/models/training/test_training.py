@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from models.network.segmenter import Segmenter, SegmenterConfig
+from models.network.sizes import PRESETS, Preset
 from models.training import objective
 from models.training import train as training
 from models.training.examples import CropSampler
@@ -32,18 +33,21 @@ SETTINGS = TrainingSettings(steps=6, batch=2, crop=16, learning_rate=3e-3)
 SHIFT = np.zeros(2, np.float32)
 
 
-def test_training_learns():
-    """Forty small steps bring the loss of two easily told classes down to a third."""
+@pytest.mark.parametrize("preset", PRESETS)
+def test_training_learns(preset: Preset):
+    """Sixty small steps bring the loss of two easily told classes down to less than two thirds."""
     losses: list[float] = []
-    settings = replace(SETTINGS, steps=40, learning_rate=1e-2)
-    model, summary = train(CONFIG, [block_example()], SHIFT, settings, lambda now: losses.append(now.loss))
-    batch = CropSampler([block_example()], 8, 2, 16).draw(8, np.random.default_rng(0), SHIFT)
-    weight = class_weights([block_example()], 3, 5.0)
+    scene, settings = block_example(64, 16), replace(SETTINGS, steps=60, crop=32, learning_rate=1e-2)
+    model, summary = train(
+        replace(CONFIG, **PRESETS[preset]), [scene], SHIFT, settings, lambda now: losses.append(now.loss)
+    )
+    batch = CropSampler([scene], 8, 2, 32).draw(8, np.random.default_rng(0), SHIFT)
+    weight = class_weights([scene], 3, 5.0)
     with torch.no_grad():
         last = batch_loss(model, batch, weight, np.random.default_rng(0), phase_at(0.0), soft_dice=False)
-    assert last < losses[0] / 3
-    assert summary["steps"] == 40
-    assert summary["skipped_steps"] == 0
+    assert last < losses[0] / (3 if preset == "two-scale" else 1.5)
+    assert (summary["steps"], summary["skipped_steps"]) == (60, 0)
+    assert (model.config.preset, model.training) == (preset, False)
 
 
 def test_equal_seeds_give_equal_weights_and_leave_global_streams_alone():

@@ -12,10 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from models.reading.inference import glance
 from models.weights.files import (
     FORMAT,
     UNSEALED,
@@ -29,7 +27,6 @@ from models.weights.files import (
 )
 from models.weights.sealed_files import SEAL, TENSORS
 from pipeline.errors import WeightsError
-from pipeline.geometry.grid import SceneGrid
 from tests.models.conftest import Maker
 
 
@@ -70,13 +67,8 @@ def test_everything_comes_back_bit_by_bit(tiny: Maker, saved: Path):
         assert (getattr(after.normalisation, name) == getattr(before.normalisation, name)).all()
     assert (after.class_colours == before.class_colours).all()
     assert not after.segmenter.training
-
-
-def test_loaded_weights_draw_the_same(tiny: Maker, saved: Path):
-    """A glance through loaded weights equals that through the original ones, bit by bit."""
-    values, nm = np.random.default_rng(0).uniform(0.1, 0.5, (16, 8, 7)), np.linspace(420, 980, 7)
-    first, second = (glance(weights, values, nm, SceneGrid(32, 16, 8, 2)) for weights in (tiny(), load_weights(saved)))
-    assert (first.probability == second.probability).all()
+    described = describe_weights(saved)
+    assert (described.config, described.basis, described.record) == (after.config, after.basis, after.record)
 
 
 def test_saving_twice_gives_equal_files(tiny: Maker, saved: Path, tmp_path: Path):
@@ -120,17 +112,13 @@ def test_a_missing_file_says_how_to_make_one(tmp_path: Path):
         load_weights(tmp_path / "gone.safetensors")
 
 
-@pytest.mark.parametrize("keep", [0, 5, 400, -100])
-def test_a_file_cut_short_is_not_readable(saved: Path, keep: int):
-    """A file that ends early is named, whatever is left of it."""
-    saved.write_bytes(saved.read_bytes()[:keep])
-    with pytest.raises(WeightsError, match="not a readable safetensors file"):
-        load_weights(saved)
-
-
-def test_a_pickle_is_never_opened(saved: Path, tiny: Maker):
-    """A file of torch's own kind is refused without being unpickled."""
-    torch.save(tiny().segmenter.state_dict(), saved)
+@pytest.mark.parametrize("keep", [0, 5, 400, -100, None])
+def test_what_is_no_whole_file_is_not_readable(saved: Path, keep: int | None):
+    """A file that ends early is named, whatever is left of it, and so is torch's own kind: no pickle is opened."""
+    if keep is None:
+        torch.save(load_file(saved), saved)
+    else:
+        saved.write_bytes(saved.read_bytes()[:keep])
     with pytest.raises(WeightsError, match="not a readable safetensors file"):
         load_weights(saved)
 
@@ -212,14 +200,6 @@ def test_a_write_that_fails_leaves_the_old_file(tiny: Maker, saved: Path, monkey
     assert [path.name for path in saved.parent.iterdir()] == ["w.safetensors"]
 
 
-def test_a_description_is_what_the_weights_say(saved: Path):
-    """Read without the tensors: sizes, basis, classes and record are those of the weights themselves."""
-    described, weights = describe_weights(saved), load_weights(saved)
-    assert described.config == weights.config
-    assert (described.basis, described.class_names) == (weights.basis, weights.class_names)
-    assert described.record == weights.record
-
-
 def _flipped(path: Path, place: int, bit: int) -> None:
     raw = bytearray(path.read_bytes())
     raw[place] ^= 1 << bit
@@ -239,21 +219,6 @@ def test_a_description_that_was_changed_is_refused(saved: Path):
     saved.write_bytes(raw.replace(b"class 1", b"class 3"))
     with pytest.raises(WeightsError, match="is damaged: its description is not what was written"):
         describe_weights(saved)
-
-
-def test_tensors_of_other_weights_are_refused(tiny: Maker, saved: Path, tmp_path: Path):
-    """Tensors of the right shapes that the hashes are not of."""
-    save_weights(tiny(1), tmp_path / "other.safetensors")
-    about = json.loads((_metadata(saved))["about"])
-    save_file(load_file(tmp_path / "other.safetensors"), saved, {"about": json.dumps(about)})
-    with pytest.raises(WeightsError, match=r"is damaged: tensor \S+ is not what was written"):
-        load_weights(saved)
-
-
-def _metadata(path: Path) -> dict[str, str]:
-    with safe_open(path, framework="np") as file:
-        found: dict[str, str] = file.metadata()
-    return found
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
