@@ -178,7 +178,7 @@ def cut(image: Tensor, patch: int) -> Tensor:
     """An image as patches, row by row: (B, c, y, x) -> (B, N, c, p, p)."""
     b, c, y, x = image.shape
     cells = image.view(b, c, y // patch, patch, x // patch, patch).permute(0, 2, 4, 1, 3, 5)
-    return cells.reshape(b, -1, c, patch, patch)
+    return cells.reshape(b, y // patch * (x // patch), c, patch, patch)
 
 
 def joined(patches: Tensor, columns: int) -> Tensor:

@@ -72,7 +72,6 @@ def _block(rig: Rig, seed: int = 0) -> SweepBlock:
 
 
 def _ours(light: Light, variant: str, seed: int = 0) -> Raw:
-    """PRNU, dark current, shot noise, well, read noise, converter."""
     block = _block(_rig(), seed)
     chosen: dict[Any, str] = {
         DARK_CURRENT: "exact",

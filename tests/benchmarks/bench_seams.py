@@ -33,7 +33,6 @@ PRIOR_PX = 26.0
 
 
 def rows() -> list[Row]:
-    """Registration, crop rows, the survey, the pictures."""
     waves = [_waves("4-40 px", (4, 40), 50), _waves("40-400 px", (40, 400), 50), _waves("4-40 px", (4, 40), 1)]
     return [*waves, _rows_with_gaps(), _rows_without(), *_survey(), *_pictures()]
 

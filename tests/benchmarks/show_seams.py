@@ -50,7 +50,6 @@ COLOURS = (2, 1, 0)  # bands shown as red, green and blue
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Write both pictures into the folder named."""
     if len(arguments) != 1:
         print("usage: python tests/benchmarks/show_seams.py FOLDER", file=sys.stderr)
         return 2

@@ -106,7 +106,6 @@ CASES: dict[str, tuple[Case, tuple[str, ...], str]] = {
 
 
 def _order(out: Path) -> list[str]:
-    """Whether runs are listed by the dates that they state, to the second."""
     runs = Archive.open(out, create=False, write=False).runs()
     dates = [folder.name.split("-")[0] for folder in runs]
     return [] if dates == sorted(dates) and len(set(runs)) == len(runs) else [f"runs are listed as {dates}"]
@@ -137,7 +136,6 @@ def _redate(folder: Path, shift_s: float) -> None:
 
 
 def rows(quick: bool = False) -> list[Row]:
-    """Every case by every clock that concerns it."""
     with tempfile.TemporaryDirectory(prefix="clocks-") as name, Nursery(Path(name)) as nursery:
         subject = prepare(nursery)
         return [_row(subject, fault, quick) for fault in CASES]

@@ -64,7 +64,6 @@ def flip_spool(name: str, flips: int, folder: Path, seed: int = 0) -> Rot:
 
 
 def _go_on(place: Path, truth: dict[str, bytes]) -> list[str]:
-    """Open a spool, have back what is lost, read every line."""
     wrong = []
     with Spool.open(place, SAMPLES, BANDS, header=HEADER) as spool:
         if len(spool.lost) + LINES - spool.count > 1:
@@ -144,7 +143,6 @@ def _told(root: Path) -> list[str]:
 
 
 def _guarded(tried: Callable[[], list[str]]) -> list[str]:
-    """What is wrong, a defect among it."""
     try:
         return tried()
     except PipelineError as error:
@@ -161,7 +159,6 @@ def rot_everything(flips: int, folder: Path, seed: int = 0) -> dict[str, Rot]:
 
 
 def rows(quick: bool = False) -> Sequence[Row]:
-    """One row for all kinds of files."""
     clock = Clock()
     with tempfile.TemporaryDirectory(prefix="growing-") as name:
         found = rot_everything(200 if quick else FLIPS, Path(name))

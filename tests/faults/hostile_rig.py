@@ -175,7 +175,6 @@ def meet_for(seconds: float, seed: int, meet: Callable[[np.random.Generator, Out
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Drivers warn of each of these bytes."""
     before = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
@@ -185,7 +184,6 @@ def _quiet() -> Iterator[None]:
 
 
 def rows(quick: bool = False) -> list[Row]:
-    """Both devices, and the line to the camera."""
     seconds = (QUICK_S if quick else FULL_S) / 2
     demanded = "each done by its deadline, in one message and bounded memory"
     found = []

@@ -157,7 +157,6 @@ def try_power(cuts: int, folder: Path, seed: int = 0) -> Losses:
 
 
 def _go_on(place: Path, appended: int, found: Losses) -> Iterator[str]:
-    """Open what is left, compare each line, append the rest."""
     with Spool.open(place, SAMPLES, BANDS, header=HEADER) as spool:
         lost = max(appended - spool.count, 0) + len(spool.lost)
         found.lost[lost] += 1
@@ -206,7 +205,6 @@ def _contents(folder: Path) -> dict[str, bytes]:
 
 
 def rows(quick: bool = False) -> list[Row]:
-    """Captures killed, and captures whose power failed."""
     found = []
     with tempfile.TemporaryDirectory(prefix="lost-") as name:
         clock, kills = Clock(), 3 if quick else KILLS

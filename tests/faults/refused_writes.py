@@ -85,7 +85,6 @@ def _runs(hit: list[tuple[int, str, str]]) -> int | None:
 
 
 def rows(quick: bool = False) -> list[Row]:
-    """Refusals of all kinds over a whole survey."""
     clock, count = Clock(), 12 if quick else PLACES
     with tempfile.TemporaryDirectory(prefix="refused-") as name, Nursery(Path(name)) as nursery:
         found = refuse_places(prepare(nursery), count)

@@ -151,7 +151,6 @@ def _receipts(out: Path) -> list[Any]:
 
 
 def rows(quick: bool = False) -> list[Row]:
-    """SIGTERM on both engines."""
     found = []
     for engine, counts in COUNTS.items():
         clock, count = Clock(), counts[quick]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,6 @@ import torch
 from torch import Tensor
 
 from models.network.controls import build_network
-from models.network.segmenter import Segmenter
 from models.network.sizes import PRESETS, Preset, SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
 from models.reading.inference import CoarseLook
@@ -20,6 +20,11 @@ from models.training.train import Progress
 from models.weights.files import AnyWeights, Weights
 from pipeline.geometry.grid import SceneGrid
 
+SMALL: dict[str, Any] = {"classes": 3, "columns": 4, "patch": 8, "factor": 2, "width": 8, "coarse_width": 8} | {
+    "dim": 16,
+    "heads": 2,
+    "layers": 1,
+}
 Maker = Callable[..., Weights]
 ControlMaker = Callable[..., AnyWeights]
 
@@ -64,22 +69,32 @@ def killed_after(step: int) -> Callable[[Progress], None]:
     return report
 
 
+def make_network(seed: int = 0, **sizes: Any) -> Any:
+    """A small network of the given sizes; whatever training starts from zero is drawn too, so that nothing is idle."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        model = build_network(SegmenterConfig(**{**SMALL, **sizes})).eval()
+        for parameter in model.parameters():
+            if not parameter.any():
+                torch.nn.init.normal_(parameter, std=0.3)
+    return model
+
+
 def make_weights(seed: int = 0, **sizes: Any) -> Weights:
-    """Random weights of the given sizes; whatever training starts from zero is drawn too, so that nothing is idle."""
-    made = make_any_weights(seed, **sizes)
-    assert isinstance(made.network, Segmenter)
-    return Weights(made.network, made.basis, made.normalisation, made.class_names, made.class_colours, made.record)
+    """Random weights of a two-scale segmenter."""
+    return Weights(**vars(make_any_weights(seed, **sizes)))
+
+
+def plain_weights(**sizes: Any) -> Weights:
+    """Those of two layers, with columns of one scale that have no correlation."""
+    made = make_weights(**{"layers": 2, **sizes})
+    one = np.ones(made.config.columns, np.float32)
+    return replace(made, normalisation=Normalisation(0.3 * one, 0.1 * one, np.diag(one)))
 
 
 def make_any_weights(seed: int = 0, **sizes: Any) -> AnyWeights:
     """Random weights of the network that the sizes name."""
-    small = {"classes": 3, "columns": 4, "patch": 8, "factor": 2, "width": 8, "coarse_width": 8} | {"layers": 1}
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        model = build_network(SegmenterConfig(**{**small, "dim": 16, "heads": 2, **sizes})).eval()
-        for parameter in model.parameters():
-            if not parameter.any():
-                torch.nn.init.normal_(parameter, std=0.3)
+    model = make_network(seed, **sizes)
     columns = model.config.columns
     centre, spread = np.linspace(0.2, 0.4, columns), np.linspace(0.05, 0.1, columns)
     whitening = np.eye(columns) + 0.1

@@ -116,7 +116,7 @@ def test_a_missing_file_says_how_to_make_one(tmp_path: Path):
 def test_what_is_no_whole_file_is_not_readable(saved: Path, keep: int | None):
     """A file that ends early is named, whatever is left of it, and so is torch's own kind: no pickle is opened."""
     if keep is None:
-        torch.save(load_file(saved), saved)
+        torch.save({"a": torch.zeros(1)}, saved)
     else:
         saved.write_bytes(saved.read_bytes()[:keep])
     with pytest.raises(WeightsError, match="not a readable safetensors file"):
