@@ -31,6 +31,8 @@ READOUT_NS = 9.0
 
 Light = NDArray[np.float32]
 Raw = NDArray[np.uint16]
+VOLT_PER_E = 1e-5
+MILLISECOND = 1e-3
 
 
 def rows() -> list[Row]:
@@ -207,10 +209,6 @@ def _torch_draws(light: Light) -> dict[str, Callable[[], object]]:
         "torch normal": lambda: out.normal_(generator=generator),
         "torch poisson": lambda: torch.poisson(mean, generator=generator),
     }
-
-
-VOLT_PER_E = 1e-5
-MILLISECOND = 1e-3
 
 
 class PyxelChain:

@@ -16,6 +16,7 @@ SIDE, BANDS, EDGE = 256, 270, 176  # of the sweep; of the output grid, which lie
 TURN_DEG = 14.0
 CRS, ORIGIN_M = "EPSG:32631", (500_000.0, 5_000_000.0)  # one metre a pixel, for what wants to be on the Earth
 FEW = 18  # bands of the libraries that take one at a time and long for each
+Engine = Callable[[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor], Any]
 
 
 @dataclass(frozen=True)
@@ -217,9 +218,6 @@ def _swath_and_area(scene: Turned) -> tuple[Any, Any]:
     lon, lat = pyproj.Transformer.from_crs(CRS, "EPSG:4326", always_xy=True).transform(east + x, north - y)
     extent = (east - 0.5, north - EDGE + 0.5, east + EDGE - 0.5, north + 0.5)
     return SwathDefinition(lon, lat), AreaDefinition("grid", "grid", "grid", pyproj.CRS(CRS), EDGE, EDGE, extent)
-
-
-Engine = Callable[[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor], Any]
 
 
 def _bag(table: torch.Tensor, index: torch.Tensor, weight: torch.Tensor, _apart: torch.Tensor) -> torch.Tensor:

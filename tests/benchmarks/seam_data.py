@@ -41,6 +41,15 @@ Floats = NDArray[np.float64]
 LINES, SAMPLES = 3000, 2000
 MARGIN_PX = 100
 WAVELENGTHS = (450.0, 550.0, 650.0, 800.0)
+RGBN = data_folder("rgbn")
+NEIGHBOURS = ("rgbn_suba.tif", "rgbn_subb.tif")
+CUT_LEFT, CUT_RIGHT = 220, 320  # columns that both parts have
+WRONG_BY = np.array([3.0, -4.0])
+BETWEEN = np.array([0.37, 0.61])  # of a pixel, where the second cut's pixels lie
+PRIOR_PX = 8.0  # by which a place may be wrong
+BLOCK_ROWS = 64
+BORDER = 12  # pixels whose spline saw the picture's edge
+ROW_PX = 12.0
 
 
 @dataclass(frozen=True)
@@ -159,18 +168,6 @@ def _shown(survey: Survey, image: PlacedImage, points: Floats) -> Floats:
     ]
     place: Floats = ((1 - share) * ends[0] + share * ends[1]) / survey.camera.ifov_rad
     return place
-
-
-Floats = NDArray[np.float64]
-
-RGBN = data_folder("rgbn")
-NEIGHBOURS = ("rgbn_suba.tif", "rgbn_subb.tif")
-CUT_LEFT, CUT_RIGHT = 220, 320  # columns that both parts have
-WRONG_BY = np.array([3.0, -4.0])
-BETWEEN = np.array([0.37, 0.61])  # of a pixel, where the second cut's pixels lie
-PRIOR_PX = 8.0  # by which a place may be wrong
-BLOCK_ROWS = 64
-BORDER = 12  # pixels whose spline saw the picture's edge
 
 
 @dataclass(frozen=True)
@@ -308,11 +305,6 @@ def _joined(left: Picture, right: Picture, whole: NDArray[np.float32], kernel: K
     inner = (slice(BORDER, -BORDER), slice(BORDER, -BORDER))
     error = (values - whole)[inner]
     return Joined(values, values - whole, differing, float(np.sqrt(np.nanmean(error**2)) / whole[inner].std()))
-
-
-Floats = NDArray[np.float64]
-
-ROW_PX = 12.0
 
 
 def wave_views(

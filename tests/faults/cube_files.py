@@ -23,6 +23,7 @@ from storage.export.envi_writer import EnviFile, write_envi
 from storage.readers.scan_files import open_cube_source
 
 SHAPE = (20, 12, 5)
+LONGEST_S = 30  # then it counts as hanging
 
 
 def _cube() -> Any:
@@ -137,9 +138,6 @@ FORMATS: dict[str, Callable[[Path], str]] = {
     "Zarr v2": lambda folder: _zarr(folder, 2),
     "Zarr v3": lambda folder: _zarr(folder, 3),
 }
-
-
-LONGEST_S = 30  # then it counts as hanging
 
 
 class TookTooLongError(Exception):

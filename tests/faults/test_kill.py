@@ -25,6 +25,31 @@ MOMENTS = [(number + random.Random(number).random()) / KILLS for number in range
 LIVES = (0.5, 0.35, 0.35, 0.35) * 3  # of it too: what was not published begins anew
 
 Runner = Callable[[Path, float | None], tuple[int, float]]
+ROOT = Path(__file__).parents[2]
+PUBLISH = """
+import sys
+from storage.archive.archive import Archive
+archive = Archive.open(sys.argv[1])
+made = 0
+for number in range(10**6):
+    def build(path):
+        for name in range(4):
+            (path / f"{name}.bin").write_bytes(bytes([number % 251]) * 20_000)
+    made += archive.produce("stage", build, version=1, params={"number": number})[1]
+    if made == 1:
+        print("published one", flush=True)
+"""
+SPOOL = """
+import sys
+from pathlib import Path
+import numpy as np
+from pipeline.source import Line
+from storage.arrays.spool import Spool
+spool = Spool.open(Path(sys.argv[1]), 64, 30, header={"sweep": "a"})
+print(spool.count, flush=True)
+for number in range(spool.count, 10**6):
+    spool.append(Line(number, np.full((64, 30), number % 65536, np.uint16), 0.0, 0.0, 0.1 * number, 100.0))
+"""
 
 
 @dataclass(frozen=True)
@@ -109,36 +134,6 @@ def test_killed_again_and_again(run: Runner, whole: Whole, tmp_path: Path) -> No
     assert published[-1] > 0
     assert run(tmp_path, None)[0] == 0
     np.testing.assert_array_equal(class_map(tmp_path), whole.classes)
-
-
-ROOT = Path(__file__).parents[2]
-KILLS = 6
-
-PUBLISH = """
-import sys
-from storage.archive.archive import Archive
-archive = Archive.open(sys.argv[1])
-made = 0
-for number in range(10**6):
-    def build(path):
-        for name in range(4):
-            (path / f"{name}.bin").write_bytes(bytes([number % 251]) * 20_000)
-    made += archive.produce("stage", build, version=1, params={"number": number})[1]
-    if made == 1:
-        print("published one", flush=True)
-"""
-
-SPOOL = """
-import sys
-from pathlib import Path
-import numpy as np
-from pipeline.source import Line
-from storage.arrays.spool import Spool
-spool = Spool.open(Path(sys.argv[1]), 64, 30, header={"sweep": "a"})
-print(spool.count, flush=True)
-for number in range(spool.count, 10**6):
-    spool.append(Line(number, np.full((64, 30), number % 65536, np.uint16), 0.0, 0.0, 0.1 * number, 100.0))
-"""
 
 
 def _run_and_kill(script: str, folder: Path, delay: float) -> str:

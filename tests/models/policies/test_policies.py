@@ -24,6 +24,9 @@ from pipeline.errors import SettingsError, ShapeError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.selection import select_seats
 
+Measure = Callable[[NDArray[np.floating]], NDArray[np.float64]]
+both = pytest.mark.parametrize("measure", [fine_grained, spectral_residual])
+
 
 def _glance(height: int = 32, width: int = 48, patch: int = 8, factor: int = 2) -> Glance:
     """A flat scene of which the glance is equally unsure everywhere."""
@@ -169,10 +172,6 @@ def test_policies_and_masks_that_do_not_fit_are_refused():
         score_seats("mask", _glance())
     with pytest.raises(ShapeError, match=r"mask is \(32, 47\) px, the scene is \(32, 48\)"):
         score_seats("mask", _glance(), mask=np.ones((32, 47)))
-
-
-Measure = Callable[[NDArray[np.floating]], NDArray[np.float64]]
-both = pytest.mark.parametrize("measure", [fine_grained, spectral_residual])
 
 
 def _noise(shape: tuple[int, ...] = (40, 56, 5), seed: int = 0) -> NDArray[np.float64]:

@@ -72,16 +72,6 @@ def look(columns: NDArray[np.float32], patch: int = 8, factor: int = 2) -> Glanc
     return Glance(grid, columns, np.empty((0, 0, 0), np.float32))
 
 
-def test_training_median_and_spread_become_those_of_photographs(tiny: Maker):
-    """The median pixel is 0, the mean of photographs; one spread more of every column is 1 in each colour."""
-    weights = tiny()
-    normal, wavelength = weights.normalisation, np.linspace(400.0, 1000.0, 4)
-    pixels = np.stack([normal.centre, normal.centre + normal.spread, normal.centre - 2 * normal.spread])
-    columns = normal.apply(pixels, np.ones(4, np.bool_))
-    assert len(wavelength) == weights.basis.columns
-    assert columns @ colours_of(weights) == pytest.approx(np.repeat([[0.0], [1.0], [-2.0]], 3, axis=1), abs=1e-4)
-
-
 def test_colours_are_those_of_the_scene(tiny: Maker):
     """Undoing the normalisation and mixing by wavelength gives the same colours, brought to one scale."""
     weights = tiny()

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from models.network.controls import build_network
 from models.network.segmenter import Segmenter, SegmenterConfig
 from models.network.sizes import PRESETS, Preset
 from models.training import objective
@@ -19,6 +20,7 @@ from models.training.objective import (
     SHARES,
     batch_loss,
     class_weights,
+    draw_paper_seats,
     draw_seats,
     map_loss,
     phase_at,
@@ -248,3 +250,31 @@ def test_a_start_that_has_no_place_is_refused():
     """A tensor of another network is not passed over in silence."""
     with pytest.raises(WeightsError, match=r"two-scale has no place for 1 tensors, the first encoder\.extra"):
         train(CONFIG, [block_example()], SHIFT, SETTINGS, start={"encoder.extra": torch.zeros(1)})
+
+
+@pytest.mark.parametrize("preset", ["dense", "coarser", "upsampled"])
+def test_dense_controls_draw_no_chance(preset: Preset):
+    """They read each seat, whatever the generator says: two streams give one loss."""
+    batch = CropSampler([block_example(64, 16)], 8, 2, 32).draw(2, np.random.default_rng(0), SHIFT)
+    model, streams = build_network(replace(CONFIG, **PRESETS[preset])), map(np.random.default_rng, (0, 1))
+    first, other = (batch_loss(model, batch, torch.ones(3), rng, phase_at(0.0), soft_dice=True) for rng in streams)
+    assert first == other
+    assert first.requires_grad
+
+
+def test_paper_seats_are_distinct_and_sometimes_none():
+    """Every share of the segmenter's training occurs, no seat twice in a scene; some crops get no seat."""
+    coarse = torch.randn(3, 2, 32, 32, generator=torch.Generator().manual_seed(0))
+    drawn = [draw_paper_seats(coarse, 64, CONFIG, np.random.default_rng(seed)) for seed in range(80)]
+    assert {row.shape[1] for row in drawn} == {0, *(round(64 * share) for share, _ in SHARES)}
+    assert all(len(scene.unique()) == len(scene) for row in drawn for scene in row)
+    assert {int(row.max()) for row in drawn if row.numel()} <= set(range(64))
+
+
+def test_half_of_the_papers_seats_lie_on_edges():
+    """With one edge in the coarse image, about half of the draws begin with a seat that touches it."""
+    coarse = torch.zeros(1, 2, 32, 32)
+    coarse[..., 18:] = 1.0  # an edge between columns 17 and 18: seats of column 4
+    drawn = (draw_paper_seats(coarse, 64, CONFIG, np.random.default_rng(seed)) for seed in range(80))
+    first = [int(row[0, 0]) % 8 == 4 for row in drawn if row.numel()]
+    assert 0.35 < np.mean(first) < 0.75

@@ -14,9 +14,12 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from models.network.sizes import PRESETS, Preset
 from models.weights.files import (
     FORMAT,
     UNSEALED,
+    Weights,
+    check_two_scale,
     content_key,
     describe_weights,
     load_any_weights,
@@ -27,7 +30,7 @@ from models.weights.files import (
 )
 from models.weights.sealed_files import SEAL, TENSORS
 from pipeline.errors import WeightsError
-from tests.models.conftest import Maker
+from tests.models.conftest import Maker, make_any_weights
 
 
 def _about(path: Path) -> dict[str, Any]:
@@ -51,24 +54,22 @@ def saved(tiny: Maker, tmp_path: Path) -> Path:
     return tmp_path / "w.safetensors"
 
 
-def test_everything_comes_back_bit_by_bit(tiny: Maker, saved: Path):
-    """Parameters, basis, normalisation, classes, colours and record are those that were saved."""
-    before, after = tiny(), load_weights(saved)
-    old, new = before.segmenter.state_dict(), after.segmenter.state_dict()
+@pytest.mark.parametrize("preset", PRESETS)
+def test_everything_comes_back_bit_by_bit(tmp_path: Path, preset: Preset):
+    """Parameters, basis, normalisation, classes, colours and record of any design are those that were saved."""
+    path, before = tmp_path / "w.safetensors", make_any_weights(**PRESETS[preset])
+    save_weights(before, path)
+    after, described = load_any_weights(path), describe_weights(path)
+    old, new = before.network.state_dict(), after.network.state_dict()
     assert list(old) == list(new)
     assert all(torch.equal(old[name], new[name]) for name in old)
-    assert (after.config, after.basis, after.class_names, after.record) == (
-        before.config,
-        before.basis,
-        before.class_names,
-        before.record,
-    )
+    for one in (after, described):
+        told = (one.config, one.basis, one.class_names, one.record)
+        assert told == (before.config, before.basis, before.class_names, before.record)
     for name in ("centre", "spread", "whitening"):
         assert (getattr(after.normalisation, name) == getattr(before.normalisation, name)).all()
     assert (after.class_colours == before.class_colours).all()
-    assert not after.segmenter.training
-    described = describe_weights(saved)
-    assert (described.config, described.basis, described.record) == (after.config, after.basis, after.record)
+    assert (isinstance(after, Weights), after.network.training) == (preset == "two-scale", False)
 
 
 def test_saving_twice_gives_equal_files(tiny: Maker, saved: Path, tmp_path: Path):
@@ -288,3 +289,14 @@ def test_what_is_damaged_is_not_sealed(saved: Path):
     with pytest.raises(WeightsError, match="not finite"):
         seal_weights(saved)
     assert saved.read_bytes() == before
+
+
+@pytest.mark.parametrize("preset", [preset for preset in PRESETS if preset != "two-scale"])
+def test_a_survey_refuses_a_control(preset: Preset, tmp_path: Path):
+    """The message names the file, the control in it, and how weights for a survey are made."""
+    path = tmp_path / "w.safetensors"
+    save_weights(make_any_weights(**PRESETS[preset]), path)
+    with pytest.raises(WeightsError, match=f"w.safetensors holds the control '{preset}'.*spectralzoom train DATASET"):
+        load_weights(path)
+    with pytest.raises(WeightsError, match="a survey needs weights of two scales"):
+        check_two_scale(describe_weights(path).config, path)
