@@ -19,7 +19,7 @@ from flows.evaluate.request import EvaluateRequest
 from flows.survey.scene import check_labels, judged_labels
 from flows.training.data import TrainingData, farm_test_data, open_training_data
 from flows.training.look import observe_scene
-from models.network.dead_pixels import patches_of
+from models.network.spectral import patches_of
 from models.reading.inference import CoarseLook, Glance, glance_of_columns
 from models.training.examples import normalised
 from models.weights.files import AnyWeights, Description, Weights, content_key, describe_weights

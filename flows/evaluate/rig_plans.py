@@ -16,7 +16,7 @@ from flows.evaluate.costs import plan_seconds
 from flows.evaluate.frames import Look, look_at
 from flows.evaluate.rows import Seats, Trial
 from models.evaluation.metrics import confusion
-from models.policies.free_seats import RANDOM_DRAWS
+from models.evaluation.placement import RANDOM_DRAWS
 from models.policies.policies import score_seats
 from models.reading.inference import segment
 from models.weights.files import Weights

@@ -22,8 +22,17 @@ from flows.evaluate.series import Record, Runs, seeds_of
 from models.evaluation.boundary import boundary_counts
 from models.evaluation.metrics import confusion
 from models.evaluation.placement_metrics import average_precision, gain_sums, oracle_gain, rank_correlation, top_seats
+from flows.evaluate.frames import Look, Sight
+from models.evaluation.metrics import boundary_counts, confusion
+from models.evaluation.placement import (
+    RANDOM_DRAWS,
+    average_precision,
+    gain_sums,
+    oracle_gain,
+    rank_correlation,
+    top_seats,
+)
 from models.network.cost import MultiplyAdds, multiply_adds
-from models.policies.free_seats import RANDOM_DRAWS
 from models.policies.policies import score_seats
 from models.reading.control_maps import control_multiply_adds, draw_with_control
 from models.reading.inference import Glance, segment

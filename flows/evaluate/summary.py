@@ -22,22 +22,23 @@ from flows.evaluate.series import (
     mean_or_none,
     summarise_curves,
 )
-from models.evaluation.boundary import boundary_iou, mean_boundary_iou
 from models.evaluation.metrics import (
     average_accuracy,
+    boundary_iou,
     false_pixels,
     frequency_weighted_iou,
     gap_closed,
     iou_per_class,
     kappa,
     labelled_classes,
+    mean_boundary_iou,
     mean_iou,
     miou_of_shown_classes,
     miou_over_frame_classes,
     miou_over_frames,
     overall_accuracy,
 )
-from models.evaluation.placement_metrics import captured_gain
+from models.evaluation.placement import captured_gain
 
 Key = tuple[str, float]
 ENDS = ("none", "all")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 from flows.settings.survey_settings import BUILT_IN_SCENES, RIG_FIELD, MapChoice, Settings
-from models.network.vgg_sizes import TRAINED_VGG_FROM, VGG_FROM
+from models.network.sizes import TRAINED_VGG_FROM, VGG_FROM
 from pipeline.errors import SettingsError
 from pipeline.rig.device_settings import MOST_PAIRS
 from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from flows.survey.run import SurveyRun, weights_path
 from models.network.vgg_sizes import saliency_bytes
 from models.policies.policies import IMAGE_POLICIES, NETWORK_POLICIES, score_seats
+from models.network.sizes import saliency_bytes
+from models.policies.policies import IMAGE_POLICIES
 from models.policies.vgg_file import VggFile
 from models.reading.inference import CoarseLook, Glance, look_coarsely, read_glance, segment
 from models.reading.regions import HALO_CELLS, REGION_PX, Region, most_bytes, plan_regions, whole_field

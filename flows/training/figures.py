@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.evaluation.metrics import agreement, confusion
-from models.network.dead_pixels import patches_of
+from models.evaluation.placement import CONTROL_SHARE, RANDOM_DRAWS, Controls, Counts, agreement_of_draws, run_controls
 from models.network.segmenter import Segmenter
-from models.policies.free_seats import CONTROL_SHARE, RANDOM_DRAWS, Controls, Counts, agreement_of_draws, run_controls
+from models.network.spectral import patches_of
 from models.policies.policies import score_seats
 from models.reading.control_maps import draw_with_control
 from models.reading.inference import Glance, glance_of_columns

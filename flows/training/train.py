@@ -16,12 +16,13 @@ from flows.training.figures import validate
 from flows.training.look import observe_scene
 from models.network.sizes import PRESETS, Positions, Preset, SegmenterConfig
 from models.network.spectral import SpectralBasis
-from models.training.checkpoint import read_checkpoint
 from models.training.examples import Observation, measured_normalisation, normalised
 from models.training.start_weights import StartFile
 from models.training.train import Progress, TrainingSettings, train
 from models.weights.files import AnyWeights, save_weights, with_record
 from pipeline.errors import SceneError, SettingsError, ShapeError
+from models.weights.sealed_files import read_checkpoint
+from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES

@@ -37,21 +37,13 @@ def paired_interval(
 ) -> Interval:
     """Bootstrap the difference of two rows over frames, and over seeds of the training where there are several.
 
-    Parameters
-    ----------
-    first, second
-        (run, frame, class, class) confusion counts. A run is a seed of the training or of the placement; a row's
-        figure is the mean over its runs of the mIoU of the drawn frames together. The rows may differ in runs, not in
-        frames. A frame that a run did not judge is all zeros.
-    seeds
-        Of each row, which seed of the training every run is of, (run,) from 0. Seeds are drawn with replacement too;
-        rows of equally many share the draw. Without them all runs count alike.
-    draws
-        How many times as many frames as there are are drawn, with replacement.
+    ``first`` and ``second`` are (run, frame, class, class) confusion counts. A run is a seed of the training or of the
+    placement; a row's figure is the mean over its runs of the mIoU of the drawn frames together. The rows may differ in
+    runs, not in frames. A frame that a run did not judge is all zeros. ``draws`` times as many frames as there are are
+    drawn, with replacement. ``seeds`` say of each row which seed of the training every run is of, (run,) from 0: seeds
+    are drawn with replacement too, and rows of equally many share the draw; without them all runs count alike.
 
-    Raises
-    ------
-    ShapeError : the rows differ in frames or classes, or seeds are not given for every run.
+    Raises ShapeError where the rows differ in frames or classes, or seeds are not given for every run.
     """
     if first.shape[1:] != second.shape[1:] or first.ndim != 4:
         raise ShapeError(f"expected two rows of the same frames and classes, got {first.shape} and {second.shape}")

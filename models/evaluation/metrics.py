@@ -7,6 +7,10 @@ classes, whatever they show. A class that a map shows and the labels lack is a f
 
 Before, the mean was over the classes that labels or map show (`miou_of_shown_classes`): a single stray pixel of a
 false class was another IoU of 0 in the mean of the map that has it, and none in the mean of the map beside it.
+
+`boundary_counts` and `boundary_iou` look near borders alone (Cheng et al., arXiv 2103.16562): of each class only the
+pixels within ``d`` px (chessboard) of the border of its own region are kept, in the labels and in the map. The edge of
+the image is a border, and so is that of what has no label.
 """
 
 from __future__ import annotations
@@ -17,15 +21,14 @@ from numpy.typing import NDArray
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import UNLABELLED
 
+DIAGONAL_SHARE = 0.02  # the default of Cheng et al.
+
 
 def confusion(labels: NDArray[np.integer], predicted: NDArray[np.integer], classes: int) -> NDArray[np.int64]:
-    """Count pixels by label (row) and prediction (column), (classes, classes) int64.
+    """Count pixels by label (row) and prediction (column), (classes, classes) int64; counts of parts add up.
 
-    Labels of 255 are left out before counting; counts of parts add up to the count of the whole.
-
-    Raises
-    ------
-    ShapeError : different shapes, or a label or prediction outside 0..classes-1 (255 allowed in labels).
+    Labels of 255 are left out before counting. Raises ShapeError for different shapes, or a label or prediction outside
+    0..classes-1 (255 allowed in labels).
     """
     if labels.shape != predicted.shape:
         raise ShapeError(f"labels are {labels.shape}, the class map is {predicted.shape}; they must be equal")
@@ -96,10 +99,9 @@ def overall_accuracy(counts: NDArray[np.int64]) -> float:
 
 
 def average_accuracy(counts: NDArray[np.int64]) -> float:
-    """Mean over the labelled classes of the share of their pixels found."""
+    """Mean over the labelled classes of the share of their pixels found; NaN when nothing is labelled."""
     support = counts.sum(axis=1)
-    present = support > 0
-    return float((np.diag(counts)[present] / support[present]).mean()) if present.any() else float("nan")
+    return _mean_of_known(np.divide(np.diag(counts), support, out=np.full(len(counts), np.nan), where=support > 0))
 
 
 def kappa(counts: NDArray[np.int64]) -> float:
@@ -142,3 +144,54 @@ def miou_over_frame_classes(frames: NDArray[np.int64]) -> float:
 def _mean_of_known(values: NDArray[np.float64]) -> float:
     known = values[~np.isnan(values)]
     return float(known.mean()) if known.size else float("nan")
+
+
+def boundary_px(shape: tuple[int, int], share: float = DIAGONAL_SHARE) -> int:
+    """Width of the boundary [px]: a share of the diagonal, rounded, at least 1."""
+    return max(1, round(share * float(np.hypot(*shape))))
+
+
+def boundary_counts(
+    labels: NDArray[np.integer], predicted: NDArray[np.integer], classes: int, width: int | None = None
+) -> NDArray[np.int64]:
+    """Count boundary pixels of each class, (class, 2) int64: in both, in either. Counts of images add up.
+
+    ``labels`` and ``predicted`` are (y, x) class indices; where the label is 255 neither counts. ``width`` is that of
+    the boundary [px], by default 2 % of the image's diagonal. Raises ShapeError where the two are not of one (y, x)
+    size.
+    """
+    if labels.shape != predicted.shape or labels.ndim != 2:
+        raise ShapeError(f"labels are {labels.shape}, the class map is {predicted.shape}; they must be equal, (y, x)")
+    d = boundary_px(labels.shape) if width is None else width
+    seen = labels != UNLABELLED
+    counts = np.zeros((classes, 2), np.int64)
+    for number in range(classes):
+        truth = near_border(labels == number, d)
+        drawn = near_border((predicted == number) & seen, d)
+        counts[number] = np.count_nonzero(truth & drawn), np.count_nonzero(truth | drawn)
+    return counts
+
+
+def near_border(region: NDArray[np.bool_], width: int) -> NDArray[np.bool_]:
+    """Pixels of a (y, x) region within ``width`` px of what is not the region; the image ends where the array does."""
+    from scipy.ndimage import minimum_filter1d
+
+    if not region.any():
+        return region
+    inner = region.astype(np.uint8)
+    for axis in (0, 1):
+        inner = minimum_filter1d(inner, 2 * width + 1, axis=axis, mode="constant", cval=0)
+    border: NDArray[np.bool_] = region & (inner == 0)
+    return border
+
+
+def boundary_iou(counts: NDArray[np.int64], labelled: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Boundary IoU of each class from `boundary_counts`; NaN for a class that the labels lack (`labelled_classes`)."""
+    both, either = counts[:, 0].astype(np.float64), counts[:, 1]
+    iou: NDArray[np.float64] = np.divide(both, either, out=np.full(len(both), np.nan), where=labelled)
+    return iou
+
+
+def mean_boundary_iou(counts: NDArray[np.int64], labelled: NDArray[np.bool_]) -> float:
+    """Mean over the classes that the labels have; NaN where there is none."""
+    return _mean_of_known(boundary_iou(counts, labelled))

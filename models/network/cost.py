@@ -5,8 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 
-from models.network.sizes import BOTTOM, SCORER_WIDTH, SegmenterConfig, level_widths, scorer_inputs
-from models.network.vgg_sizes import saliency_multiply_adds
+from models.network.sizes import (
+    BOTTOM,
+    SCORER_WIDTH,
+    SegmenterConfig,
+    level_widths,
+    saliency_multiply_adds,
+    scorer_inputs,
+)
 from pipeline.geometry.grid import SceneGrid
 
 
@@ -25,18 +31,9 @@ class MultiplyAdds:
         return self.glance + self.score + self.encode + self.decode
 
 
-SCORE_PER_PIXEL = {  # per coarse pixel; entropy also per class
-    "entropy": 2,
-    "margin": 4,
-    "sobel": 19,
-    "saliency": 75,
-    "spectral-residual": 120,
-    "random": 0,
-    "stratified": 0,
-    "centre": 0,
-    "uniform": 0,
-    "mask": 0,
-}
+SCORE_PER_PIXEL = {"entropy": 2, "margin": 4, "sobel": 19, "saliency": 75, "spectral-residual": 120} | dict.fromkeys(
+    ("random", "stratified", "centre", "uniform", "mask"), 0
+)  # per coarse pixel; entropy also per class
 AVERAGED = {"sobel": 1, "saliency": 2, "spectral-residual": 1}  # how often these go through all columns
 
 
@@ -45,21 +42,21 @@ def multiply_adds(
 ) -> MultiplyAdds:
     """Count a survey with ``seats`` fine patches of ``bands`` bands; ``policy=None`` counts no score.
 
-    ``channels`` are those that VGG19 reads, for the policies through it.
-
-    The glance is the reading of the coarse pass, counted once: fine patches read what is kept of it.
+    ``channels`` are those that VGG19 reads, for the policies through it. The glance is the reading of the coarse pass,
+    counted once: fine patches read what is kept of it.
     """
     p, s = config.patch, config.factor
     rows, columns = (size // (p * s) for size in grid.padded_shape)
-    cells, side = rows * columns, config.token_side**2
-    basis = p * p * bands * config.columns
-    glance = cells * (basis + _stem(config, config.coarse_width) + _coarse_decoder(config))
-    glance += _transformer(config, cells * side, 0)
-    encode = seats * (basis + _stem(config, config.width)) + _transformer(config, seats * side, cells * side)
-    decode = seats * _fine_decoder(config)
-    if policy is None:
-        return MultiplyAdds(glance, 0, encode, decode)
-    return MultiplyAdds(glance, _score(config, policy, (rows * p, columns * p), channels), encode, decode)
+    cells, side, pixels = rows * columns, config.token_side**2, p * p
+    wide, narrow = config.width, config.coarse_width
+    basis = pixels * bands * config.columns
+    drawn = _head(config, narrow) + pixels * (9 * narrow**2 + narrow * config.classes)
+    glance = cells * (basis + _stem(config, narrow) + drawn) + _transformer(config, cells * side, 0)
+    encode = seats * (basis + _stem(config, wide)) + _transformer(config, seats * side, cells * side)
+    under = (p // s + 2) ** 2 * narrow * wide
+    decode = seats * (_head(config, wide) + under + pixels * (11 * wide**2 + wide * config.classes))
+    score = 0 if policy is None else _score(config, policy, (rows * p, columns * p), channels)
+    return MultiplyAdds(glance, score, encode, decode)
 
 
 def control_multiply_adds(config: SegmenterConfig, grid: SceneGrid, seats: int, bands: int) -> MultiplyAdds:
@@ -84,29 +81,18 @@ def control_multiply_adds(config: SegmenterConfig, grid: SceneGrid, seats: int, 
 
 def _score(config: SegmenterConfig, policy: str, coarse: tuple[int, int], channels: int) -> int:
     """The policy over (y, x) coarse pixels; VGG19 reads some more around them."""
+    pixels = coarse[0] * coarse[1]
     if policy in ("vgg-static", "vgg-trained"):
         return saliency_multiply_adds(coarse, config.columns, channels)
-    if policy == "self-attention":
-        return _received_attention(config, coarse)
-    if policy == "gain":
-        return _scorer(config, coarse)
+    if policy == "self-attention":  # the weights of one layer once more, and their sum over heads and queries
+        tokens = pixels // config.patch**2 * config.token_side**2
+        return tokens**2 * (config.dim + config.heads)
+    if policy == "gain":  # entropy and pooling per coarse pixel, then the network per seat
+        inputs, seats = scorer_inputs(config), pixels // (config.patch // config.factor) ** 2
+        per_seat = SCORER_WIDTH * (inputs + 9 + SCORER_WIDTH + 1) + 1
+        return pixels * (2 + config.classes + inputs) + seats * per_seat
     per_pixel = SCORE_PER_PIXEL[policy] + (config.classes if policy == "entropy" else 0)
-    per_pixel += AVERAGED.get(policy, 0) * config.columns
-    return per_pixel * coarse[0] * coarse[1]
-
-
-def _received_attention(config: SegmenterConfig, coarse: tuple[int, int]) -> int:
-    """The weights of one layer once more, and their sum over heads and queries."""
-    tokens = coarse[0] * coarse[1] // config.patch**2 * config.token_side**2
-    return tokens**2 * (config.dim + config.heads)
-
-
-def _scorer(config: SegmenterConfig, coarse: tuple[int, int]) -> int:
-    """Entropy and pooling per coarse pixel, then the network per seat."""
-    cells, width = config.patch // config.factor, SCORER_WIDTH
-    per_pixel = 2 + config.classes + scorer_inputs(config)
-    per_seat = width * (scorer_inputs(config) + 9 + width + 1) + 1
-    return coarse[0] * coarse[1] * per_pixel + coarse[0] // cells * (coarse[1] // cells) * per_seat
+    return (per_pixel + AVERAGED.get(policy, 0) * config.columns) * pixels
 
 
 def _levels(config: SegmenterConfig, width: int) -> list[tuple[int, int]]:
@@ -134,14 +120,3 @@ def _transformer(config: SegmenterConfig, tokens: int, before: int) -> int:
     """Closed form L ((4 + 2 r) d^2 N + 2 N (M + N) d) of N tokens that read M others and each other."""
     d, r = config.dim, config.mlp_ratio
     return config.layers * ((4 + 2 * r) * d * d * tokens + 2 * tokens * (before + tokens) * d)
-
-
-def _coarse_decoder(config: SegmenterConfig) -> int:
-    pixels, width = config.patch**2, config.coarse_width
-    return _head(config, width) + pixels * (9 * width * width + width * config.classes)
-
-
-def _fine_decoder(config: SegmenterConfig) -> int:
-    pixels, width = config.patch**2, config.width
-    under = (config.patch // config.factor + 2) ** 2 * config.coarse_width * width
-    return _head(config, width) + under + pixels * (2 * width * width + 9 * width * width + width * config.classes)

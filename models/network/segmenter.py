@@ -3,22 +3,41 @@
 Shapes: B scenes of H x W fine px, padded to whole cells of p * s px; coarse image H/s x W/s; seats (H/p) x (W/p);
 coarse patches (H/ps) x (W/ps), each p x p coarse px. J spectral columns, d token width, K fine patches a scene, m
 tokens a side of a patch.
+
+Scenes of different sizes are read together: patches of all of them go through stems and heads in chunks that fit the
+caches, and so do tokens through everything of the encoder but attention itself, which runs scene by scene. Nothing is
+padded, no token waits for the longest scene, none is masked.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from models.network.encoder import Encoder, Memory
-from models.network.pixel_side import PatchHead, PatchStem, Residual
-from models.network.scorer import SeatScorer
+from models.network.layers import (
+    ChannelNorm,
+    Encoder,
+    Memory,
+    PatchHead,
+    PatchStem,
+    Residual,
+    code_1d,
+    code_2d,
+    cut,
+    encode_packed,
+    joined,
+    paper_numbers,
+)
+from models.network.sizes import PATCHES_AT_ONCE, SCORER_WIDTH, level_widths, scorer_inputs
 from models.network.sizes import SegmenterConfig as SegmenterConfig
-from models.network.sizes import level_widths
-from models.network.tokens import code_1d, code_2d, paper_numbers
+
+Features = list[Tensor]  # of each level, finest first
 
 
 @dataclass(frozen=True)
@@ -57,22 +76,10 @@ class Segmenter(nn.Module):
     def forward(
         self, coarse: Tensor, fine: Tensor, seats: Tensor, origin: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Classify a batch of scenes.
+        """Logits of the coarse image (B, classes, H/s, W/s) and of the fine patches (B, K, classes, p, p).
 
-        Parameters
-        ----------
-        coarse
-            (B, J, H/s, W/s) normalised columns.
-        fine
-            (B, K, J, p, p) normalised columns of the captured seats.
-        seats
-            (B, K) int64 seat numbers, unique within a scene.
-        origin
-            (B, 2) seat units added to the places, for crops of larger scenes.
-
-        Returns
-        -------
-        Logits of the coarse image (B, classes, H/s, W/s) and of the fine patches (B, K, classes, p, p).
+        ``coarse`` (B, J, H/s, W/s) and ``fine`` (B, K, J, p, p) are normalised columns, ``seats`` (B, K) int64 seat
+        numbers, unique within a scene, ``origin`` (B, 2) seat units added to the places, for crops of larger scenes.
         """
         reading = self.read_coarse(coarse, origin)
         return reading.logits, self.read_fine(reading, fine, seats, origin)
@@ -80,16 +87,9 @@ class Segmenter(nn.Module):
     def read_coarse(self, coarse: Tensor, origin: Tensor | None = None) -> CoarseReading:
         """Read the coarse image alone."""
         rows, columns = (size // self.config.patch for size in coarse.shape[2:])
-        features, tokens = self.coarse_stem(self.coarse_patches(coarse))
+        features, tokens = self.coarse_stem(cut(coarse, self.config.patch).flatten(0, 1))
         read, memory = self.encoder(self.code_coarse(tokens, rows, columns, origin))
-        image = self.coarse_head(features, read.view(tokens.shape))
-        return self.reading_of(image, memory, rows, columns)
-
-    def coarse_patches(self, coarse: Tensor) -> Tensor:
-        """Cut coarse images into patches, (B, J, H/s, W/s) -> (B * patches, J, p, p), row by row."""
-        p = self.config.patch
-        b, j, y, x = coarse.shape
-        return coarse.view(b, j, y // p, p, x // p, p).permute(0, 2, 4, 1, 3, 5).reshape(-1, j, p, p)
+        return self.reading_of(self.coarse_head(features, read.view(tokens.shape)), memory, rows, columns)
 
     def code_coarse(self, tokens: Tensor, rows: int, columns: int, origin: Tensor | None = None) -> Tensor:
         """Tokens of ``rows`` x ``columns`` coarse patches a scene, (B * P, m^2, d), with codes, (B, P m^2, d)."""
@@ -117,17 +117,70 @@ class Segmenter(nn.Module):
         if k == 0:  # convolutions take an empty batch forward but not backward
             return fine.new_zeros(b, 0, self.config.classes, p, p)
         features, tokens = self.fine_stem(fine.flatten(0, 1))
-        read = self.encode_fine(reading, tokens.view(b, k, *tokens.shape[1:]), seats, origin)
-        logits = self.decode_fine(features, read.flatten(0, 1), self.canvas_windows(reading.canvas, seats))
+        coded = self.code_fine(tokens.view(b, k, *tokens.shape[1:]), seats, reading.columns, origin)
+        read = self.encoder(coded, reading.memory)[0].view(tokens.shape)
+        logits = self.decode_fine(features, read, self.canvas_windows(reading.canvas, seats))
         return logits.view(b, k, *logits.shape[1:])
 
-    def encode_fine(
-        self, reading: CoarseReading, tokens: Tensor, seats: Tensor, origin: Tensor | None = None
-    ) -> Tensor:
-        """Let the tokens of fine patches, (B, K, m^2, d), read the coarse ones and each other."""
-        coded = self.code_fine(tokens, seats, reading.columns, origin)
-        read: Tensor = self.encoder(coded, reading.memory)[0]
-        return read.view(tokens.shape)
+    def read_coarse_packed(
+        self, images: Sequence[Tensor], origins: Sequence[Tensor | None], living: Sequence[Tensor | None]
+    ) -> list[CoarseReading]:
+        """Read coarse images of any sizes, (1, J, H/s, W/s) each, as ``read_coarse`` reads one.
+
+        Tokens that are not ``living``, (tokens,) bool, are left out: nothing reads them, and they tell nothing.
+        """
+        if not images:
+            return []
+        p = self.config.patch
+        sizes = [(image.shape[2] // p, image.shape[3] // p) for image in images]
+        counts = [rows * columns for rows, columns in sizes]
+        patches = torch.cat([cut(image, p)[0] for image in images])
+        described = [self.coarse_stem(chunk) for chunk in torch.split(patches, PATCHES_AT_ONCE)]
+        tokens = torch.split(torch.cat([token for _, token in described]), counts)
+        coded = [
+            self.code_coarse(token, *size, origin)[0][slice(None) if alive is None else alive]
+            for token, size, origin, alive in zip(tokens, sizes, origins, living, strict=True)
+        ]
+        read, memories = encode_packed(self.encoder, coded)
+        read = [
+            part if alive is None else part.new_zeros(len(alive), part.shape[1]).index_put((alive,), part)
+            for part, alive in zip(read, living, strict=True)
+        ]
+        drawn = torch.cat(
+            [self.coarse_head(features, token) for features, token in _with_tokens(described, torch.cat(read))]
+        )
+        return [
+            self.reading_of(features, memory, *size)
+            for features, memory, size in zip(torch.split(drawn, counts), memories, sizes, strict=True)
+        ]
+
+    def read_fine_packed(
+        self,
+        readings: Sequence[CoarseReading],
+        patches: Sequence[NDArray[np.floating]],
+        seats: Sequence[Tensor],
+        origins: Sequence[Tensor | None],
+    ) -> Iterator[Tensor]:
+        """Logits of the fine patches of all scenes, one after the other, (some, classes, p, p) at a time.
+
+        Of each scene: its reading, patches (K, p, p, J), in which what is not finite counts as 0, the median, and the
+        numbers (K,) int64 of their seats.
+        """
+        described = [self.fine_stem(chunk) for chunk in _chunks(patches)]
+        if not described:
+            return
+        tokens = torch.split(torch.cat([token for _, token in described]), [len(own) for own in seats])
+        coded = [
+            self.code_fine(token[None], own[None], reading.columns, origin)[0]
+            for token, own, reading, origin in zip(tokens, seats, readings, origins, strict=True)
+        ]
+        read, _ = encode_packed(self.encoder, coded, [reading.memory for reading in readings])
+        under = torch.cat(
+            [self.around_seats(reading.canvas, own[None]) for reading, own in zip(readings, seats, strict=True)]
+        )
+        chunks = torch.split(under, PATCHES_AT_ONCE)
+        for (features, token), window in zip(_with_tokens(described, torch.cat(read)), chunks, strict=True):
+            yield self.decode_fine(features, token, self.bring_up(self.under(window)))
 
     def code_fine(self, tokens: Tensor, seats: Tensor, columns: int, origin: Tensor | None = None) -> Tensor:
         """Tokens of fine patches, (B, K, m^2, d), with their codes, (B, K m^2, d)."""
@@ -192,8 +245,58 @@ class Segmenter(nn.Module):
         """Coarse logits brought up to the fine grid, overwritten where a fine patch is, (B, classes, H, W) float32."""
         p, s = self.config.patch, self.config.factor
         full = F.interpolate(coarse_logits.float(), scale_factor=s, mode="bilinear", align_corners=False)
-        b, c, y, x = full.shape
-        cells = full.view(b, c, y // p, p, x // p, p).permute(0, 2, 4, 1, 3, 5).flatten(1, 2)
-        index = seats[:, :, None, None, None].expand(-1, -1, c, p, p)
-        cells = cells.scatter(1, index, fine_logits.float())
-        return cells.view(b, y // p, x // p, c, p, p).permute(0, 3, 1, 4, 2, 5).reshape(b, c, y, x)
+        cells = cut(full, p)
+        index = seats[:, :, None, None, None].expand(-1, -1, *cells.shape[2:])
+        return joined(cells.scatter(1, index, fine_logits.float()), full.shape[-1] // p)
+
+
+class SeatScorer(nn.Module):
+    """A few convolutions on the grid of seats. Nothing is learned through it by the segmenter that it judges."""
+
+    def __init__(self, config: SegmenterConfig) -> None:
+        super().__init__()
+        self.cells = config.patch // config.factor
+        inputs = scorer_inputs(config)
+        self.norm = ChannelNorm(inputs)
+        self.enter = nn.Conv2d(inputs, SCORER_WIDTH, 1)
+        self.around = nn.Conv2d(SCORER_WIDTH, SCORER_WIDTH, 3, padding=1, padding_mode="replicate", groups=SCORER_WIDTH)
+        self.mix = nn.Conv2d(SCORER_WIDTH, SCORER_WIDTH, 1)
+        self.leave = nn.Conv2d(SCORER_WIDTH, 1, 1)
+        nn.init.zeros_(self.leave.weight)
+        nn.init.zeros_(self.leave.bias)  # type: ignore[arg-type]
+        self.of_entropy = nn.Parameter(torch.tensor(0.2))  # what is learned is added to a share of the entropy
+
+    def forward(self, canvas: Tensor, logits: Tensor) -> Tensor:
+        """Features and logits of the coarse pixels, (B, c, H/s, W/s) -> gain of each seat, (B, H/p, W/p) [nat per px].
+
+        No gradient goes back into either.
+        """
+        canvas, logits = canvas.detach(), logits.detach()
+        probability = logits.float().softmax(dim=1).to(canvas.dtype)
+        entropy = torch.special.entr(probability).sum(dim=1, keepdim=True)
+        images = (canvas, probability, entropy)  # pooled one by one: each as it lies in memory
+        mean = torch.cat([F.avg_pool2d(image, self.cells) for image in images], dim=1)
+        most = torch.cat([F.max_pool2d(image, self.cells) for image in (canvas, entropy)], dim=1)
+        x = self.enter(self.norm(torch.cat([mean, most], dim=1)))
+        x = x + self.mix(self.around(F.gelu(x)))
+        gain: Tensor = self.of_entropy * mean[:, -1] + self.leave(F.gelu(x))[:, 0]
+        return gain
+
+
+def _chunks(patches: Sequence[NDArray[np.floating]]) -> Iterator[Tensor]:
+    """Patches of all scenes, so many at a time whichever scene they are of, (some, J, p, p) channels last."""
+    starts = np.cumsum([0, *map(len, patches)])
+    for first in range(0, int(starts[-1]), PATCHES_AT_ONCE):
+        parts = [
+            own[max(first - start, 0) : max(first + PATCHES_AT_ONCE - start, 0)]
+            for own, start in zip(patches, starts, strict=False)
+        ]
+        chunk = torch.from_numpy(np.concatenate(parts, dtype=np.float32))
+        yield chunk.nan_to_num_(0.0, 0.0, 0.0).permute(0, 3, 1, 2)
+
+
+def _with_tokens(described: Sequence[tuple[Features, Tensor]], read: Tensor) -> Iterator[tuple[Features, Tensor]]:
+    """Chunks of features with their part of the tokens read, (all tokens, d) -> (patches, m^2, d) each."""
+    parts = torch.split(read, [before.shape[0] * before.shape[1] for _, before in described])
+    for (features, before), part in zip(described, parts, strict=True):
+        yield features, part.view(before.shape)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -19,9 +20,9 @@ from pipeline.errors import ShapeError
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from models.network.segmenter import CoarseReading, Segmenter
 
 MOST_WEIGHTS = 2**20  # softmax weights in memory at once
+LAST_QUERIES: ContextVar[list[Tensor] | None] = ContextVar("LAST_QUERIES", default=None)
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,6 @@ class TokenReading:
 @contextmanager
 def queries_kept() -> Iterator[list[Tensor]]:
     """Keep the queries of the last layer, (B, head, N, width), of the last reading that this thread makes inside."""
-    from models.network.encoder import LAST_QUERIES
 
     kept: list[Tensor] = []
     before = LAST_QUERIES.set(kept)
@@ -47,32 +47,13 @@ def queries_kept() -> Iterator[list[Tensor]]:
         LAST_QUERIES.reset(before)
 
 
-def token_reading(
-    segmenter: Segmenter, reading: CoarseReading, kept: list[Tensor], living: NDArray[np.bool_] | None = None
-) -> TokenReading | None:
-    """Take the first scene of a coarse reading and the queries kept of it (None without); nothing is computed yet."""
-    if not kept:
-        return None
-    return TokenReading(
-        kept[-1][0].float().numpy(), reading.memory[-1][0][0].float().numpy(), segmenter.config.token_side, living
-    )
-
-
 def received_attention(
     queries: NDArray[np.floating], keys: NDArray[np.floating], *, most: int = MOST_WEIGHTS
 ) -> NDArray[np.float64]:
     """Share of all attention that each token receives, (token,), summing to 1: the mean over heads and queries.
 
-    Parameters
-    ----------
-    queries, keys
-        (head, token, width).
-    most
-        Weights held at once; queries are taken in so many blocks as that needs. The result does not depend on it.
-
-    Raises
-    ------
-    ShapeError : queries and keys that do not belong together.
+    ``queries`` and ``keys`` are (head, token, width). At most ``most`` weights are held at once, queries in so many
+    blocks as that needs; the result does not depend on it. Raises ShapeError where the two do not belong together.
     """
     if queries.ndim != 3 or queries.shape != keys.shape or not keys.size:
         raise ShapeError(f"expected queries and keys (head, token, width) alike, got {queries.shape} and {keys.shape}")

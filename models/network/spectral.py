@@ -1,8 +1,12 @@
-"""The spectral stem: any number of bands, in any order, onto a fixed number of columns by wavelength."""
+"""The spectral stem: any number of bands, in any order, onto a fixed number of columns by wavelength.
+
+Pixels without a reading are filled from the rest of their patch; of which more than half is dead is not read.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +18,9 @@ REACH = 1.5  # a column is reached by a band within this many column spacings of
 LONGEST_NM, SHORTEST_NM = 3000.0, 200.0
 SPREAD_FLOOR = 1e-3  # least spread of a column, as a share of the median spread
 VARIANCE_FLOOR = 1e-5  # least variance of a direction that whitening brings to 1, as a share of the largest
+Kind = TypeVar("Kind", bound=np.generic)
+MOST_DEAD = 0.5  # a token with more dead pixels than this share is not read
+MOST_COLUMN = 1e12  # of normalised columns: no reading gives more, and squares of more would end the range of float32
 
 
 @dataclass(frozen=True)
@@ -43,13 +50,9 @@ class SpectralBasis:
         A band counts by the stretch of spectrum that it stands for (trapezoid on the sorted wavelengths), so that
         15 or 270 bands give numbers of one scale, and repeated bands share their weight.
 
-        Returns
-        -------
-        (band, column) float32 and (column,) bool. Columns that no band reaches are all zero.
+        Returns (band, column) float32 and (column,) bool. Columns that no band reaches are all zero.
 
-        Raises
-        ------
-        WavelengthError : not finite, or outside 200-3000 nm (micrometres?).
+        Raises WavelengthError for a wavelength that is not finite, or outside 200-3000 nm (micrometres?).
         """
         wavelength = checked_wavelengths(wavelength_nm, len(wavelength_nm))
         centres = np.linspace(self.low_nm, self.high_nm, self.columns)
@@ -189,3 +192,40 @@ class Normalisation:
     def gain_shift(self) -> NDArray[np.float32]:
         """What 100 % more light adds to normalised columns beyond doubling them, (column,)."""
         return np.asarray((self.centre / self.spread) @ self.whitening, np.float32)
+
+
+def all_alive(columns: NDArray[np.floating]) -> bool:
+    """Whether no pixel is dead, without a copy of the columns."""
+    return not columns.size or bool(columns.min() >= -MOST_COLUMN and columns.max() <= MOST_COLUMN)
+
+
+def dead_pixels(columns: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Pixels with a column that is not finite, or larger than any reading gives, (..., column) -> (...)."""
+    if all_alive(columns):
+        return np.zeros(columns.shape[:-1], np.bool_)
+    alive = columns <= MOST_COLUMN  # no copy of the columns: their size would be one
+    alive &= columns >= -MOST_COLUMN
+    return np.asarray(~alive.all(axis=-1), np.bool_)
+
+
+def fill_dead(patches: NDArray[np.floating], dead: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Patches (P, y, x, column) with the mean of each one's living pixels in the dead ones; 0 where none lives."""
+    filled = np.array(patches, np.float32)
+    for patch, holes in zip(filled, dead, strict=True):  # one by one: together they would take several copies of all
+        if holes.any():
+            patch[holes] = 0 if holes.all() else patch[~holes].mean(axis=0, dtype=np.float64)
+    return filled
+
+
+def readable(dead: NDArray[np.bool_], side: int = 1) -> NDArray[np.bool_]:
+    """Which of ``side`` x ``side`` tokens a patch can be read, (P, y, x) dead pixels -> (P, side^2), row by row."""
+    count, height, width = dead.shape
+    cells = dead.reshape(count, side, height // side, side, width // side)
+    return np.asarray(cells.mean(axis=(2, 4)) <= MOST_DEAD, np.bool_).reshape(count, side * side)
+
+
+def patches_of(image: NDArray[Kind], patch: int) -> NDArray[Kind]:
+    """Cut an image whose sides ``patch`` divides, (y, x, ...), into patches (P, patch, patch, ...), row by row."""
+    y, x = image.shape[0] // patch, image.shape[1] // patch
+    cells = image.reshape(y, patch, x, patch, *image.shape[2:]).swapaxes(1, 2)
+    return cells.reshape(y * x, patch, patch, *image.shape[2:])

@@ -1,24 +1,31 @@
 """Attention policies: how much a fine look at each seat is worth, judged from the glance alone.
 
-One table of those that need neither training nor weights of their own; what stands out in an image is measured in
-`models.policies.saliency`, and what lies where in `models.policies.spacing`.
+Two of them measure what stands out in the coarse image (OpenCV's contrib modules). Both look at one grey image, the
+mean of all bands after each was stretched to its own range: neither the brightness of a band nor the order of bands
+counts. What is not finite takes its band's median, a band without contrast adds nothing, and where no band has any,
+nothing stands out. What lies where is scored in `models.policies.spacing`, saliency by VGG19 in `models.policies.vgg`.
 """
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.network.self_attention import attention_of_seats
-from models.policies.saliency import fine_grained, spectral_residual
 from models.policies.spacing import centre_scores, random_scores, stratified_scores, uniform_scores
 from models.reading.inference import CoarseLook, Glance
 from pipeline.errors import SettingsError, ShapeError
 from pipeline.geometry.grid import SceneGrid
 
+Pixels = NDArray[np.float64]
+LEVELS = 65535  # of a stretched band; whole numbers add up alike in any order
+DARK, BRIGHT = 0.1, 99.9  # percentiles between which a band is stretched: one dead pixel is not its range
+FLAT = 1e-6  # a range smaller than this share of the values is rounding, not contrast
+MOST_PX = 1024  # a side of the image whose spectrum is taken: work and memory of larger ones grow, seats do not show it
 Scores = NDArray[np.float64]
 Policy = Literal[
     "gain",
@@ -37,8 +44,75 @@ Policy = Literal[
     "self-attention",
 ]
 POLICIES: tuple[Policy, ...] = get_args(Policy)
-
 MOST_SUMMED = 1e280  # of a mask's values: larger ones are summed in a larger unit
+
+
+def fine_grained(bands: NDArray[np.floating]) -> Pixels:
+    """Contrast of each pixel with six of its surroundings, 24 to 224 px wide, (y, x) in 0..1 of (y, x, band).
+
+    Raises SettingsError where OpenCV is missing, or lacks its contrib modules.
+    """
+    saliency = _opencv().StaticSaliencyFineGrained_create()
+    image = grey_image(bands)
+    return np.zeros(bands.shape[:2]) if image is None else _compute(saliency, np.rint(255 * image).astype(np.uint8))
+
+
+def spectral_residual(bands: NDArray[np.floating]) -> Pixels:
+    """Where the image is not what its smoothed log spectrum predicts, (y, x) in 0..1 of (y, x, band).
+
+    The spectrum is that of the whole image at its own size, up to 1024 px a side. (At the 64 px of its authors the
+    measure finds objects, not the few pixels of a seat.) Raises SettingsError as `fine_grained`.
+    """
+    saliency = _opencv().StaticSaliencySpectralResidual_create()
+    saliency.setImageHeight(min(bands.shape[0], MOST_PX))
+    saliency.setImageWidth(min(bands.shape[1], MOST_PX))
+    image = grey_image(bands)
+    return np.zeros(bands.shape[:2]) if image is None else _compute(saliency, (255 * image).astype(np.float32))
+
+
+def grey_image(bands: NDArray[np.floating]) -> Pixels | None:
+    """Mean of the bands, each stretched to its own range, stretched itself: (y, x) in 0..1; None without contrast."""
+    total = np.zeros(bands.shape[:2], np.int64)
+    for number in range(bands.shape[-1]):
+        band = _stretched(bands[..., number].astype(np.float64))
+        if band is not None:
+            total += np.rint(LEVELS * band).astype(np.int64)
+    return _stretched(total.astype(np.float64))
+
+
+def _stretched(values: Pixels) -> Pixels | None:
+    """Bring the 0.1 and 99.9 % percentiles to 0 and 1, and what is not finite to the median; None without contrast."""
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return None
+    low, middle, high = np.percentile(finite, (DARK, 50.0, BRIGHT))
+    if _is_flat(low, high):  # something small on a plain ground: all that there is to see
+        low, high = finite.min(), finite.max()
+    if _is_flat(low, high):
+        return None
+    filled = np.where(np.isfinite(values), values, middle)
+    stretched: Pixels = np.clip((filled - low) / (high - low), 0.0, 1.0)
+    return stretched
+
+
+def _is_flat(low: float, high: float) -> bool:
+    return bool(high - low <= FLAT * max(abs(low), abs(high)))
+
+
+def _compute(saliency: Any, image: NDArray[np.generic]) -> Pixels:
+    """Let OpenCV measure one image; a number that its logarithm of nothing left behind counts as 0."""
+    found = np.asarray(saliency.computeSaliency(np.ascontiguousarray(image))[1], np.float64)
+    return np.nan_to_num(found, nan=0.0, posinf=0.0, neginf=0.0)
+
+
+def _opencv() -> Any:
+    try:
+        return importlib.import_module("cv2").saliency
+    except (ImportError, AttributeError) as error:
+        raise SettingsError(
+            "the policies saliency and spectral-residual need OpenCV with its contrib modules;"
+            " pip install opencv-contrib-python-headless, or choose another policy"
+        ) from error
 
 
 def score_seats(
@@ -51,27 +125,23 @@ def score_seats(
 ) -> Scores:
     """Score every seat of the padded grid, (seats,) float64; a seat counts by the share of it that lies on the scene.
 
-    Parameters
-    ----------
-    policy
-        What the weights expect a look to gain: ``gain``. How much of the encoder's own attention the place receives:
-        ``self-attention``. By the glance's classes: ``entropy``, or ``margin``, 1 less what the likeliest is ahead of
-        the next. By the coarse image: ``sobel`` edges (the paper's ED), ``saliency`` (fine-grained) or
-        ``spectral-residual``. By place: ``random`` and ``stratified``, by ``seed``, the ``centre`` first, or
-        ``uniform``, a grid. Or ``mask``: a given (y, x) image of the scene's size (the paper's fixed attention
-        policy), in which NaN counts as 0.
-        Or the greatest saliency of the seat's coarse pixels to ``network``: ``vgg-static``, the paper's SA, by
-        photographs, or ``vgg-trained``, its TA, by a network that learned from data of one's own.
+    ``policy`` is one of `POLICIES`: what the weights expect a look to gain (``gain``); how much of the encoder's own
+    attention the place receives (``self-attention``); by the glance's classes ``entropy``, or ``margin``, 1 less what
+    the likeliest is ahead of the next; by the coarse image ``sobel`` edges (the paper's ED), ``saliency``
+    (fine-grained) or ``spectral-residual``; by place ``random`` and ``stratified``, by ``seed``, the ``centre`` first,
+    or ``uniform``, a grid; ``mask``: a given (y, x) image of the scene's size (the paper's fixed attention policy), in
+    which NaN counts as 0; or the greatest saliency of the seat's coarse pixels to ``network``: ``vgg-static``, the
+    paper's SA, by photographs, or ``vgg-trained``, its TA, by a network that learned from data of one's own.
 
-    Raises
-    ------
-    SettingsError : an unknown policy, ``mask`` without a mask, or saliency without OpenCV's contrib modules.
-    ShapeError : a mask of another size than the scene's.
+    Raises SettingsError for an unknown policy, ``mask`` without a mask, or saliency without OpenCV's contrib modules;
+    ShapeError for a mask of another size than the scene's.
     """
-    if policy == "gain":
-        scores = _expected_gain(seen)
-    elif policy == "self-attention":
-        scores = _received_attention(seen)
+    if (policy == "gain" and seen.gain is None) or (policy == "self-attention" and seen.tokens is None):
+        raise SettingsError(f"the policy {policy!r} asks the weights, and nothing was read with them")
+    if policy == "gain" and seen.gain is not None:
+        scores = seen.gain.astype(np.float64)
+    elif policy == "self-attention" and seen.tokens is not None:
+        scores = attention_of_seats(seen.tokens, seen.grid.seat_shape, seen.grid.factor)
     elif policy in _PLACE_SCORES:
         scores = _PLACE_SCORES[policy](seen.grid, seed)
     elif policy == "mask":
@@ -79,7 +149,10 @@ def score_seats(
     elif policy in _PIXEL_SCORES:
         scores = _seat_means(_PIXEL_SCORES[policy](seen), seen)
     elif policy in _IMAGE_SCORES:
-        scores = _seat_means(_on_the_scene(_IMAGE_SCORES[policy], seen), seen)
+        y, x = seen.grid.coarse_shape
+        pixels = np.zeros(seen.columns.shape[:2])  # beyond the scene nothing stands out
+        pixels[:y, :x] = _IMAGE_SCORES[policy](seen.columns[:y, :x])
+        scores = _seat_means(pixels, seen)
     elif policy in NETWORK_POLICIES:
         scores = _network_scores(policy, seen, network)
     else:
@@ -98,22 +171,6 @@ def pixel_entropy(probability: NDArray[np.floating]) -> NDArray[np.float64]:
     return entropy
 
 
-def _expected_gain(seen: Glance) -> Scores:
-    if seen.gain is None:
-        raise SettingsError("the policy 'gain' asks the weights, and nothing was read with them")
-    return seen.gain.astype(np.float64)
-
-
-def _received_attention(seen: Glance) -> Scores:
-    if seen.tokens is None:
-        raise SettingsError("the policy 'self-attention' asks the weights, and nothing was read with them")
-    return attention_of_seats(seen.tokens, seen.grid.seat_shape, seen.grid.factor)
-
-
-def _entropy(seen: Glance) -> NDArray[np.float64]:
-    return pixel_entropy(seen.probability)
-
-
 def _margin(seen: Glance) -> NDArray[np.float64]:
     ranked = np.sort(seen.probability.astype(np.float64), axis=-1)  # NaN comes last and stays NaN
     second = ranked[..., -2] if ranked.shape[-1] > 1 else 0.0
@@ -130,17 +187,9 @@ def _edges(seen: Glance) -> NDArray[np.float64]:
     return edges
 
 
-def _on_the_scene(measure: ImageScore, seen: Glance) -> NDArray[np.float64]:
-    """Measure the part of the coarse image that lies on the scene; beyond it nothing stands out."""
-    y, x = seen.grid.coarse_shape
-    pixels = np.zeros(seen.columns.shape[:2])
-    pixels[:y, :x] = measure(seen.columns[:y, :x])
-    return pixels
-
-
 ImageScore = Callable[[NDArray[np.floating]], NDArray[np.float64]]
 _PIXEL_SCORES: dict[str, Callable[[Glance], NDArray[np.float64]]] = {
-    "entropy": _entropy,
+    "entropy": lambda seen: pixel_entropy(seen.probability),
     "margin": _margin,
     "sobel": _edges,
 }

@@ -8,12 +8,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from models.network.vgg_sizes import TRAINED_VGG_FROM, VGG_FROM
+from models.network.sizes import TRAINED_VGG_FROM, VGG_FROM
 from pipeline.errors import SettingsError, WeightsError
 
 if TYPE_CHECKING:
-    from models.network.vgg import VggFeatures
-    from models.policies.vgg_saliency import VggSaliency
+    from models.policies.vgg import VggFeatures, VggSaliency
     from models.training.pretrained import LoadReport
     from models.weights.files import Weights
 
@@ -47,7 +46,7 @@ class VggFile:
 
         Raises WeightsError as `report`, or its channels are none that these weights can give.
         """
-        from models.policies.vgg_saliency import VggSaliency, channels_of, colours_of
+        from models.policies.vgg import VggSaliency, channels_of, colours_of  # loads torch
 
         network = _network_at(self)[0]
         return VggSaliency(network, channels_of(weights, network) if self.trained else colours_of(weights))
@@ -60,7 +59,7 @@ def _hash(path: Path) -> str:
 
 @lru_cache(maxsize=1)
 def _network_at(file: VggFile) -> tuple[VggFeatures, LoadReport]:
-    from models.training.pretrained import load_vgg
+    from models.policies.vgg import load_vgg  # loads torch
 
     loaded = load_vgg(file.path, trained=file.trained)
     if _hash(file.path) != file.key:

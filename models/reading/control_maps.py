@@ -6,80 +6,51 @@ What a control costs is counted by ``control_multiply_adds``.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
+import torch.nn.functional as F  # noqa: N812 - its usual name
 from numpy.typing import NDArray
+from torch import Tensor
 
-from models.network.cost import control_multiply_adds as control_multiply_adds
-from models.reading.inference import PATCHES_AT_ONCE, CoarseLook, DrawnMap, check_seats, decide, draw_coarse, origin_of
+from models.network.controls import DenseNetwork, PaperNetwork
+from models.network.layers import cut, joined
+from models.network.segmenter import Segmenter
+from models.network.sizes import PATCHES_AT_ONCE
+from models.reading.inference import CoarseLook, DrawnMap, check_patches, decide, draw_coarse, origin_of
 from models.weights.files import AnyWeights
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import SceneGrid, pad_by_reflection
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from models.baselines.dense import DenseNetwork
-    from models.baselines.paper import PaperNetwork
 
 
 def draw_with_control(
     weights: AnyWeights, look: CoarseLook, fine: NDArray[np.floating], seats: NDArray[np.integer]
 ) -> DrawnMap:
-    """Draw the class map of a scene with a control.
+    """Draw the class map of a scene, of its own size, with a control.
 
-    Parameters
-    ----------
-    look
-        The coarse pass in the control's own columns. Read by the paper's network and by ``upsampled``.
-    fine
-        (seat, p, p, column) normalised columns of the fine pass; anything not finite counts as the median.
-    seats
-        (seat,) their numbers on the grid, each once. The paper's network reads those that are given; ``dense`` and
-        ``coarser`` need every valid seat; ``upsampled`` reads none, whatever is given.
+    ``look`` is the coarse pass in the control's own columns, read by the paper's network and by ``upsampled``. ``fine``
+    (seat, p, p, column) are normalised columns of the fine pass; anything not finite counts as the median. ``seats``
+    (seat,) are their numbers on the grid, each once: the paper's network reads those that are given, ``dense`` and
+    ``coarser`` need every valid seat, ``upsampled`` reads none, whatever is given.
 
-    Returns
-    -------
-    Maps of the scene's own size.
-
-    Raises
-    ------
-    ShapeError : weights of two scales, a seat missing, given twice or outside the grid, or patches of another shape.
+    Raises ShapeError for weights of two scales, a seat missing, given twice or outside the grid, or patches of another
+    shape.
     """
-    import torch
-
-    from models.baselines.paper import PaperNetwork
-    from models.network.segmenter import Segmenter
-
     network, numbers = weights.network.eval(), np.ascontiguousarray(seats, np.int64)
     if isinstance(network, Segmenter):
         raise ShapeError("these weights are of two scales; draw with models.reading.inference.segment")
-    check_seats(numbers, look.grid)
-    p, columns = weights.config.patch, weights.config.columns
-    if fine.shape != (len(numbers), p, p, columns):
-        expected = (len(numbers), p, p, columns)
-        raise ShapeError(f"expected patches of shape {expected} (seat, y, x, column), got {fine.shape}")
+    check_patches(fine, numbers, look.grid, weights.config)
     with torch.inference_mode():
         if isinstance(network, PaperNetwork):
-            drawn = _draw_paper(network, look, fine, numbers)
+            coarse = torch.from_numpy(look.columns).permute(2, 0, 1)[None].contiguous()
+            logits = network.token_logits(coarse, _tensor(fine)[None], torch.from_numpy(numbers)[None])
+            span = look.grid.patch * look.grid.factor
+            drawn = draw_coarse(logits, SceneGrid(look.grid.height, look.grid.width, 1, span))
         elif network.config.sight == "halved":
             drawn = _draw_halved(network, look, fine, numbers)
         else:
             drawn = _draw_dense(network, look, fine, numbers)
-    scene = np.s_[: look.grid.height, : look.grid.width]
-    return DrawnMap(drawn.classes[scene].copy(), drawn.confidence[scene].copy())
-
-
-def _draw_paper(
-    network: PaperNetwork, look: CoarseLook, fine: NDArray[np.floating], seats: NDArray[np.int64]
-) -> DrawnMap:
-    import torch
-
-    coarse = torch.from_numpy(look.columns).permute(2, 0, 1)[None].contiguous()
-    logits = network.token_logits(coarse, _tensor(fine)[None], torch.from_numpy(seats)[None])
-    span = look.grid.patch * look.grid.factor
-    return draw_coarse(logits, SceneGrid(look.grid.height, look.grid.width, 1, span))
+    return drawn.of_scene(look.grid)
 
 
 def _draw_dense(
@@ -108,10 +79,6 @@ def _draw_halved(
     network: DenseNetwork, look: CoarseLook, fine: NDArray[np.floating], seats: NDArray[np.int64]
 ) -> DrawnMap:
     """Read means of 2 x 2 px and bring the map up."""
-    import torch
-
-    from models.baselines.dense import joined
-
     grid, p = look.grid, look.grid.patch
     coarser = SceneGrid(grid.height, grid.width, p, 2)
     rows, across = (size // (2 * p) for size in coarser.padded_shape)
@@ -127,8 +94,6 @@ def _draw_halved(
 
 def _read(network: DenseNetwork, chunks: Iterator[Tensor], columns: int, look: CoarseLook) -> Iterator[Tensor]:
     """Class logits of all patches, some at a time, in rows of ``columns``; features stay in the caches."""
-    import torch
-
     described = [network.stem(chunk) for chunk in chunks]
     tokens = torch.cat([token for _, token in described])[None]
     read = network.encode(tokens, columns, origin_of(look))[0]
@@ -144,19 +109,12 @@ def _in_chunks(patches: NDArray[np.floating], order: NDArray[np.integer]) -> Ite
 
 def _tensor(patches: NDArray[np.floating]) -> Tensor:
     """(patch, y, x, column) -> (patch, column, y, x), what is not finite as the median."""
-    import torch
-
     finite = np.nan_to_num(np.asarray(patches, np.float32), nan=0.0, posinf=0.0, neginf=0.0)
     return torch.from_numpy(finite).permute(0, 3, 1, 2).contiguous()
 
 
 def _brought_up(look: CoarseLook) -> Iterator[Tensor]:
     """Patches of the coarse image brought up bilinearly, those of one row of valid seats at a time."""
-    import torch
-    import torch.nn.functional as F  # noqa: N812 - its usual name
-
-    from models.baselines.dense import cut
-
     grid, s = look.grid, look.grid.factor
     cells = grid.patch // s
     wide, high = -(-grid.width // grid.patch), -(-grid.height // grid.patch)

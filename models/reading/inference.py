@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from models.network.dead_pixels import all_alive, dead_pixels, fill_dead, patches_of, readable
-from models.network.self_attention import TokenReading, queries_kept, token_reading
-from models.network.sizes import PATCHES_AT_ONCE as PATCHES_AT_ONCE
+from models.network.self_attention import TokenReading, queries_kept
 from models.network.sizes import SegmenterConfig
+from models.network.spectral import all_alive, dead_pixels, fill_dead, patches_of, readable
 from models.weights.files import AnyWeights, Weights
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
@@ -26,6 +25,7 @@ if TYPE_CHECKING:
     from models.network.segmenter import CoarseReading, Segmenter
 
 Precision = Literal["float32", "bfloat16"]
+PATCHES_A_PACK = 256  # scenes are read together up to so many patches; one with more is read alone
 
 
 @dataclass(frozen=True)
@@ -73,21 +73,20 @@ class DrawnMap:
     classes: NDArray[np.uint8]  # (y, x), 255 where nothing can be said
     confidence: NDArray[np.float32]  # (y, x), NaN there
 
+    def of_scene(self, grid: SceneGrid) -> DrawnMap:
+        """Give what of the map of a padded grid lies on the scene."""
+        scene = np.s_[: grid.height, : grid.width]
+        return DrawnMap(self.classes[scene].copy(), self.confidence[scene].copy())
+
 
 def glance(
     weights: Weights, coarse: NDArray[np.floating], wavelength_nm: NDArray[np.floating], grid: SceneGrid
 ) -> Glance:
     """Read the coarse mosaic alone.
 
-    Parameters
-    ----------
-    coarse
-        (y, x, band) scene values of the coarse pass, shape ``grid.coarse_shape``; NaN where nothing was captured. What
-        is no reading by the weights' `most_value` counts as NaN.
-
-    Raises
-    ------
-    ShapeError : the mosaic does not fit the grid, or the grid the weights.
+    ``coarse`` (y, x, band) are scene values of the coarse pass, of shape ``grid.coarse_shape``; NaN where nothing was
+    captured. What is no reading by the weights' `most_value` counts as NaN. Raises ShapeError where the mosaic does not
+    fit the grid, or the grid the weights.
     """
     return read_glance(weights, look_coarsely(weights, [coarse], wavelength_nm, grid))
 
@@ -102,39 +101,33 @@ def look_coarsely(
 ) -> CoarseLook:
     """Bring the coarse mosaic to the spectral columns of the weights, some rows at a time.
 
-    Parameters
-    ----------
-    strips
-        (y, x, band) parts of the mosaic from the top down; together of the shape ``grid.coarse_shape``.
-    origin
-        Row and column of the seat of a larger field in which the grid begins.
-
-    Raises
-    ------
-    ShapeError : the mosaic does not fit the grid, or the grid the weights.
+    ``strips`` are (y, x, band) parts of the mosaic from the top down, together of the shape ``grid.coarse_shape``;
+    ``origin`` is the row and column of the seat of a larger field in which the grid begins. Raises ShapeError where
+    the mosaic does not fit the grid, or the grid the weights.
     """
-    _check_grid(weights, grid)
-    columns, filled = np.empty((*grid.coarse_shape, weights.config.columns), np.float32), 0
+    config = weights.config
+    if (grid.patch, grid.factor) != (config.patch, config.factor):
+        raise ShapeError(
+            f"the weights read patches of {config.patch} px at a factor of {config.factor},"
+            f" the grid has {grid.patch} px and {grid.factor}"
+        )
+    rows, width = grid.coarse_shape
+    columns, filled = np.empty((rows, width, config.columns), np.float32), 0
     strange: NDArray[np.bool_] | None = None
     for strip in strips:
         last = filled + len(strip)
-        if strip.shape[1] != grid.coarse_shape[1] or last > grid.coarse_shape[0]:
-            raise ShapeError(
-                f"the coarse mosaic is {(last, strip.shape[1])}, the scene grid expects {grid.coarse_shape}"
-            )
+        if strip.shape[1] != width or last > rows:
+            raise ShapeError(f"the coarse mosaic is {(last, strip.shape[1])}, the scene grid expects {(rows, width)}")
         columns[filled:last] = weights.columns(strip, wavelength_nm)
         if (wild := beyond_range(strip, weights.normalisation.most_value)) is not None:
-            strange = np.zeros(grid.coarse_shape, np.bool_) if strange is None else strange
+            strange = np.zeros((rows, width), np.bool_) if strange is None else strange
             strange[filled:last] = wild.any(axis=-1)
         filled = last
-    if filled != grid.coarse_shape[0]:
-        raise ShapeError(
-            f"the coarse mosaic is {(filled, grid.coarse_shape[1])}, the scene grid expects {grid.coarse_shape}"
-        )
+    if filled != rows:
+        raise ShapeError(f"the coarse mosaic is {(filled, width)}, the scene grid expects {(rows, width)}")
     y, x = grid.padded_shape
-    padded = pad_by_reflection(columns, (y // grid.factor, x // grid.factor))
-    columns = np.ascontiguousarray(padded, np.float32)
-    living = _mend(columns, weights.config)
+    columns = np.ascontiguousarray(pad_by_reflection(columns, (y // grid.factor, x // grid.factor)), np.float32)
+    living = _mend(columns, config)
     return CoarseLook(grid, columns, origin=origin, living=living, strange=strange)
 
 
@@ -166,38 +159,27 @@ def glance_batch(weights: Weights, looks: Sequence[CoarseLook], *, precision: Pr
     """Read coarse looks of any sizes, each alone, their patches packed; as ``read_glance`` one by one, but faster."""
     import torch
 
-    from models.network.batches import packs
-
     seen: list[Glance] = []
     with torch.inference_mode(), _computing_in(precision):
         for part in packs([_patches_in(look) for look in looks]):
             with queries_kept() as queries:
                 readings = _read_coarse(weights, looks[part])
             asked = torch.split(queries[-1], [reading.memory[-1][0].shape[2] for reading in readings], dim=2)
-            seen += [
-                _glance(weights, look, reading, [own], precision)
-                for look, reading, own in zip(looks[part], readings, asked, strict=True)
-            ]
+            for look, reading, own in zip(looks[part], readings, asked, strict=True):
+                keys = reading.memory[-1][0][0].float().numpy()
+                seen.append(
+                    Glance(
+                        look.grid,
+                        look.columns,
+                        np.ascontiguousarray(reading.logits[0].float().softmax(dim=0).permute(1, 2, 0).numpy()),
+                        origin=look.origin,
+                        living=look.living,
+                        gain=weights.segmenter.score(reading)[0].float().numpy(),
+                        read=Read(weights.segmenter, look.columns, look.origin, reading, precision, look.living),
+                        tokens=TokenReading(own[0].float().numpy(), keys, weights.config.token_side, look.living),
+                    )
+                )
     return seen
-
-
-def _glance(
-    weights: Weights, look: CoarseLook, reading: CoarseReading, queries: list[Tensor], precision: Precision
-) -> Glance:
-    probability = np.ascontiguousarray(reading.logits[0].float().softmax(dim=0).permute(1, 2, 0).numpy())
-    gain = weights.segmenter.score(reading)[0].float().numpy()
-    tokens = token_reading(weights.segmenter, reading, queries, look.living)
-    read = Read(weights.segmenter, look.columns, look.origin, reading, precision, look.living)
-    return Glance(
-        look.grid,
-        look.columns,
-        probability,
-        origin=look.origin,
-        living=look.living,
-        gain=gain,
-        read=read,
-        tokens=tokens,
-    )
 
 
 def segment(
@@ -208,25 +190,14 @@ def segment(
     *,
     precision: Precision = "float32",
 ) -> DrawnMap:
-    """Draw the class map from the coarse look and the fine patches.
+    """Draw the class map from the coarse look and the fine patches, of the scene's own size.
 
-    Parameters
-    ----------
-    patches
-        (seat, p, p, column) normalised columns of the fine pass. A dead pixel (see `models.network.dead_pixels`) counts
-        as the mean of its patch; a patch of which more than half is dead counts as not captured.
-    seats
-        (seat,) their numbers on the grid, each once.
-    precision
-        Of convolutions and matrix products; norms, softmax and the decision are float32.
+    ``patches`` (seat, p, p, column) are normalised columns of the fine pass. A dead pixel (see `dead_pixels`) counts as
+    the mean of its patch; a patch of which more than half is dead counts as not captured. ``seats`` (seat,) are their
+    numbers on the grid, each once; without one the map is the glance brought up to the fine grid. ``precision`` is that
+    of convolutions and matrix products; norms, softmax and the decision are float32.
 
-    Returns
-    -------
-    Maps of the scene's own size. Without a seat this is the glance brought up to the fine grid.
-
-    Raises
-    ------
-    ShapeError : a seat given twice or outside the grid, or patches of another shape.
+    Raises ShapeError for a seat given twice or outside the grid, or patches of another shape.
     """
     return segment_batch(weights, [seen], [patches], [seats], precision=precision)[0]
 
@@ -239,23 +210,14 @@ def segment_batch(
     *,
     precision: Precision = "float32",
 ) -> list[DrawnMap]:
-    """Draw the maps of scenes of any sizes and numbers of seats together, as ``segment`` one by one, but faster.
-
-    Fine patches of all scenes are packed, nothing is padded. For the rest see ``segment``.
-    """
+    """Draw the maps of scenes of any sizes and numbers of seats together, as ``segment`` one by one, but faster."""
     import torch
 
-    from models.network.batches import packs
-
-    scenes = [
-        (look, own, np.asarray(numbers, np.int64)) for look, own, numbers in zip(seen, patches, seats, strict=True)
-    ]
-    for look, own, numbers in scenes:
-        check_seats(numbers, look.grid)
-        expected = (len(numbers), look.grid.patch, look.grid.patch, weights.config.columns)
-        if own.shape != expected:
-            raise ShapeError(f"expected patches of shape {expected} (seat, y, x, column), got {own.shape}")
-    scenes = [(look, *captured(own, numbers)) for look, own, numbers in scenes]
+    scenes = []
+    for look, own, given in zip(seen, patches, seats, strict=True):
+        numbers = np.asarray(given, np.int64)
+        check_patches(own, numbers, look.grid, weights.config)
+        scenes.append((look, *captured(own, numbers)))
     with torch.inference_mode(), _computing_in(precision):
         counts = [_patches_in(look) + len(numbers) for look, _, numbers in scenes]
         return [drawn for part in packs(counts) for drawn in _draw_pack(weights, scenes[part], precision)]
@@ -267,8 +229,6 @@ def _draw_pack(
     """Maps of scenes that are read together."""
     import torch
 
-    from models.network.batches import FineScene, read_fine_packed
-
     looks = [look for look, _, _ in pack]
     readings = readings_of(weights, looks, precision=precision)
     padded = [draw_coarse(reading.logits.float(), look.grid) for reading, look in zip(readings, looks, strict=True)]
@@ -277,19 +237,15 @@ def _draw_pack(
         for drawn, (look, _, seats) in zip(padded, pack, strict=True)
         for place in look.grid.seat_origin(seats)
     )
-    scenes = [
-        FineScene(reading, own, torch.from_numpy(seats), origin_of(look))
-        for reading, (look, own, seats) in zip(readings, pack, strict=True)
-    ]
+    parts = [own for _, own, _ in pack], [torch.from_numpy(seats) for *_, seats in pack]
     p = weights.config.patch
-    for logits in read_fine_packed(weights.segmenter.eval(), scenes):
+    for logits in weights.segmenter.eval().read_fine_packed(readings, *parts, [origin_of(look) for look in looks]):
         confidence, classes = (part.numpy() for part in decide(logits.float(), dim=1))
         for sure, values, (drawn, (y, x)) in zip(confidence, classes, places, strict=False):
             drawn.classes[y : y + p, x : x + p] = values
             drawn.confidence[y : y + p, x : x + p] = sure
     for drawn, look in zip(padded, looks, strict=True):
-        scene = np.s_[: look.grid.height, : look.grid.width]
-        yield DrawnMap(drawn.classes[scene].copy(), drawn.confidence[scene].copy())
+        yield drawn.of_scene(look.grid)
 
 
 def captured(patches: NDArray[np.floating], seats: NDArray[np.int64]) -> tuple[NDArray[np.floating], NDArray[np.int64]]:
@@ -311,24 +267,23 @@ def check_seats(seats: NDArray[np.int64], grid: SceneGrid) -> None:
         raise ShapeError(f"seat {repeated[0]} is given more than once; give each seat one patch")
 
 
-def _check_grid(weights: AnyWeights, grid: SceneGrid) -> None:
-    config = weights.config
-    if (grid.patch, grid.factor) != (config.patch, config.factor):
-        raise ShapeError(
-            f"the weights read patches of {config.patch} px at a factor of {config.factor},"
-            f" the grid has {grid.patch} px and {grid.factor}"
-        )
+def check_patches(
+    patches: NDArray[np.floating], seats: NDArray[np.int64], grid: SceneGrid, config: SegmenterConfig
+) -> None:
+    """Refuse seats as `check_seats`, and patches that are not (seat, p, p, column) (ShapeError)."""
+    check_seats(seats, grid)
+    expected = (len(seats), grid.patch, grid.patch, config.columns)
+    if patches.shape != expected:
+        raise ShapeError(f"expected patches of shape {expected} (seat, y, x, column), got {patches.shape}")
 
 
 def _patches_in(look: CoarseLook) -> int:
-    """Coarse patches of a look."""
     rows, columns = look.grid.seat_shape
     return rows * columns // look.grid.factor**2
 
 
 @contextmanager
 def _computing_in(precision: Precision) -> Iterator[None]:
-    """Let convolutions and matrix products compute in a precision."""
     import torch
 
     if precision == "float32":
@@ -343,26 +298,33 @@ def readings_of(
     weights: Weights, looks: Sequence[CoarseLook], *, precision: Precision = "float32"
 ) -> list[CoarseReading]:
     """Readings of coarse looks. Nothing flows back from fine patches, so one that a glance kept is not made twice."""
-    kept = [_kept(weights, look, precision) for look in looks]
-    unread = [look for look, reading in zip(looks, kept, strict=True) if reading is None]
-    fresh = iter(_read_coarse(weights, unread))
+    kept = [
+        look.read.reading
+        if isinstance(look, Glance) and look.read and look.read.fits(weights, look, precision)
+        else None
+        for look in looks
+    ]
+    fresh = iter(_read_coarse(weights, [look for look, reading in zip(looks, kept, strict=True) if reading is None]))
     return [next(fresh) if reading is None else reading for reading in kept]
-
-
-def _kept(weights: Weights, look: CoarseLook, precision: Precision) -> CoarseReading | None:
-    """The reading that a glance kept, if these weights would read the same."""
-    read = look.read if isinstance(look, Glance) else None
-    return read.reading if read is not None and read.fits(weights, look, precision) else None
 
 
 def _read_coarse(weights: Weights, looks: Sequence[CoarseLook]) -> list[CoarseReading]:
     import torch
 
-    from models.network.batches import read_coarse_packed
-
     images = [torch.from_numpy(look.columns).permute(2, 0, 1)[None] for look in looks]
     living = [None if look.living is None else torch.from_numpy(look.living) for look in looks]
-    return read_coarse_packed(weights.segmenter.eval(), images, [origin_of(look) for look in looks], living)
+    return weights.segmenter.eval().read_coarse_packed(images, [origin_of(look) for look in looks], living)
+
+
+def packs(counts: Sequence[int], most: int = PATCHES_A_PACK) -> list[slice]:
+    """Parts of a row of scenes that are read together: up to ``most`` patches each, or one scene."""
+    starts, filled = [0], 0
+    for number, count in enumerate(counts):
+        if number > starts[-1] and filled + count > most:
+            starts.append(number)
+            filled = 0
+        filled += count
+    return [slice(start, end) for start, end in zip(starts, [*starts[1:], len(counts)], strict=True)] if counts else []
 
 
 def origin_of(look: CoarseLook) -> Tensor | None:

@@ -24,7 +24,6 @@ HALO_CELLS = 1  # coarse patches around a region that are read with it; see benc
 CELL_COPIES, SEAT_COPIES = 8, 2  # of a coarse cell's features, and of a patch's columns, in memory at once
 STRIP_COPIES = 3  # of values on their way from a store to spectral columns
 STRIP_ROWS, PATCHES_READ = 64, 64  # at once: those of a shard
-
 Scalar = TypeVar("Scalar", bound=np.generic)
 
 
@@ -128,18 +127,11 @@ def plan_regions(
 ) -> list[Region]:
     """Cut a field into regions of nearly equal size, row by row; one that is no larger than ``most_px`` stays whole.
 
-    Parameters
-    ----------
-    shard
-        (y, x) of what is written at once [px]: regions hold whole ones, and whole coarse patches.
-    most_px
-        (y, x) of the largest region, as far as one shard and one coarse patch allow.
-    halo
-        Coarse patches that are read around a region where the field goes on.
+    ``shard``: (y, x) of what is written at once [px]: regions hold whole ones, and whole coarse patches. ``most_px``:
+    (y, x) of the largest region, as far as one shard and one coarse patch allow. ``halo``: Coarse patches that are read
+    around a region where the field goes on.
 
-    Raises
-    ------
-    ShapeError : a size or the halo is negative.
+    Raises ShapeError where a size or the halo is negative.
     """
     if halo < 0 or min(*shard, *most_px) < 1:
         raise ShapeError(

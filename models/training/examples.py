@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from models.network.layers import cut
 from models.network.spectral import Normalisation, SpectralBasis
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera, expose, footprint
@@ -50,9 +51,7 @@ def observe(
 
     Goes in strips of rows; each strip draws its noise from a stream of its own.
 
-    Raises
-    ------
-    SceneError : the scene has no labels.
+    Raises SceneError where the scene has no labels.
     """
     if scene.labels is None:
         raise SceneError(f"scene {scene.name} has no labels; training needs them")
@@ -127,7 +126,7 @@ class CropSampler:
         crops = [self._crop(rng, gain_shift) for _ in range(count)]
         coarse, fine, labels = (torch.stack([torch.from_numpy(crop[i]) for crop in crops]) for i in range(3))
         origin = torch.from_numpy(rng.integers(0, 4096, (count, 2)))
-        return Batch(coarse, self._seats(fine), labels, origin)
+        return Batch(coarse, cut(fine, self.patch), labels, origin)
 
     def _crop(self, rng: np.random.Generator, gain_shift: NDArray[np.float32]) -> tuple[NDArray[np.generic], ...]:
         s, size = self.factor, self.size
@@ -148,12 +147,6 @@ class CropSampler:
             for image, sigma in zip(channels_first, (noise / math.sqrt(s), noise), strict=True):
                 image += np.float32(sigma) * rng.standard_normal(image.shape, np.float32)
         return channels_first[0], channels_first[1], np.ascontiguousarray(turn(labels)).astype(np.int64)
-
-    def _seats(self, fine: Tensor) -> Tensor:
-        b, j, y, x = fine.shape
-        p = self.patch
-        cells = fine.view(b, j, y // p, p, x // p, p).permute(0, 2, 4, 1, 3, 5)
-        return cells.reshape(b, -1, j, p, p)
 
 
 def _random_turn(rng: np.random.Generator) -> Callable[[NDArray[np.generic]], NDArray[np.generic]]:

@@ -5,7 +5,7 @@ a captured seat is what the scorer learns to tell; a seat without a label tells 
 other: seats are placed at random and by the entropy of the first reading; then also by the scorer; then in larger
 crops, of which fewer make a batch, as far as the scenes have larger ones.
 
-A control (``models.baselines.designs``) has one map and no scorer: it is asked for that map's loss alone, from the
+A control (``models.network.controls``) has one map and no scorer: it is asked for that map's loss alone, from the
 same crops.
 """
 
@@ -18,14 +18,17 @@ import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor
 
-from models.baselines.designs import Control, Network
-from models.network.scorer import scoring_loss
+from models.network.controls import Control, Network
 from models.network.segmenter import Segmenter, SegmenterConfig
+from models.network.sizes import MOST_GAIN
 from models.training.examples import Batch, Example
 from pipeline.geometry.grid import UNLABELLED
 
 GLANCE_WEIGHT, SCORER_WEIGHT = 0.4, 1.0  # of the map without a seat, and of the scorer, beside the map with seats
 SHARES = ((0.05, 0.15), (0.1, 0.25), (0.2, 0.25), (0.35, 0.15), (0.5, 0.1), (1.0, 0.1))  # (of the seats, how often)
+HUBER_NAT = 0.1  # errors of the scorer above this count linearly
+RANK_WEIGHT = 0.2
+RANK_NAT = 0.05  # two seats that differ by less are hardly put in order
 WITHOUT_SEATS = 0.1  # how often the paper's network, which has no map of a glance beside, gets no seat at all
 
 
@@ -96,32 +99,22 @@ def control_loss(model: Control, batch: Batch, weight: Tensor, rng: np.random.Ge
 
 
 def draw_paper_seats(coarse: Tensor, every: int, config: SegmenterConfig, rng: np.random.Generator) -> Tensor:
-    """Draw seats for the paper's network, (B, K): half the time where the coarse image has edges, else at random.
+    """Draw some of ``every`` seats for the paper's network, (B, K): half the time where the image has edges.
 
-    Edges are those of the policy ``sobel``, the paper's ED; the shares are those of the two-scale segmenter.
-
-    Parameters
-    ----------
-    coarse
-        (B, J, H/s, W/s) normalised columns.
-    every
-        How many seats a scene has.
+    Edges of ``coarse`` (B, J, H/s, W/s) are those of the policy ``sobel``, the paper's ED; the shares are those of the
+    two-scale segmenter.
     """
     shares, odds = zip(*SHARES, strict=True)
     share = 0.0 if rng.random() < WITHOUT_SEATS else float(rng.choice(shares, p=odds))
     worth = torch.from_numpy(rng.random((len(coarse), every))).float()
     if rng.random() < 0.5:
-        edges = F.avg_pool2d(_edges(coarse), config.patch // config.factor).flatten(1)
+        down = coarse.new_tensor([[-1.0, -2.0, -1.0], [0.0, 0.0, 0.0], [1.0, 2.0, 1.0]])
+        brightness = F.pad(coarse.mean(dim=1, keepdim=True), (1, 1, 1, 1), mode="replicate")
+        gradient = F.conv2d(brightness, torch.stack([down, down.T])[:, None])
+        size = gradient.square().sum(dim=1, keepdim=True).sqrt()
+        edges = F.avg_pool2d(size, config.patch // config.factor).flatten(1)
         worth = edges + 0.1 * edges.mean() * worth
     return worth.argsort(dim=1, descending=True, stable=True)[:, : round(share * every)]
-
-
-def _edges(coarse: Tensor) -> Tensor:
-    """Size of Sobel's gradient of the mean column, (B, J, y, x) -> (B, 1, y, x)."""
-    down = coarse.new_tensor([[-1.0, -2.0, -1.0], [0.0, 0.0, 0.0], [1.0, 2.0, 1.0]])
-    kernels = torch.stack([down, down.T])[:, None]
-    gradient = F.conv2d(F.pad(coarse.mean(dim=1, keepdim=True), (1, 1, 1, 1), mode="replicate"), kernels)
-    return gradient.square().sum(dim=1, keepdim=True).sqrt()
 
 
 def draw_seats(
@@ -129,10 +122,7 @@ def draw_seats(
 ) -> Tensor:
     """Draw how many seats and which: (B, K) distinct seat numbers. By entropy or gain they are placed with some chance.
 
-    Parameters
-    ----------
-    glance, score
-        Logits of the coarse pixels (B, classes, H/s, W/s), and gain of the seats (B, seats).
+    ``glance`` are logits of the coarse pixels (B, classes, H/s, W/s), ``score`` the gain of the seats (B, seats).
     """
     shares, odds = zip(*SHARES, strict=True)
     count = max(1, round(float(rng.choice(shares, p=odds)) * score.shape[1]))
@@ -169,3 +159,23 @@ def map_loss(logits: Tensor, losses: Tensor, labels: Tensor, weight: Tensor, *, 
     size = probability.sum(dim=(0, 2, 3)) + truth.sum(dim=(0, 2, 3))
     present = truth.sum(dim=(0, 2, 3)) > 0
     return loss + 0.5 * (1 - 2 * both[present] / (size[present] + 1)).mean()
+
+
+def scoring_loss(score: Tensor, gain: Tensor, known: Tensor | None = None) -> Tensor:
+    """How far scores of seats are from what these gained, in size and in order, (B, K) and (B, K); gains are clipped.
+
+    Huber's loss and, with a fifth of its weight, the pairs of a scene that stand in the wrong order. Seats that are not
+    ``known`` (B, K), which nothing is labelled in, have no say; 0, with a gradient of 0, where none is known.
+    """
+    told = torch.ones_like(score, dtype=torch.bool) if known is None else known
+    if not told.any():
+        return score.sum() * 0.0
+    gain = gain.clamp(-MOST_GAIN, MOST_GAIN)
+    size = F.smooth_l1_loss(score[told], gain[told], beta=HUBER_NAT)
+    apart = gain[:, :, None] - gain[:, None, :]
+    pairs = (apart > 0) & told[:, :, None] & told[:, None, :]
+    if not pairs.any():
+        return size
+    wrong = F.softplus((score[:, None, :] - score[:, :, None]) / RANK_NAT)
+    weight = apart.clamp(0, 1) * pairs
+    return size + RANK_WEIGHT * RANK_NAT * (wrong * weight).sum() / weight.sum()

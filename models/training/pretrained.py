@@ -1,24 +1,23 @@
-"""Putting tensors of other networks into one of ours: by name and shape, with a report of what became of each.
+"""Tensors of other networks put into one of ours, by name and shape, with a report of what became of each.
 
 Known layouts: timm and DeiT vision transformers, Segmenter checkpoints (their encoder is the timm one under
-``encoder.``) and VGG19.
+``encoder.``) and VGG19. Kernels trained on photographs are fitted to other bands and another patch size.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
+import numpy as np
 import torch
+import torch.nn.functional as F  # noqa: N812 - its usual name
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from models.network.spectral import checked_wavelengths
-from models.network.vgg import WAVELENGTHS, VggFeatures, common_names
-from models.network.vgg_sizes import VggSizes
-from models.weights.state_files import read_state
-from pipeline.errors import WavelengthError, WeightsError
+from models.network.spectral import REACH, Normalisation, SpectralBasis
+from pipeline.errors import WeightsError
 
 PATCHES = "patch_embed.proj.weight"
 _UNUSED = {
@@ -33,6 +32,7 @@ _UNUSED = {
     "decoder": "a decoder for its own classes",
     "decode_head": "a decoder for its own classes",
 }
+RGB_NM = (650.0, 550.0, 450.0)
 
 
 @dataclass
@@ -54,42 +54,34 @@ class LoadReport:
 def load_into(module: nn.Module, state: Mapping[str, Tensor], *, names: Mapping[str, str] | None = None) -> LoadReport:
     """Put every tensor that has a place into ``module``, in place; nothing is changed where none has.
 
-    Parameters
-    ----------
-    state
-        Named tensors as `models.weights.state_files.read_state` gives them.
-    names
-        Beginnings of names, of the file to the module's own, ``*`` standing for one number:
-        ``{"blocks.*.attn.qkv": "layers.*.qkv"}``. The first that fits counts; other names stay as they are.
-
-    Raises
-    ------
-    WeightsError : nothing fits; names what was found.
+    ``state`` are named tensors as `models.weights.state_files.read_state` gives them, ``names`` beginnings of names, of
+    the file to the module's own, ``*`` standing for one number: ``{"blocks.*.attn.qkv": "layers.*.qkv"}``. The first
+    that fits counts; other names stay as they are. Raises WeightsError where nothing fits, naming what was found.
     """
     places, report = module.state_dict(), LoadReport()
     found: dict[str, Tensor] = {}
     for name, value in state.items():
-        target = _renamed(_plain(name), names or {})
+        plain = name.removeprefix("encoder.").removeprefix("backbone.")  # of a Segmenter's encoder, and mmseg's
+        target = _renamed(plain, names or {})
         if target not in places:
-            head = _plain(name).split(".")[0]
+            head = plain.split(".")[0]
             report.skipped[name] = _UNUSED.get(head, f"no place for {head}")
             continue
-        why = _refusal(value, places[target].shape)
-        if why:
+        if why := _refusal(value, places[target].shape):
             report.skipped[name] = why
             continue
         found[target] = value
         report.matched.append(name)
     report.missing = [name for name in places if name not in found]
     if not found:
-        raise WeightsError(_nothing_fits(state, report))
+        shown = ", ".join(f"{name} {tuple(value.shape)}" for name, value in list(state.items())[:4]) or "nothing"
+        expected = set(_UNUSED.values())  # of such files: what else is wrong comes first
+        reasons = "; ".join(sorted(set(report.skipped.values()), key=lambda why: (why in expected, why))[:3])
+        raise WeightsError(
+            f"none of {len(state)} tensors fits the network: found {shown} ({reasons}); use weights made for it"
+        )
     module.load_state_dict(found, strict=False)
     return report
-
-
-def _plain(name: str) -> str:
-    """A Segmenter's encoder has the names of timm below ``encoder.``, mmseg's ``backbone.``."""
-    return name.removeprefix("encoder.").removeprefix("backbone.")
 
 
 def _renamed(name: str, names: Mapping[str, str]) -> str:
@@ -108,60 +100,49 @@ def _refusal(value: Tensor, shape: torch.Size) -> str:
     return "" if value.shape == shape else f"{tuple(value.shape)} does not fit {tuple(shape)}"
 
 
-def _nothing_fits(state: Mapping[str, Tensor], report: LoadReport) -> str:
-    shown = ", ".join(f"{name} {tuple(value.shape)}" for name, value in list(state.items())[:4])
-    expected = set(_UNUSED.values())  # of such files: what else is wrong comes first
-    reasons = "; ".join(sorted(set(report.skipped.values()), key=lambda why: (why in expected, why))[:3])
-    found = f"found {shown or 'nothing'} ({reasons})"
-    return f"none of {len(state)} tensors fits the network: {found}; use weights made for it"
+def rgb_response(basis: SpectralBasis) -> NDArray[np.float32]:
+    """How much each spectral column says of red, green and blue (650, 550, 450 nm), (3, column), rows summing to 1."""
+    return wavelength_response(basis, RGB_NM)
 
 
-def load_vgg(path: Path, sizes: VggSizes | None = None, *, trained: bool = False) -> tuple[VggFeatures, LoadReport]:
-    """Read VGG19's convolutions: torchvision's file, the stack alone, or the normalised variant.
+def wavelength_response(basis: SpectralBasis, wavelength_nm: Sequence[float]) -> NDArray[np.float32]:
+    """How much each spectral column says of the light at some wavelengths, (wavelength, column), rows summing to 1.
 
-    Parameters
-    ----------
-    trained
-        On data of one's own: then it may read any number of channels, and a tensor ``wavelength_nm`` in the file, one
-        number for each, says where they lie.
-
-    Raises
-    ------
-    WeightsError : as `read_state`, or a convolution is missing or of another size: another network, such as VGG16;
-        or other channels than photographs have, or wavelengths that do not belong to them.
+    A wavelength outside the basis takes its nearest end: data without blue show red there.
     """
-    sizes = sizes or VggSizes()
-    state = read_state(path)
-    wavelengths = state.pop(WAVELENGTHS, None) if trained else None
-    state = common_names(state, sizes)
-    channels = _channels(state)
-    if channels != 3 and not trained:
-        raise WeightsError(
-            f"{path} reads {channels} channels, a VGG19 of photographs 3; one trained on such data is for the"
-            " policy vgg-trained"
-        )
-    named = None if wavelengths is None else _wavelengths(wavelengths, channels, path)
-    network = VggFeatures(replace(sizes, channels=channels), named)
-    try:
-        report = load_into(network, state)
-    except WeightsError as error:
-        raise WeightsError(f"{path} is no VGG19: {error}") from error
-    if report.missing:
-        raise WeightsError(
-            f"{path} lacks {len(report.missing)} of {len(network.state_dict())} tensors of VGG19's convolutions, the"
-            f" first {report.missing[0]} ({report}); give VGG19 without batch normalisation"
-        )
-    return network.requires_grad_(False).eval(), report
+    centres = np.linspace(basis.low_nm, basis.high_nm, basis.columns)
+    wanted = np.clip(wavelength_nm, basis.low_nm, basis.high_nm)
+    distance = np.abs(wanted[:, None] - centres[None, :]) / basis.spacing_nm
+    bump = np.where(distance <= REACH, np.exp(-0.5 * (distance / 0.5) ** 2), 0.0)
+    return np.asarray(bump / bump.sum(axis=1, keepdims=True), np.float32)
 
 
-def _channels(state: Mapping[str, Tensor]) -> int:
-    """What the first convolution reads; 3 where there is none, which loading refuses."""
-    first = state.get("features.0.weight")
-    return 3 if first is None or first.dim() != 4 else int(first.shape[1])
+def mixed_channels(normalisation: Normalisation, response: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Mix normalised columns to channels by a response (channel, column), (column, channel).
+
+    The median of the training data becomes 0 in every channel, one spread more of all columns 1.
+    """
+    exact = response.astype(np.float64)
+    undo = np.linalg.inv(normalisation.whitening.astype(np.float64)) * normalisation.spread
+    return np.asarray(undo @ exact.T / (exact @ normalisation.spread), np.float32)
 
 
-def _wavelengths(tensor: Tensor, channels: int, path: Path) -> tuple[float, ...]:
-    try:
-        return tuple(checked_wavelengths(tensor.double().numpy(), channels).tolist())
-    except WavelengthError as error:
-        raise WeightsError(f"{path}, tensor {WAVELENGTHS!r}: {error}") from error
+def map_rgb_kernel(kernel: Tensor, response: NDArray[np.floating]) -> Tensor:
+    """Kernel (out, 3, y, x) over colours -> (out, column, y, x), the sum over colours of weight times response.
+
+    It says of the columns what the old one says of the colours mixed from them; grey of all columns is grey.
+    """
+    return torch.einsum("ocyx,cj->ojyx", kernel, torch.as_tensor(np.asarray(response), dtype=kernel.dtype))
+
+
+def resize_patch_kernel(kernel: Tensor, size: tuple[int, int]) -> Tensor:
+    """Kernel (out, in, y, x) of patches -> the same for patches of ``size``.
+
+    Its answer to a patch enlarged bilinearly is the old one to the patch itself: the pseudo-inverse of enlarging.
+    """
+    rows, columns = kernel.shape[2:]
+    pixels = torch.eye(rows * columns, dtype=torch.float64).reshape(-1, 1, rows, columns)
+    enlarge = F.interpolate(pixels, size=size, mode="bilinear", align_corners=False).reshape(rows * columns, -1)
+    fitted = kernel.double().reshape(-1, rows * columns) @ torch.linalg.pinv(enlarge).T
+    resized: Tensor = fitted.reshape(*kernel.shape[:2], *size).to(kernel.dtype)
+    return resized

@@ -13,21 +13,31 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from models.network.segmenter import Segmenter, SegmenterConfig
+from models.network.segmenter import Segmenter
+from models.network.sizes import SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
-from models.training.kernel_fits import mixed_channels, rgb_response
-from models.training.pretrained import PATCHES, LoadReport, load_into
-from models.training.start_columns import STEMS, column_change, for_columns, of_colours, with_patch_kernels
+from models.training.pretrained import (
+    PATCHES,
+    LoadReport,
+    load_into,
+    map_rgb_kernel,
+    mixed_channels,
+    resize_patch_kernel,
+    rgb_response,
+    wavelength_response,
+)
 from models.weights.files import FORMAT, NORMALISATION, Description, describe_weights, read_tensors, unsealed_note
-from models.weights.state_files import read_notes, read_state, read_variant
+from models.weights.state_files import read_heads, read_notes, read_state
 from pipeline.errors import SettingsError, WeightsError
 
-Kind = Literal["vision transformer", "Segmenter", "spectralzoom"]
+STEMS = ("coarse_stem", "fine_stem")
 HEAD_WIDTH = 64  # of every common vision transformer: its file does not say how many heads it has
 START_FROM = (  # in words
     "a vision transformer of timm or DeiT, a Segmenter checkpoint with its variant.yml, or weights that `spectralzoom"
@@ -46,6 +56,58 @@ _TRANSFORMER = {
     "norm": "encoder.norm",
 }
 _OURS = {"blocks": "encoder.blocks", "norm": "encoder.norm"}
+
+
+def column_change(
+    old_basis: SpectralBasis, old: Normalisation, basis: SpectralBasis, new: Normalisation
+) -> NDArray[np.float64]:
+    """What normalised columns of the new data say of the old ones, (new column, old column).
+
+    By wavelength, whatever the number of columns; median and spread of the new data take the place of the old ones.
+    """
+    centres = np.linspace(old_basis.low_nm, old_basis.high_nm, old_basis.columns)
+    mixed = np.asarray(wavelength_response(basis, tuple(centres)).T, np.float64)
+    if basis == old_basis:
+        mixed = np.eye(basis.columns)
+    whitened = mixed @ old.whitening.astype(np.float64)
+    return np.asarray(np.linalg.solve(new.whitening.astype(np.float64), whitened), np.float64)
+
+
+def for_columns(state: Mapping[str, Tensor], change: NDArray[np.float64]) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Bring the first kernels to the new columns, with how; nothing where these mean the same.
+
+    No kernel grows: what hardly varied in the old data and was made large there may vary much in the new.
+    """
+    fitted, how = dict(state), dict[str, str]()
+    if change.shape[0] == change.shape[1] and np.allclose(change, np.eye(len(change)), atol=1e-5):
+        return fitted, how
+    for name in (f"{stem}.{part}.weight" for stem in STEMS for part in ("enter", "embed")):
+        kernel = state.get(name)
+        if kernel is None or kernel.dim() != 4 or kernel.shape[1] != change.shape[1]:
+            continue
+        mixed = torch.einsum("ocyx,jc->ojyx", kernel.double(), torch.from_numpy(change))
+        before, after = (one.flatten(1).norm(dim=1).clamp(min=1e-12) for one in (kernel.double(), mixed))
+        fitted[name] = (mixed * (before / after).clamp(max=1.0)[:, None, None, None]).to(kernel.dtype)
+        how[name] = f"{kernel.shape[1]} to {change.shape[0]} spectral columns by wavelength"
+    return fitted, how
+
+
+def with_patch_kernels(
+    state: Mapping[str, Tensor], config: SegmenterConfig, colours: NDArray[np.float32]
+) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Bring a transformer's patch kernel to both stems: to their patch size, and from colours to columns; with how."""
+    fitted, how = dict(state), dict[str, str]()
+    name = next((name for name in state if name.removeprefix("encoder.") == PATCHES), None)
+    if name is None or not config.patch_kernel or state[name].dim() != 4 or state[name].shape[1] != 3:
+        return fitted, how
+    kernel, side = fitted.pop(name), config.patch // config.token_side
+    sized = kernel if kernel.shape[2:] == (side, side) else resize_patch_kernel(kernel, (side, side))
+    mapped = map_rgb_kernel(sized, colours.T)
+    how[name] = f"{tuple(kernel.shape)} to {tuple(mapped.shape)}, colours to spectral columns by wavelength"
+    bias = fitted.pop(name.removesuffix("weight") + "bias", torch.zeros(kernel.shape[0]))
+    for stem in STEMS:
+        fitted[f"{stem}.embed.weight"], fitted[f"{stem}.embed.bias"] = mapped, bias
+    return fitted, how
 
 
 @dataclass(frozen=True)
@@ -77,9 +139,21 @@ class StartFile:
         if not path.is_file():
             raise SettingsError(f"no file {path}; --init takes {START_FROM}")
         self.path = path
-        self.described = _described(path)
-        self.state = read_state(path) if self.described is None else read_tensors(path, self.described)
-        self.kind: Kind = _kind(self.state, self.described, path)
+        self.described: Description | None = None  # what earlier weights of ours say of themselves
+        if path.suffix == ".safetensors" and FORMAT.partition("/")[0] in read_notes(path).get("about", ""):
+            self.described = describe_weights(path)
+            self.state, self.kind = read_tensors(path, self.described), "spectralzoom"
+            return
+        self.state = read_state(path)
+        for self.kind, prefix in (("vision transformer", ""), ("Segmenter", "encoder.")):
+            qkv = self.state.get(f"{prefix}blocks.0.attn.qkv.weight")
+            if qkv is not None and qkv.dim() == 2:
+                return
+        shown = ", ".join(f"{name} {tuple(value.shape)}" for name, value in list(self.state.items())[:4])
+        raise WeightsError(
+            f"none of {len(self.state)} tensors of {path} has a place in the segmenter: found {shown}; --init takes"
+            f" {START_FROM}"
+        )
 
     @cached_property
     def sizes(self) -> TokenSizes:
@@ -90,7 +164,7 @@ class StartFile:
         plain = {name.removeprefix("encoder."): value for name, value in self.state.items()}
         dim = int(plain["blocks.0.attn.qkv.weight"].shape[-1])
         wide = plain.get("blocks.0.mlp.fc1.weight")
-        heads = read_variant(self.path).heads if self.kind == "Segmenter" else max(dim // HEAD_WIDTH, 1)
+        heads = read_heads(self.path) if self.kind == "Segmenter" else max(dim // HEAD_WIDTH, 1)
         layers = len({name.split(".")[1] for name in plain if name.startswith("blocks.")})
         return TokenSizes(dim, heads, 4 if wide is None else int(wide.shape[0]) // dim, layers)
 
@@ -112,7 +186,10 @@ class StartFile:
         """Whether what is begun from it has a patch kernel: a transformer's of colours, or that of earlier weights."""
         if self.described is not None:
             return self.described.config.patch_kernel
-        return any(name.removeprefix("encoder.") == PATCHES and of_colours(it) for name, it in self.state.items())
+        return any(
+            name.removeprefix("encoder.") == PATCHES and value.dim() == 4 and value.shape[1] == 3
+            for name, value in self.state.items()
+        )
 
     @property
     def earlier(self) -> dict[str, Any]:
@@ -124,15 +201,18 @@ class StartFile:
     ) -> Start:
         """Give what of the file has a place in a segmenter of these sizes, columns and classes.
 
-        Raises
-        ------
-        WeightsError : nothing has.
+        Raises WeightsError where nothing has.
         """
         state, spared, changed = dict(self.state), dict[str, str](), dict[str, str]()
         if self.described is not None:
             state, spared = _without_heads(state, names == self.described.class_names)
-            change = column_change(self.described.basis, _normalisation(self.state), basis, normalisation)
-            state, changed = for_columns(state, change)
+            try:
+                own = Normalisation(*(self.state[f"normalisation.{name}"].numpy() for name in NORMALISATION))
+            except KeyError as error:
+                raise WeightsError(
+                    f"the weights to begin from lack the tensor {error}; train or copy them again"
+                ) from None
+            state, changed = for_columns(state, column_change(self.described.basis, own, basis, normalisation))
         else:
             state, changed = with_patch_kernels(state, config, mixed_channels(normalisation, rgb_response(basis)))
         with torch.random.fork_rng(devices=[]):
@@ -141,19 +221,20 @@ class StartFile:
         _settle(report, self.state, spared, changed)
         missing = set(report.missing)
         taken = {name: value for name, value in model.state_dict().items() if name not in missing}
-        return Start(taken, report, self._record(report))
-
-    def _record(self, report: LoadReport) -> dict[str, Any]:
-        return {
+        skipped: dict[str, list[str]] = {}
+        for name, why in report.skipped.items():
+            skipped.setdefault(why, []).append(name)
+        record = {
             "file": self.path.name,
             "sha256": hashlib.sha256(self.path.read_bytes()).hexdigest(),
             "kind": self.kind,
             "matched": len(report.matched),
             "resized": dict(report.resized),
-            "skipped": by_reason(report.skipped),
+            "skipped": skipped,
             "licence": self._licence(),
             **({} if self.described is None or self.described.sealed else {"unsealed": unsealed_note(self.path)}),
         }
+        return Start(taken, report, record)
 
     def _licence(self) -> str | None:
         """What the file says of its licence, or what the one says that it was begun from; None where neither does."""
@@ -165,34 +246,6 @@ class StartFile:
         return None
 
 
-def by_reason(skipped: Mapping[str, str]) -> dict[str, list[str]]:
-    """Names of tensors by why they were skipped."""
-    found: dict[str, list[str]] = {}
-    for name, why in skipped.items():
-        found.setdefault(why, []).append(name)
-    return found
-
-
-def _described(path: Path) -> Description | None:
-    """What earlier weights of ours say of themselves; None for other files."""
-    if path.suffix != ".safetensors" or FORMAT.partition("/")[0] not in read_notes(path).get("about", ""):
-        return None
-    return describe_weights(path)
-
-
-def _kind(state: Mapping[str, Tensor], described: Description | None, path: Path) -> Kind:
-    if described is not None:
-        return "spectralzoom"
-    for kind, prefix in (("vision transformer", ""), ("Segmenter", "encoder.")):
-        qkv = state.get(f"{prefix}blocks.0.attn.qkv.weight")
-        if qkv is not None and qkv.dim() == 2:
-            return kind  # type: ignore[return-value]
-    shown = ", ".join(f"{name} {tuple(value.shape)}" for name, value in list(state.items())[:4])
-    raise WeightsError(
-        f"none of {len(state)} tensors of {path} has a place in the segmenter: found {shown}; --init takes {START_FROM}"
-    )
-
-
 def _without_heads(state: Mapping[str, Tensor], same: bool) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Leave out what is no part of the segmenter, and what tells classes apart where these are others, with why."""
     beside = {"class_colours", *(f"normalisation.{name}" for name in NORMALISATION)}
@@ -201,13 +254,6 @@ def _without_heads(state: Mapping[str, Tensor], same: bool) -> tuple[dict[str, T
         return kept, {}
     heads = {name: "other classes" for name in kept if name.split(".")[0] in CLASS_HEADS}
     return {name: value for name, value in kept.items() if name not in heads}, heads
-
-
-def _normalisation(state: Mapping[str, Tensor]) -> Normalisation:
-    try:
-        return Normalisation(*(state[f"normalisation.{name}"].numpy() for name in NORMALISATION))
-    except KeyError as error:
-        raise WeightsError(f"the weights to begin from lack the tensor {error}; train or copy them again") from None
 
 
 def _settle(

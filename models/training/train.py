@@ -16,12 +16,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from models.baselines.designs import Network, build_network
+from models.network.controls import Network, build_network
 from models.network.process import keep_freed_memory
 from models.network.sizes import SegmenterConfig
-from models.training.checkpoint import load_checkpoint, save_checkpoint
 from models.training.examples import Batch, CropSampler, Example
 from models.training.objective import PHASES, batch_loss, class_weights, phase_at
+from models.weights.sealed_files import load_checkpoint, save_checkpoint
 from pipeline.errors import PipelineError, WeightsError
 from pipeline.geometry.grid import UNLABELLED
 
@@ -93,7 +93,11 @@ class Trainer:
                 raise WeightsError(f"{config.preset} has no place for {len(strange)} tensors, the first {strange[0]}")
         self.model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.averaged = copy.deepcopy(self.model).eval()
-        groups = _parameter_groups(self.model, settings.weight_decay)
+        parameters = list(self.model.parameters())  # matrices and kernels decay, gains and shifts do not
+        groups: list[dict[str, object]] = [
+            {"params": [p for p in parameters if p.ndim > 1], "weight_decay": settings.weight_decay},
+            {"params": [p for p in parameters if p.ndim <= 1], "weight_decay": 0.0},
+        ]
         self.optimiser = torch.optim.AdamW(groups, settings.learning_rate)
         self.samplers = {}
         for larger in {phase.larger for phase in PHASES}:
@@ -113,9 +117,7 @@ class Trainer:
     def step(self, done: float) -> None:
         """Take one step of a run that is ``done`` so far (0..1): the learning rate follows from it.
 
-        Raises
-        ------
-        TrainingError : the loss or its gradient was not finite three steps in a row.
+        Raises TrainingError where the loss or its gradient was not finite three steps in a row.
         """
         course = self.course
         for group in self.optimiser.param_groups:
@@ -135,7 +137,10 @@ class Trainer:
         if course.in_a_row == 3:
             last = course.step
             raise TrainingError(f"the loss was not finite in steps {last - 2} to {last}; lower the learning rate")
-        _average(self.averaged, self.model, min(self.settings.average, course.step / (course.step + 20)))
+        keep = min(self.settings.average, course.step / (course.step + 20))
+        with torch.no_grad():
+            for slow, quick in zip(self.averaged.parameters(), self.model.parameters(), strict=True):
+                slow.lerp_(quick, 1 - keep)
         value = float(loss.detach())
         if math.isfinite(value):
             course.loss = value if math.isnan(course.loss) else 0.97 * course.loss + 0.03 * value
@@ -215,18 +220,11 @@ def train(
     The same settings and examples start from the same weights and draw the same crops and seats. What follows is equal
     to rounding only: sums differ in their last bit with where memory lies, and ``minutes`` may end the run elsewhere.
 
-    Parameters
-    ----------
-    start
-        Named tensors that the network begins with; others are drawn.
-    checkpoint
-        File that the state is kept in; a killed run of the same settings and examples goes on from it.
+    ``start``: Named tensors that the network begins with; others are drawn. ``checkpoint``: File that the state is kept
+    in; a killed run of the same settings and examples goes on from it.
 
-    Raises
-    ------
-    TrainingError : the loss or its gradient was not finite three steps in a row; the last batch is kept beside the
-        checkpoint.
-    WeightsError : a tensor of ``start`` that the network has no place for.
+    Raises TrainingError where: the loss or its gradient was not finite three steps in a row; the last batch is kept
+    beside the checkpoint. WeightsError : a tensor of ``start`` that the network has no place for.
     """
     keep_freed_memory()
     trainer = Trainer(config, examples, gain_shift, settings, start)
@@ -285,16 +283,3 @@ def _step(model: nn.Module, optimiser: torch.optim.Optimizer, loss: Tensor) -> b
         return False
     optimiser.step()
     return True
-
-
-def _parameter_groups(model: nn.Module, decay: float) -> list[dict[str, object]]:
-    """Matrices and kernels decay, gains and shifts do not."""
-    matrices = [p for p in model.parameters() if p.ndim > 1]
-    rest = [p for p in model.parameters() if p.ndim <= 1]
-    return [{"params": matrices, "weight_decay": decay}, {"params": rest, "weight_decay": 0.0}]
-
-
-@torch.no_grad()
-def _average(averaged: nn.Module, model: nn.Module, keep: float) -> None:
-    for slow, quick in zip(averaged.parameters(), model.parameters(), strict=True):
-        slow.lerp_(quick, 1 - keep)

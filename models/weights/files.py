@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -28,12 +28,14 @@ from pipeline.readings import readings_alone
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from models.baselines.designs import Network
+    from models.network.controls import Network
     from models.network.segmenter import Segmenter
 
 NORMALISATION = ("centre", "spread", "whitening")
 FORMAT, UNSEALED = "spectralzoom-weights/2", "spectralzoom-weights/1"  # the earlier one has no hashes
 KEY_DIGITS = 20
+SPREAD = "normalisation.spread"
+KINDS = {"F32": "torch.float32", "U8": "torch.uint8"}  # by safetensors' names
 Learned = TypeVar("Learned", bound="AnyWeights")
 
 
@@ -99,9 +101,7 @@ class Weights(AnyWeights):
 def save_weights(weights: AnyWeights, path: Path) -> None:
     """Write the file, sealed, by a temporary name and a rename, so that it is whole or absent.
 
-    Raises
-    ------
-    WeightsError : the disk refuses.
+    Raises WeightsError where the disk refuses.
     """
     import torch
 
@@ -137,9 +137,7 @@ def content_key(path: Path) -> str:
 def seal_weights(path: Path) -> bool:
     """Give a file of an earlier version the hashes that it lacks, in place; False where it has them and they fit.
 
-    Raises
-    ------
-    WeightsError : as in ``load_weights``, or the disk refuses.
+    Raises WeightsError as ``load_weights``, or where the disk refuses.
     """
     described = describe_weights(path)
     weights = _read(path, described)
@@ -159,24 +157,16 @@ def unsealed_note(path: Path) -> str:
 def load_weights(path: Path) -> Weights:
     """Read a file that ``save_weights`` wrote of a two-scale segmenter. No pickle is involved.
 
-    Raises
-    ------
-    WeightsError : missing, of another format, a control; a tensor is not the one that was written, does not fit its
-        config, or holds what is no finite number (named).
+    Raises WeightsError where it is missing, of another format or a control, or where a tensor (named) is not the one
+    that was written, does not fit its config, or holds what is no finite number.
     """
     described = describe_weights(path)
     check_two_scale(described.config, path)
-    weights = _read(path, described)
-    return Weights(*(getattr(weights, part.name) for part in fields(AnyWeights)))
+    return Weights(**vars(_read(path, described)))
 
 
 def load_any_weights(path: Path) -> AnyWeights:
-    """Read a file that ``save_weights`` wrote: ``Weights`` of a two-scale segmenter, otherwise those of a control.
-
-    Raises
-    ------
-    WeightsError : as in ``load_weights``.
-    """
+    """Read ``Weights`` of a two-scale segmenter, otherwise those of a control; raises WeightsError likewise."""
     described = describe_weights(path)
     return load_weights(path) if described.config.design == "two-scale" else _read(path, described)
 
@@ -191,10 +181,8 @@ def check_two_scale(config: SegmenterConfig, path: Path) -> None:
 
 
 def _read(path: Path, described: Description) -> AnyWeights:
-    from models.baselines.designs import build_network
-
     tensors = read_tensors(path, described)
-    network = build_network(described.config)
+    network = _network(described.config, "cpu")
     network.load_state_dict({name: tensors[name] for name in network.state_dict()})
     normalisation = Normalisation(*(tensors[f"normalisation.{name}"].numpy() for name in NORMALISATION))
     return AnyWeights(
@@ -207,14 +195,20 @@ def _read(path: Path, described: Description) -> AnyWeights:
     )
 
 
+def _network(config: SegmenterConfig, device: str) -> Network:
+    import torch
+
+    from models.network.controls import build_network  # loads torch
+
+    with torch.device(device):
+        return build_network(config)
+
+
 def read_tensors(path: Path, described: Description) -> dict[str, Tensor]:
     """Read every tensor of a file of weights, after its header was held against what the description asks for.
 
-    Raises
-    ------
-    WeightsError : as in ``load_weights``.
+    Raises WeightsError as ``load_weights``.
     """
-    from models.weights.checks import misfit, unusable
 
     with _opened(path, "pt") as file:
         claimed = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
@@ -231,9 +225,8 @@ def read_tensors(path: Path, described: Description) -> dict[str, Tensor]:
 def describe_weights(path: Path) -> Description:
     """Read what a file of weights says of itself, in milliseconds.
 
-    Raises
-    ------
-    WeightsError : missing, cut short, of another format, or a description that is damaged or asks for what cannot be.
+    Raises WeightsError where it is missing, cut short, of another format, or where its description is damaged or asks
+    for what cannot be.
     """
     if not path.is_file():
         raise WeightsError(f"no weights at {path}; train some with: spectralzoom train DATASET -o {path.name}")
@@ -270,3 +263,37 @@ def _unreadable(path: Path, error: Exception) -> WeightsError:
 def with_record(weights: Learned, **entries: Any) -> Learned:
     """Give the same weights with entries added to their record."""
     return replace(weights, record={**weights.record, **entries})
+
+
+def misfit(config: SegmenterConfig, claimed: Mapping[str, Any]) -> str:
+    """Which tensor of a file's header is not as the config asks, in words; nothing where all are. Reads no numbers.
+
+    ``claimed`` are slices of `safetensors`, by the tensors' names. Shapes are those of the network on torch's meta
+    device, where tensors have a size and no memory.
+    """
+    one, all_pairs = (config.columns,), (config.columns, config.columns)
+    wanted = {name: (tuple(value.shape), "F32") for name, value in _network(config, "meta").state_dict().items()}
+    wanted |= {"normalisation.centre": (one, "F32"), SPREAD: (one, "F32")}
+    wanted |= {"normalisation.whitening": (all_pairs, "F32"), "class_colours": ((config.classes, 3), "U8")}
+    for name, (shape, kind) in wanted.items():
+        if name not in claimed:
+            return f"tensor {name} should be {shape}, the file has nothing"
+        came, word = tuple(claimed[name].get_shape()), claimed[name].get_dtype()
+        if came != shape:
+            return f"tensor {name} should be {shape}, the file has {came}"
+        if word != kind:
+            return f"tensor {name} should be of {KINDS[kind]}, the file has {word}"
+    return ""
+
+
+def unusable(tensors: Mapping[str, Tensor]) -> str:
+    """Which tensor holds numbers that nothing can be computed with, in words; nothing where none does."""
+    import torch
+
+    for name, value in tensors.items():
+        if value.is_floating_point() and not bool(torch.isfinite(value).all()):
+            count = int((~torch.isfinite(value)).sum())
+            return f"{count} of {value.numel()} numbers of tensor {name} are not finite"
+    if not bool((tensors[SPREAD] > 0).all()):
+        return f"tensor {SPREAD} holds a spread that is not above 0"
+    return ""

@@ -2,6 +2,8 @@
 
 The hashes lie in the description, the one text beside the tensors. They tell damage, not forgery: whoever can write the
 file can seal it anew.
+
+A checkpoint of training is one: everything that a run needs to go on after it was killed.
 """
 
 from __future__ import annotations
@@ -13,7 +15,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
+
+from pipeline.errors import WeightsError
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -22,6 +26,8 @@ ABOUT = "about"  # the text's name in the file
 TENSORS, SEAL = "tensors", "seal"  # entries of the description: hashes of the tensors by name, and its own
 # what reading a description may raise over bytes that are not what they should be
 DAMAGED = (SafetensorError, OSError, UnicodeDecodeError, json.JSONDecodeError, RecursionError)
+CHECKPOINT, UNSEALED_CHECKPOINT = "spectralzoom-checkpoint/2", "spectralzoom-checkpoint/1"  # the earlier has no hashes
+Checkpoint = tuple[dict[str, Any], "dict[str, Tensor]"]
 
 
 def write_sealed(path: Path, about: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
@@ -82,14 +88,8 @@ def _seal(about: Mapping[str, Any]) -> str:
 def hash_without_seal(path: Path, spared: Mapping[str, Any]) -> str:
     """SHA-256 of the bytes that a file would have without its hashes: sealing a file does not change it.
 
-    Parameters
-    ----------
-    spared
-        Entries that the description had before, such as its format.
-
-    Raises
-    ------
-    One of `DAMAGED`, KeyError or ValueError : no such file.
+    ``spared`` are entries that the description had before, such as its format. Raises one of `DAMAGED`, KeyError or
+    ValueError for what is no such file.
     """
     raw = path.read_bytes()
     size = int.from_bytes(raw[:8], "little")
@@ -102,3 +102,54 @@ def hash_without_seal(path: Path, spared: Mapping[str, Any]) -> str:
     digest = hashlib.sha256(len(text).to_bytes(8, "little") + text)
     digest.update(memoryview(raw)[8 + size :])
     return digest.hexdigest()
+
+
+def save_checkpoint(path: Path, identity: str, about: dict[str, Any], tensors: dict[str, Tensor]) -> None:
+    """Replace the checkpoint by a temporary name and a rename, so that it is always a whole one.
+
+    Raises WeightsError where the disk refuses.
+    """
+    try:
+        write_sealed(path, {"format": CHECKPOINT, "identity": identity, **about}, tensors)
+    except OSError as error:
+        raise WeightsError(f"cannot keep the state of training in {path}: {error.strerror}; free some space") from error
+
+
+def load_checkpoint(path: Path, identity: str) -> Checkpoint | None:
+    """Read the checkpoint of the same training run; None where there is none, or one of another run.
+
+    Raises WeightsError where what lies there is not what was written. Nothing of it is used, and it is left where it
+    is.
+    """
+    found = read_checkpoint(path)
+    return None if found is None or found[0]["identity"] != identity else found
+
+
+def read_checkpoint(path: Path) -> Checkpoint | None:
+    """Read a checkpoint, of whichever run; None where there is no file. Raises WeightsError as ``load_checkpoint``."""
+    if not path.is_file():
+        return None
+    tensors: dict[str, Tensor] = {}
+    try:
+        with safe_open(path, framework="pt") as file:
+            about = read_about(file)
+            kind = about.get("format")
+            if kind == UNSEALED_CHECKPOINT:
+                wrong = "an earlier version wrote it, without hashes to check it by"
+            elif kind != CHECKPOINT:
+                wrong = f"it holds {kind or 'no format mark'}, expected {CHECKPOINT}"
+            elif not (wrong := broken_seal(about)):
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+                wrong = changed_tensor(about, tensors)
+    except DAMAGED as error:
+        raise _refused(path, str(error)[:120]) from error
+    if wrong:
+        raise _refused(path, wrong)
+    return about, tensors
+
+
+def _refused(path: Path, why: str) -> WeightsError:
+    return WeightsError(
+        f"the state of training in {path} cannot be gone on from: {why}; bring back a copy of it, or delete it to begin"
+        " anew"
+    )

@@ -15,7 +15,7 @@ from measure import Clock, Row, ratio, time_in_turn
 from numpy.typing import NDArray
 
 from models.network.cost import multiply_adds
-from models.network.encoder import Encoder, Memory
+from models.network.layers import Encoder, Memory, cut
 from models.network.process import keep_freed_memory, one_thread
 from models.network.segmenter import Segmenter, SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
@@ -55,7 +55,6 @@ class Frame:
 
 
 def rows() -> list[Row]:
-    """All figures, on one thread."""
     keep_freed_memory()
     with one_thread():
         return [*_batches(), *_bands(), *_shares()]
@@ -170,7 +169,7 @@ def _padded_batch(weights: Weights, frames: Sequence[Frame]) -> list[DrawnMap]:
         used[number, : len(row)] = True
     side = config.token_side**2
     known, asked = (mask.flatten(1).repeat_interleave(side, dim=1) for mask in (there, used))
-    features, tokens = model.coarse_stem(model.coarse_patches(coarse))
+    features, tokens = model.coarse_stem(cut(coarse, model.config.patch)[0])
     read, memory = _masked(model.encoder, model.code_coarse(tokens, rows, columns), known, None)
     image = model.coarse_head(features, read.view(tokens.shape)) * there.flatten()[:, None, None, None]
     reading = model.reading_of(image, memory, rows, columns)
@@ -195,7 +194,6 @@ def _masked(
 
 
 def _drawn(frame: Frame, coarse: torch.Tensor, fine: torch.Tensor) -> DrawnMap:
-    """The map of one frame of a padded batch."""
     grid, p = frame.look.grid, frame.look.grid.patch
     y, x = frame.look.columns.shape[:2]
     drawn = draw_coarse(coarse[None, :, :y, :x], grid)
@@ -278,7 +276,6 @@ def _shares() -> list[Row]:
 
 
 def _adaptive(weights: Weights, every: Frame, count: int, precision: str = "float32") -> DrawnMap:
-    """Glance, score by the learned gain, and draw with so many seats."""
     seen: Glance = read_glance(weights, every.look, precision=precision)  # type: ignore[arg-type]
     scores = score_seats("gain", seen).ravel()[every.seats]
     best = np.sort(np.argsort(-scores, kind="stable")[:count])

@@ -12,34 +12,24 @@ from safetensors.torch import load_file
 from torch import nn
 
 from models.evaluation.metrics import mean_iou
-from models.evaluation.placement_metrics import captured_gain, gain_sums, oracle_gain
-from models.network.encoder import TokenAttention
-from models.network.pixel_side import ChannelNorm
-from models.network.scorer import MOST_GAIN, scoring_loss
+from models.evaluation.placement import captured_gain, gain_sums, oracle_gain
+from models.network.layers import ChannelNorm, TokenAttention
 from models.network.segmenter import Segmenter, SegmenterConfig
+from models.network.sizes import MOST_GAIN
 from models.network.spectral import Normalisation, SpectralBasis
 from models.reading.inference import glance_of_columns
 from models.training import train as training
 from models.training.examples import Example
-from models.training.objective import map_loss, pixel_losses
+from models.training.objective import map_loss, pixel_losses, scoring_loss
 from models.training.train import Trainer, TrainingSettings, train
 from models.weights.files import Weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.geometry.scan import CostModel
 from pipeline.planning.fine_pass import plan_fine
+from tests.models.conftest import SMALL
 
-SIZES: dict[str, Any] = {
-    "classes": 2,
-    "columns": 4,
-    "patch": 8,
-    "factor": 2,
-    "width": 8,
-    "coarse_width": 8,
-    "dim": 16,
-    "heads": 2,
-    "layers": 1,
-}
+SIZES: dict[str, Any] = SMALL | {"classes": 2}
 SETTINGS = TrainingSettings(steps=4, batch=1, crop=16)
 NO_SHIFT = np.zeros(4, np.float32)
 

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from flows.survey.field_work import seat_columns
 from models.network.dead_pixels import MOST_COLUMN
+from flows.survey.region_work import seat_columns
+from models.network.spectral import MOST_COLUMN
 from models.policies.policies import score_seats
 from models.reading.inference import DrawnMap, Glance, decide, glance, glance_of_columns, look_coarsely, segment
 from models.reading.regions import whole_field
@@ -40,7 +42,6 @@ STRANGE = st.one_of(
 
 
 def _drawn(coarse: NDArray[np.float32], fine: NDArray[np.float32]) -> tuple[Glance, DrawnMap]:
-    """Glance and map as a survey makes them of stored values."""
     seen = glance(WEIGHTS, coarse, NM, GRID)
     store: Any = SimpleNamespace(seats=SEATS, pick=lambda entries: fine[entries])
     seats, columns = seat_columns(WEIGHTS, store, NM, seen, whole_field(GRID))

@@ -30,7 +30,7 @@ from models.evaluation.metrics import (
     iou_per_class,
     kappa,
 )
-from models.policies.free_seats import CONTROL_SHARE, Controls, run_controls
+from models.evaluation.placement import CONTROL_SHARE, Controls, run_controls
 from models.policies.policies import score_seats
 from models.reading.inference import CoarseLook, Glance, glance_of_columns, segment
 from models.weights.files import Weights

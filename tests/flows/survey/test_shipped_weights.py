@@ -11,7 +11,7 @@ import pytest
 from flows.survey.run import SHIPPED
 from flows.survey.stages.accuracy import columns_of_all_seats
 from models.evaluation.metrics import mean_iou
-from models.policies.free_seats import Controls, run_controls
+from models.evaluation.placement import Controls, run_controls
 from models.reading.inference import glance
 from models.weights.files import Weights, content_key, describe_weights, load_weights
 from pipeline.geometry.camera import LineCamera

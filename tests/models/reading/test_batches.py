@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,15 +10,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models.network import batches
-from models.network.batches import encode_packed, packs
+from models.network.layers import encode_packed
 from models.reading import inference
-from models.reading.inference import CoarseLook, Glance, glance_batch, read_glance, segment, segment_batch
+from models.reading.inference import CoarseLook, Glance, glance_batch, packs, read_glance, segment, segment_batch
 from models.weights.files import Weights
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import SceneGrid
+from tests.models.conftest import Maker
 
-Maker = Callable[..., Weights]
 Scenes = tuple[list[CoarseLook], list[np.ndarray], list[np.ndarray]]
 SIZES = [(37, 53), (1, 1), (48, 16), (16, 16), (60, 44), (17, 90)]
 COUNTS = [5, 1, 0, 4, 40, 9]
@@ -44,7 +42,7 @@ def _scenes(weights: Weights, seed: int = 0) -> Scenes:
 @pytest.mark.parametrize("most", [1, 20, 1000])
 def test_packed_maps_are_those_of_one_by_one(tiny: Maker, sizes: dict, most: int, monkeypatch: pytest.MonkeyPatch):
     """However scenes are packed, classes are the same and confidence differs by 1e-6 at most."""
-    monkeypatch.setattr(batches, "packs", lambda counts: packs(counts, most))
+    monkeypatch.setattr(inference, "packs", lambda counts: packs(counts, most))
     weights = tiny(**sizes)
     looks, patches, seats = _scenes(weights)
     together = segment_batch(weights, looks, patches, seats)

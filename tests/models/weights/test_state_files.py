@@ -11,7 +11,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from models.weights.state_files import Variant, read_state, read_variant, unwrap_state
+from models.weights.state_files import read_heads, read_state, unwrap_state
 from pipeline.errors import WeightsError
 
 STATE = {"blocks.0.weight": torch.arange(6.0).reshape(2, 3), "norm.bias": torch.ones(2)}
@@ -98,16 +98,10 @@ def test_files_without_tensors_are_refused(tmp_path: Path):
         read_state(tmp_path / "none.pth")
 
 
-@pytest.mark.parametrize(
-    "decoder", ["{name: mask_transformer, n_layers: 2}", "\n    n_layers: 2\n    name: mask_transformer"]
-)
-def test_the_variant_beside_a_segmenter_is_read(tmp_path: Path, decoder: str):
-    """Sizes that no shape tells, the heads before all, come from variant.yml, whichever way its tables are written."""
-    before, _, _ = VARIANT.partition("  decoder:")
-    (tmp_path / "variant.yml").write_text(f"data_kwargs:\n  n_cls: 3\n{before}  decoder: {decoder}\n  n_extra: 1\n")
-    assert read_variant(tmp_path / "checkpoint.pth") == Variant(
-        "vit_tiny_patch16_384", 16, 192, 12, 3, 150, "mask_transformer"
-    )
+def test_the_heads_of_a_segmenter_are_read(tmp_path: Path):
+    """They come from variant.yml beside the checkpoint: no shape tells them."""
+    (tmp_path / "variant.yml").write_text(VARIANT)
+    assert read_heads(tmp_path / "checkpoint.pth") == 3
 
 
 @pytest.mark.parametrize(
@@ -115,18 +109,17 @@ def test_the_variant_beside_a_segmenter_is_read(tmp_path: Path, decoder: str):
     [
         (None, "no variant.yml beside"),
         (VARIANT.replace("n_heads: 3", ""), "lacks 'n_heads'"),
-        ("just text", "lacks 'net_kwargs'"),
-        ("net_kwargs: 3", "cannot use"),
-        (VARIANT.replace("patch_size: 16", "patch_size: big"), "cannot use"),
-        ("net_kwargs: !!python/object/apply:os.getcwd []", "cannot use"),
+        ("just text", "lacks 'n_heads'"),
+        (VARIANT.replace("n_heads: 3", "n_heads: many"), "cannot use"),
+        (VARIANT.replace("n_heads: 3", "n_heads: !!python/object/apply:os.getcwd []"), "cannot use"),
     ],
 )
 def test_a_variant_that_cannot_be_used_is_named(tmp_path: Path, text: str | None, said: str):
-    """Missing, incomplete, damaged, or with an object in the place of a table."""
+    """Missing, incomplete, damaged, or with an object in the place of a number."""
     if text is not None:
         (tmp_path / "variant.yml").write_text(text)
     with pytest.raises(WeightsError, match=said):
-        read_variant(tmp_path / "checkpoint.pth")
+        read_heads(tmp_path / "checkpoint.pth")
 
 
 def test_one_number_that_is_called_many_is_refused(tmp_path: Path):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from models.network.tokens import paper_numbers
+from models.network.layers import paper_numbers
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import (
     REST_TANGENT,

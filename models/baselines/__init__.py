@@ -1,1 +1,0 @@
-"""Networks that the two-scale segmenter is compared with."""

@@ -1,0 +1,179 @@
+"""How well seats were placed: against those whose fine look lowers the loss most, and against other placements.
+
+Evaluation only: all of it needs labels and the whole scene at full resolution, none of it is a survey's own cost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.evaluation.metrics import agreement, confusion, gap_closed, mean_iou
+from models.network.sizes import MOST_GAIN
+from models.policies.policies import score_seats
+from models.reading.inference import Glance, captured, origin_of, readings_of, segment
+from models.weights.files import Weights
+from pipeline.geometry.grid import UNLABELLED
+from pipeline.planning.selection import frame_seats
+
+Values = NDArray[np.floating]
+RANDOM_DRAWS = 5
+CONTROL_SHARE = 0.35  # of the valid seats: K = 35 % of surveys' receipts and of the weights' records
+Counts = NDArray[np.int64]
+
+
+def oracle_gain(
+    weights: Weights, seen: Glance, fine: NDArray[np.floating], labels: NDArray[np.uint8]
+) -> NDArray[np.float64]:
+    """Loss with no fine seat minus loss with all of them, (seat,) [nat], mean over a seat's pixels.
+
+    The loss is the cross-entropy of the labelled pixels; others, and those beside the scene, add 0 to the mean.
+    Clipped to -5..5; negative where the fine look makes the map worse. A patch that shows too little to be read is
+    left out, as in the map.
+
+    ``fine`` (seat, p, p, column) are normalised columns of every seat of the padded grid, ``labels`` (y, x) class
+    indices of the scene's own size, 255 unlabelled.
+    """
+    import torch
+
+    grid, p = seen.grid, seen.grid.patch
+    full = np.full(grid.padded_shape, UNLABELLED, np.uint8)
+    full[: grid.height, : grid.width] = labels
+    rows, columns = grid.seat_shape
+    truth = full.reshape(rows, p, columns, p).swapaxes(1, 2).reshape(-1, p, p)
+    gain, valid = np.zeros(len(truth)), grid.valid_seats()
+    patches, seats = captured(fine[valid], valid)
+    model, first = weights.segmenter.eval(), 0
+    with torch.inference_mode():
+        (reading,) = readings_of(weights, [seen])
+        numbers = torch.from_numpy(seats)
+        for after in model.read_fine_packed([reading], [patches], [numbers], [origin_of(seen)]):
+            some = seats[first : first + len(after)]
+            before = model.seat_windows(reading.logits, numbers[first : first + len(after)][None])
+            lower = _losses(before.numpy(), truth[some]) - _losses(after.numpy(), truth[some])
+            gain[some] = lower.sum(axis=(1, 2)) / p**2
+            first += len(after)
+    return np.clip(gain, -MOST_GAIN, MOST_GAIN)
+
+
+def _losses(logits: NDArray[np.float32], truth: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Cross-entropy of each pixel, (seat, class, y, x) and (seat, y, x) -> (seat, y, x); 0 where unlabelled."""
+    from scipy.special import logsumexp
+
+    labelled = truth != UNLABELLED
+    index = np.where(labelled, truth, 0).astype(np.intp)[:, None]
+    exact = logits.astype(np.float64)
+    loss = logsumexp(exact, axis=1) - np.take_along_axis(exact, index, axis=1)[:, 0]
+    return np.where(labelled, loss, 0.0)
+
+
+def gain_sums(gain: Values, chosen: NDArray[np.integer], valid: NDArray[np.integer]) -> tuple[float, float]:
+    """Gain of the chosen seats, and of as many of the best valid ones; add frames up before dividing."""
+    best = np.sort(gain[valid])[::-1][: len(chosen)]
+    return float(gain[chosen].sum()), float(best.sum())
+
+
+def captured_gain(bought: float, best: float) -> float | None:
+    """Share of the best seats' gain that the chosen ones have; None where there is none to be had."""
+    return bought / best if best > 0 else None
+
+
+def average_precision(score: Values, positive: NDArray[np.bool_]) -> float:
+    """Mean precision at each positive, from the best score down; equal scores by number, NaN last.
+
+    NaN where nothing is positive.
+    """
+    if not positive.any():
+        return float("nan")
+    worth = np.where(np.isnan(score), -np.inf, score)
+    hits = positive[np.argsort(-worth, kind="stable")]
+    precision = np.cumsum(hits) / np.arange(1, len(hits) + 1)
+    return float(precision[hits].mean())
+
+
+def top_seats(gain: Values, count: int) -> NDArray[np.bool_]:
+    """Which of the seats are the ``count`` with the most gain, equal ones by number, (seat,)."""
+    best = np.zeros(len(gain), bool)
+    best[np.argsort(-gain, kind="stable")[:count]] = True
+    return best
+
+
+def rank_correlation(score: Values, gain: Values) -> float:
+    """Spearman's correlation, equal values sharing their mean rank; NaN where either is flat."""
+    from scipy.stats import rankdata
+
+    if len(score) < 2:
+        return float("nan")
+    first, second = (rankdata(values) - (len(values) + 1) / 2 for values in (score, gain))
+    spread = float(np.sqrt((first**2).sum() * (second**2).sum()))
+    return float((first * second).sum() / spread) if spread > 0 else float("nan")
+
+
+@dataclass(frozen=True)
+class Controls:
+    """Confusion counts of each placement at one share of the seats (mode ``frame``)."""
+
+    share: float
+    seats: int
+    none: Counts
+    every: Counts
+    policies: dict[str, Counts]
+    random: list[Counts]
+
+    def as_dict(self) -> dict[str, dict[str, Any]]:
+        """`agreement` of every row, the share of the gap that it closes, and mean and spread of the random placements.
+
+        All rows are judged by the same labels, and so over the same classes.
+        """
+        none, every = mean_iou(self.none), mean_iou(self.every)
+        placed = {name: [counts] for name, counts in self.policies.items()} | {"random": self.random}
+        rows = {policy: agreement_of_draws(draws) for policy, draws in placed.items()}
+        return {policy: {**row, "gap_closed": gap_closed(row["miou"], none, every)} for policy, row in rows.items()}
+
+
+def agreement_of_draws(draws: Sequence[Counts]) -> dict[str, Any]:
+    """Give the mean of `agreement` over the draws of a placement, and the spread of their mIoU; None of one alone."""
+    each = [agreement(counts) for counts in draws]
+    means = {name: float(np.mean([one[name] for one in each])) for name in each[0]}
+    spread = float(np.std([one["miou"] for one in each], ddof=1)) if len(each) > 1 else None
+    return {**means, "spread": spread}
+
+
+def run_controls(
+    weights: Weights,
+    seen: Glance,
+    fine: NDArray[np.floating],
+    labels: NDArray[np.uint8],
+    *,
+    share: float,
+    seed: int,
+    policies: tuple[str, ...] = ("gain", "entropy", "sobel"),
+    report: Callable[[str], None] = lambda row: None,
+) -> Controls:
+    """Segment with no seat, every seat, and ``share`` of the valid seats placed by each policy and at random.
+
+    ``fine`` (seat, p, p, column) are normalised columns of every seat of the padded grid, ``labels`` (y, x) class
+    indices, 255 unlabelled.
+    """
+    valid = seen.grid.valid_share().ravel() > 0
+
+    def counts(row: str, seats: NDArray[np.integer]) -> Counts:
+        report(row)
+        drawn = segment(weights, seen, fine[seats], seats)
+        return confusion(labels, drawn.classes, weights.config.classes)
+
+    def placed(policy: str, number: int = 0) -> NDArray[np.integer]:
+        return frame_seats(score_seats(policy, seen, seed=seed + number), share, valid).seats
+
+    return Controls(
+        share,
+        len(placed("random")),
+        counts("none", np.empty(0, np.int64)),
+        counts("all", np.flatnonzero(valid)),
+        {policy: counts(policy, placed(policy)) for policy in policies},
+        [counts("random", placed("random", 1000 * (draw + 1))) for draw in range(RANDOM_DRAWS)],
+    )
