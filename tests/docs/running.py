@@ -136,7 +136,7 @@ class Reader:
         path.write_text(text, encoding="utf-8")
 
     def _change(self, block: Block) -> None:
-        """Change a file of the copy as a diff says, whose first line names it; what each part is about stands there once."""
+        """Change a file of the copy as a diff says, whose first line names it; each part fits in one place."""
         first, _, rest = block.text.partition("\n")
         path = self.tree / first.removeprefix("--- ")
         text = path.read_text(encoding="utf-8")
@@ -150,7 +150,7 @@ class Reader:
         path.write_text(text, encoding="utf-8")
 
     def _toml(self, block: Block) -> None:
-        """Load it as a scene.toml, or as settings; under the name that its first line says it stays for later blocks."""
+        """Load it as a scene.toml, or as settings; by the name in its first line it stays for later blocks."""
         path = self.folder / (block.file or f"line-{block.line}.toml")
         path.write_text(block.text, encoding="utf-8")
         if path.name == "scene.toml":
