@@ -37,6 +37,7 @@ autodoc_member_order = "bysource"
 napoleon_google_docstring = False
 napoleon_use_param = False
 napoleon_use_rtype = False
+napoleon_custom_sections = ["Raises", "Returns"]  # in words: napoleon wants each name on a line of its own
 # Docstrings name more than the reference lists, and types of numpy and xarray, whose pages are not at hand.
 nitpick_ignore_regex = [("py:.*", ".*")]
 
