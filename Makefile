@@ -1,4 +1,4 @@
-# SpectralZoom: setup, survey, survey-rig, test, lint, bench, faults, soak, lock.
+# SpectralZoom: setup, survey, survey-rig, test, lint, docs, bench, faults, soak, lock.
 #   make survey ARCHIVE=/data/field7    make test PY=python3.12 VENV=/tmp/venv    make test PYTEST_ARGS="-x tests/pipeline"
 PY ?= python3
 VENV ?= .venv
@@ -11,7 +11,7 @@ BIN := $(VENV)/bin
 # The tools beneath are asked to send no analytics.
 export DO_NOT_TRACK = 1
 
-.PHONY: setup survey survey-rig test lint bench faults soak lock
+.PHONY: setup survey survey-rig test lint docs bench faults soak lock
 .DEFAULT_GOAL := setup
 
 setup: $(BIN)/.ok
@@ -37,6 +37,10 @@ lint: $(BIN)/.ok
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# The pages of docs/ as docs/_build/index.html. A dead link, anchor or reference fails; nothing is fetched.
+docs: $(BIN)/.ok
+	$(BIN)/python -m sphinx -q -E -W --keep-going -n -d docs/_build/.doctrees docs docs/_build
 
 # Every goal with the peers beside it (BENCH="geometry lookup" for some), then what accuracy costs in time.
 bench: $(BIN)/.ok

@@ -25,7 +25,7 @@ from storage.arrays.layout import SHARD_ROWS
 from storage.export.cog_files import need_rasterio, write_cog
 from storage.export.envi_writer import EnviFile, write_envi
 from storage.export.stac_items import COG, check_owner, need_pystac, write_stac
-from storage.export.stac_fields import COG, ZARR, angular, clean_id, footprint, projection, spectral_bands, wavelengths
+from storage.export.stac_items import COG, ZARR, angular, clean_id, footprint, projection, spectral_bands, wavelengths
 from storage.export.stac_items import Collection, Item, check_owner, need_pystac, write_stac
 from storage.remote.opening import open_archive
 

@@ -16,7 +16,8 @@ from flows.publish.receipt import Receipt, check_receipt
 from flows.survey.stages.ground import coarse_colours
 from pipeline.errors import IncompleteStoreError, SettingsError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
-from storage.archive.archive import Archive, StageRef
+from storage.archive.archive import Archive
+from storage.archive.keys import StageRef
 from storage.archive.records import RECEIPT, read_run
 from storage.arrays.class_maps import ClassNames
 from storage.arrays.ground_maps import StoredImage, load_geobox, open_image

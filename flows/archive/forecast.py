@@ -15,7 +15,8 @@ from flows.survey.run import SurveyRun, open_run
 from flows.survey.stage import Stage, Wanted
 from flows.survey.survey import STAGES, judge, survey
 from pipeline.errors import IncompleteStoreError, PipelineError
-from storage.archive.archive import Archive, StageRef
+from storage.archive.archive import Archive
+from storage.archive.keys import StageRef
 from storage.archive.keys import plain, store_at
 from storage.archive.lineage import Catalogue, Change, changes_between
 from storage.archive.records import Store

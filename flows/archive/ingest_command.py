@@ -13,7 +13,8 @@ from flows.cli.app import ArchiveName, AsJson, parse_numbers, stderr
 from flows.terminal.processes import DONE
 from flows.terminal.progress import StageProgress, print_json
 from pipeline.errors import SceneError
-from storage.archive.archive import Archive, StageRef
+from storage.archive.archive import Archive
+from storage.archive.keys import StageRef
 from storage.archive.staging import check_name, file_hash
 from storage.readers.cube_sources import CubeSource
 from storage.readers.scan_files import Report, SourceFile, open_cube_source, with_wavelengths, write_ingested_cube

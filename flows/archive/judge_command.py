@@ -22,7 +22,8 @@ from flows.survey.survey import STAGES, TITLES, Products, StageRunner, judge
 from flows.terminal.progress import StageProgress
 from models.network.process import keep_freed_memory, use_one_thread
 from pipeline.errors import ArchiveError, SceneError, WeightsError
-from storage.archive.archive import Archive, StageRef
+from storage.archive.archive import Archive
+from storage.archive.keys import StageRef
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run
 from storage.remote.opening import open_archive

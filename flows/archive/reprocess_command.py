@@ -38,7 +38,7 @@ from flows.terminal.figures import counted, format_points, format_seconds
 from flows.terminal.processes import DONE, FAILED, PARTLY
 from flows.terminal.progress import put_out
 from pipeline.errors import PipelineError, SettingsError
-from pipeline.visible_text import visible
+from pipeline.errors import visible
 from storage.archive.lineage import Catalogue
 from storage.archive.records import read_run
 from storage.archive.whole_files import new_file, to_json, write_whole

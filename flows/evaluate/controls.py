@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from flows.evaluate.frames import Candidate, Sight, file_key
+from flows.evaluate.frames import Candidate, Sight
+from flows.archive.stale_runs import file_key
 from flows.evaluate.rows import Seats, Trial, cost_of, fine_samples, judge_map
 from models.network.cost import MultiplyAdds, control_multiply_adds, multiply_adds
 from models.policies.policies import score_seats

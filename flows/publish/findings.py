@@ -15,7 +15,7 @@ from flows.survey.stages.registration import load_registration
 from flows.survey.survey import Products
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.planning.fine_pass import FinePlan
-from storage.archive.archive import StageRef
+from storage.archive.keys import StageRef
 from storage.arrays.class_maps import load_class_map
 from storage.arrays.ground_maps import load_ground_map
 

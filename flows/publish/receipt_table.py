@@ -14,7 +14,7 @@ from rich.table import Table
 from flows.publish.receipt import Accuracy, Receipt, Savings, is_pending
 from flows.survey.scores import SHOWN, SHOWN_WORDS, definitions_differ, false_class_words, worst_class_words
 from flows.terminal.figures import DASH, format_bytes, format_count, format_percent, format_points, format_seconds
-from pipeline.simulator.selection.manifest import UNIT_WORDS
+from pipeline.simulator.selection.choice import UNIT_WORDS
 
 
 def headline(receipt: Receipt, looked_twice: float | None = None) -> str:

@@ -19,7 +19,7 @@ from flows.publish.receipt import Accuracy, Receipt
 from flows.publish.receipt_table import control_seats, cost_rows, format_change, headline, sentences, total_words
 from flows.survey.scores import SHOWN, SHOWN_WORDS, definitions_differ, false_class_words
 from flows.terminal.figures import format_bytes, format_percent, format_points, format_seconds
-from pipeline.visible_text import visible
+from pipeline.errors import visible
 
 _MARKDOWN = "\\`*_{}[]<>#|"
 

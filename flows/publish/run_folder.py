@@ -39,12 +39,12 @@ from pipeline.planning.coverage import on_scene
 from pipeline.planning.fine_pass import FinePlan
 from pipeline.planning.prices import SavingEntry, capture_savings
 from pipeline.rectify.calibration.calibrate import of_bands, reflectance
-from storage.archive.archive import StageRef
+from storage.archive.keys import StageRef
 from storage.archive.records import StageRecord, read_run
 from storage.archive.run_folders import RunDraft
 from storage.archive.whole_files import to_json
 from storage.arrays.class_maps import ClassMap, load_class_map
-from storage.arrays.attention import load_attention
+from storage.arrays.mosaics import load_attention
 from storage.arrays.class_maps import load_class_map
 from storage.arrays.cubes import RawCube
 from storage.arrays.ground_maps import load_ground_map, open_image

@@ -13,7 +13,7 @@ from pathlib import Path
 from rich.console import Console
 
 from flows.schedule.field_schedule import FieldSchedule
-from flows.schedule.ledger_state import moment_words
+from flows.schedule.field_schedule import moment_words
 from flows.schedule.rig_lock import RigLock, hold_place, rig_lock
 from flows.schedule.times import SystemWallClock, Timetable, WallClock
 from flows.settings.load import load_settings

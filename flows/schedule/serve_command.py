@@ -18,8 +18,7 @@ from rich.markup import escape
 from flows.schedule.due_runs import Outcome, Tell
 from flows.schedule.fields import alone_on, load_fields, survey_field
 from flows.schedule.notices import notice_address, send_notice
-from flows.schedule.plain_schedule import serve_plain
-from flows.schedule.prefect_schedule import serve_prefect
+from flows.schedule.server import serve_prefect
 from flows.schedule.served import ServeRequest
 from flows.schedule.times import parse_timetable
 from pipeline.errors import SettingsError
@@ -36,7 +35,7 @@ from flows.survey.run import open_run
 from flows.terminal.processes import DONE
 from pipeline.errors import ArchiveError, PipelineError, RigError, SettingsError
 from storage.archive.staging import take_lock
-from storage.remote.object_places import is_remote
+from storage.remote.object_stores import is_remote
 
 LOOK_AGAIN = timedelta(seconds=30)  # a clock that jumps, or a run that died, is seen after this at the latest
 

@@ -22,7 +22,7 @@ from flows.settings.survey_settings import Settings
 from pipeline.errors import SettingsError
 from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES
 from storage.archive.ledger import Ledger
-from storage.archive.toml_files import read_toml
+from storage.archive.staging import read_toml
 from storage.archive.whole_files import write_whole
 from storage.remote.opening import open_archive
 

@@ -10,13 +10,13 @@ from typing import Any
 
 from flows.settings.declared import SURVEY, TABLES, Declared
 from flows.settings.survey_settings import BUILT_IN_SCENES, PATHS, REPLACED, RIG_FIELD, MapChoice, Settings
-from models.network.vgg_sizes import TRAINED_VGG_FROM, VGG_FROM
+from models.network.sizes import TRAINED_VGG_FROM, VGG_FROM
 from pipeline.errors import PoseError, SettingsError
 from pipeline.simulator.scenes.farm.farm_scene import REMOVED_LAW
 from storage.archive.staging import read_toml
 from pipeline.rig.mirror.mirror_settings import MOST_PAIRS
 from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, REMOVED_LAW
-from storage.archive.toml_files import read_toml
+from storage.archive.staging import read_toml
 
 
 def load_settings(path: str | Path | None = None, flags: Mapping[str, object] | None = None) -> Settings:

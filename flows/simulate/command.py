@@ -29,7 +29,7 @@ from pipeline.errors import ArchiveError, SceneError, SettingsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.selection.choice import UNIT_WORDS
-from storage.archive.archive import StageRef
+from storage.archive.keys import StageRef
 from storage.readers.scene_files import load_scene_file
 from storage.remote.opening import open_archive
 

@@ -28,7 +28,7 @@ from pipeline.simulator.render import dark_frame, expected_light, read_out
 from pipeline.simulator.selection.choice import UNIT_WORDS
 from pipeline.simulator.selection.verification import contrast_about, misplaced_electrons, misplaced_share
 from pipeline.simulator.simulated import BLOCK_LINES, SimulatedSource, sweep_starts
-from storage.archive.archive import StageRef
+from storage.archive.keys import StageRef
 from storage.arrays.quicklooks import choose_bands
 
 MOST_S = 60.0  # of processor time for both ways together; beyond, not all lines are compared

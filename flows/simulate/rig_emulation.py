@@ -21,7 +21,7 @@ from flows.simulate.command import open_simulation
 from flows.survey.stages.effects import choose_effects, source_with
 from flows.terminal.progress import print_json
 from pipeline.errors import SettingsError
-from pipeline.geometry.mounting import STRAIGHT
+from pipeline.geometry.mirror import STRAIGHT
 from pipeline.rig.device_settings import SurveyRig
 from pipeline.geometry.mirror import STRAIGHT
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock, ServedRig

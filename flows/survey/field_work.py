@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.survey.run import SurveyRun, weights_path
-from models.network.vgg_sizes import saliency_bytes
+from models.network.sizes import saliency_bytes
 from models.policies.policies import IMAGE_POLICIES, NETWORK_POLICIES, score_seats
 from models.network.sizes import saliency_bytes
 from models.policies.policies import IMAGE_POLICIES
@@ -32,9 +32,9 @@ from storage.arrays.mosaics import mosaic_wavelengths, open_patches
 from storage.arrays.tile_work import RESERVED_BYTES
 from storage.parallel.crew import Crew, run_blocks
 from storage.arrays.mosaics import mosaic_strips, mosaic_wavelengths
-from storage.arrays.patches import PATCHES_A_SHARD, PatchStore, open_patches
+from storage.arrays.mosaics import PATCHES_A_SHARD, PatchStore, open_patches
 from storage.arrays.tile_work import RESERVED_BYTES, let_tiles_go
-from storage.parallel.block_work import run_blocks
+from storage.parallel.crew import run_blocks
 from storage.parallel.crew import Crew
 
 Strange = tuple[int, int]  # coarse pixels, and fine ones, with a value that is no reading

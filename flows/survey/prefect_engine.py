@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 from flows.survey.survey import STAGES, Products, StageRunner, Step, survey
 from flows.terminal.processes import end_with_us, terminable
 from pipeline.errors import PipelineError
-from storage.archive.archive import StageRef
+from storage.archive.keys import StageRef
 from storage.archive.staging import remove_tree, take_lock
 
 RETRY_DELAY_S = 2.0

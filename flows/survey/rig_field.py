@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from flows.settings.survey_settings import Settings
-from pipeline.geometry.mounting import STRAIGHT
+from pipeline.geometry.mirror import STRAIGHT
 from pipeline.geometry.scan import Sweep, sweep_positions
 from pipeline.rig.camera.camera_files import KeptInMemory
 from pipeline.rig.device_settings import CameraLimits, check_times

@@ -18,7 +18,8 @@ from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any, Literal
 
-from storage.archive.archive import Archive, StageRef, stage_key
+from storage.archive.archive import Archive
+from storage.archive.keys import StageRef, stage_key
 
 Build = Callable[[Path], None]
 Unit = Literal[

@@ -12,7 +12,7 @@ from typing import Protocol
 
 from flows.survey.run import SurveyRun
 from flows.survey.stage import all_stages
-from storage.archive.archive import StageRef
+from storage.archive.keys import StageRef
 from storage.archive.records import StageRecord, State
 
 STAGES = all_stages()

@@ -15,7 +15,7 @@ from rich.segment import Segment
 from rich.table import Column
 from rich.text import Text
 
-from pipeline.visible_text import visible
+from pipeline.errors import visible
 from storage.archive.whole_files import to_json
 
 PIPED_WIDTH = 120  # of tables where no terminal says how wide it is

@@ -38,7 +38,7 @@ from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
-from storage.arrays.codec_trials import CODECS, store_in_memory
+from storage.arrays.layout import CODECS, store_in_memory
 from storage.arrays.layout import round_bits
 
 Values = NDArray[np.float32]

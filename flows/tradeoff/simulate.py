@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 from flows.tradeoff.entries import Level, Setting, Tradeoff, register
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.coverage import full_sweeps
-from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.effect import OFF, Effect
-from pipeline.simulator.effects.light_units import noise_electrons
+from pipeline.simulator.effects.probe import noise_electrons
 from pipeline.simulator.effects.line import SLIT
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.effects.registry import EFFECTS, RAYS
 from pipeline.simulator.effects.registry import FOOTPRINT as BLURS
-from pipeline.simulator.instrument import sweep_block
-from pipeline.simulator.readout import dark_frame, read_out
+from pipeline.simulator.simulated import sweep_block
+from pipeline.simulator.render import dark_frame, read_out
 from pipeline.simulator.render import Choice, expected_light
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene

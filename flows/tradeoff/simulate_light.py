@@ -13,7 +13,7 @@ from flows.tradeoff.entries import Setting, Tradeoff, register
 from flows.tradeoff.simulate import FOOTPRINT, Against, FarmLines, Light, Seen, look_at_lines, prepare_footprint
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.lazy import Once
-from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.line import SLIT
 from pipeline.simulator.effects.registry import RAYS
 from pipeline.simulator.optics.kernel_fit import Moments

@@ -19,7 +19,8 @@ import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor
 
 from models.network.controls import Control, Network
-from models.network.segmenter import Segmenter, SegmenterConfig
+from models.network.segmenter import Segmenter
+from models.network.sizes import SegmenterConfig
 from models.network.sizes import MOST_GAIN
 from models.training.examples import Batch, Example
 from pipeline.geometry.grid import UNLABELLED

@@ -8,9 +8,9 @@ from dataclasses import dataclass, fields
 from typing import Literal, get_args
 
 from pipeline.errors import SettingsError
-from pipeline.geometry.mounting import STRAIGHT, Axes, Mounting
+from pipeline.geometry.mirror import STRAIGHT, Axes, Mounting
 from pipeline.geometry.scan import CostModel
-from pipeline.geometry.vector_memory import Ends
+from pipeline.geometry.scan import Ends
 from pipeline.stated import assumed, check_stated, stated
 
 ReadBack = Literal["none", "sampled", "all"]

@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 from typing import Literal
 
 from pipeline.geometry.mirror import Axes, Mounting
-from pipeline.rig.camera.camera_settings import CameraAddress, FileServer
+from pipeline.rig.device_settings import CameraAddress, FileServer
 from pipeline.rig.mirror.mirror_settings import MirrorLink, MirrorSettings
 from pipeline.stated import assumed, stated
 

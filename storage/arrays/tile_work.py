@@ -24,7 +24,7 @@ from pipeline.rectify.line_numbers import LineNumbers, number_lines
 from pipeline.rectify.placed import PixelGrid, Placed, place
 from pipeline.rectify.region import Reaches, column_reach, mosaic_tile
 from pipeline.rectify.registration.alignment import SweepShift, no_shifts
-from pipeline.rectify.resample import Kernel
+from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.tie_points import TieTable
 from pipeline.rectify.tracks import Track
 from storage.archive.manifests import read_table

@@ -224,7 +224,8 @@ def _through_camera(folder: Path, path: Path) -> list[Result]:
 
 def _of_the_file(folder: Path, split: Split) -> list[Result]:
     """The segmenter trained on the spectra of the file, coarse pixels being their means."""
-    from models.network.segmenter import Segmenter, SegmenterConfig
+    from models.network.segmenter import Segmenter
+    from models.network.sizes import SegmenterConfig
     from models.network.spectral import SpectralBasis, patches_of
     from models.reading.inference import glance_of_columns
     from models.training.examples import Observation, measured_normalisation, normalised

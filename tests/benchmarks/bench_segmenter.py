@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from models.network.cost import multiply_adds
 from models.network.layers import Encoder, Memory, cut
 from models.network.process import keep_freed_memory, one_thread
-from models.network.segmenter import Segmenter, SegmenterConfig
+from models.network.segmenter import Segmenter
+from models.network.sizes import SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
 from models.policies.policies import score_seats
 from models.reading.inference import (

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 from storage.archive import run_folders, staging
-from storage.archive.archive import Archive, StageRef
+from storage.archive.archive import Archive
+from storage.archive.keys import StageRef
 from storage.archive.run_folders import date_of_store
 from storage.maintenance.garbage import plan_clearance
 from storage.remote.opening import verify_archive

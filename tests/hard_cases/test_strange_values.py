@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from flows.survey.field_work import seat_columns
-from models.network.dead_pixels import MOST_COLUMN
+from models.network.spectral import MOST_COLUMN
 from flows.survey.region_work import seat_columns
 from models.network.spectral import MOST_COLUMN
 from models.policies.policies import score_seats

@@ -23,11 +23,11 @@ from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.selection.choice import Decision, decide, list_effects, sum_up
 from pipeline.simulator.selection.choice import Decision, decide
-from pipeline.simulator.selection.manifest import list_effects, sum_up
+from pipeline.simulator.selection.choice import list_effects, sum_up
 from pipeline.simulator.selection.survey_probe import probe_survey
 from pipeline.simulator.selection.verification import candidate_blocks, verify, worst_blocks
 from pipeline.simulator.simulated import SimulatedSource, sweep_block, sweep_starts
-from storage.archive.archive import StageRef
+from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table
 from storage.archive.whole_files import to_json
 

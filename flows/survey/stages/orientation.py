@@ -10,7 +10,7 @@ from flows.survey.run import SurveyRun
 from flows.survey.stage import Product, Wanted, stage
 from flows.survey.stages.attention import load_plan
 from pipeline.planning.orientation import compare_orientations, find_rows
-from storage.archive.archive import StageRef
+from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table, write_table
 from storage.arrays.mosaics import load_attention, mosaic_brightness
 

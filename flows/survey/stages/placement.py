@@ -21,7 +21,7 @@ from pipeline.rectify.placed import PixelGrid
 from pipeline.rectify.region import read_seats
 from pipeline.rectify.tie_points import TieTable
 from pipeline.rectify.tracks import Track
-from storage.archive.archive import StageRef
+from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table, write_table
 from storage.arrays.layout import read_array
 from storage.arrays.lookups import path_digest, write_lookup

@@ -20,7 +20,7 @@ from pipeline.rectify.registration.alignment import SweepShift
 from pipeline.rectify.registration.illumination import overlap_light, solve_lights
 from pipeline.rectify.registration.overlaps import BroadSweep, broad_bands
 from pipeline.rectify.registration.seams import Anchor, Registration, SeamWindow, anchor_sweep, register_sweeps
-from storage.archive.archive import StageRef
+from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table, write_table
 from storage.arrays.mosaics import load_mosaic
 from storage.arrays.tile_work import Sighted, sight_sweeps

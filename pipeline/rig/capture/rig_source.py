@@ -44,13 +44,13 @@ from pipeline.rig.capture.capture_paths import (
     place_lines,
 )
 from pipeline.rig.capture.capture_runner import CaptureRunner, RigDevices, Say, say_nothing
-from pipeline.rig.device_errors import DeviceRefused, StateUnknown
+from pipeline.rig.devices import DeviceRefused, StateUnknown
 from pipeline.rig.survey_rig import SurveyRig
 from pipeline.simulator.simulated import check_binning
 from pipeline.rig.capture.capture_runner import CaptureJournal, CaptureRunner, RigDevices, Say, say_nothing
 from pipeline.rig.device_settings import SurveyRig
 from pipeline.rig.devices import DeviceRefused, StateUnknown
-from pipeline.simulator.instrument import check_binning
+from pipeline.simulator.simulated import check_binning
 from pipeline.source import Line, References
 
 LOG = logging.getLogger(__name__)

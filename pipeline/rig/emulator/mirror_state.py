@@ -20,10 +20,10 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.geometry.vector_memory import Ends
+from pipeline.geometry.scan import Ends
 from pipeline.rig.devices import Clock
 from pipeline.geometry.scan import Ends
-from pipeline.rig.clock import Clock
+from pipeline.rig.devices import Clock
 from pipeline.rig.emulator.mirror_motion import AxisMotion, Stiffness, VectorPlayer
 from pipeline.rig.mirror.registers import (
     CHANNELS,

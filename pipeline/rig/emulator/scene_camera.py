@@ -35,7 +35,7 @@ from pipeline.rig.mirror.steering import wire_positions
 from pipeline.rig.survey_rig import Pulses
 from pipeline.simulator.effects.effect import Aim, Bound, SweepBlock
 from pipeline.rig.mirror.path_player import wire_positions
-from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.effect import Aim, Bound
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.render import Choice

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pipeline.errors import RigError, SettingsError
-from pipeline.geometry.vector_memory import device_range
+from pipeline.geometry.scan import device_range
 from pipeline.rig.device_settings import MirrorSettings, ReadBack
 from pipeline.rig.devices import SYSTEM_CLOCK, Clock, Closing
 from pipeline.rig.mirror.mirror_requests import Identity, Modes, ProLink

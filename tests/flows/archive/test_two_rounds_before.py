@@ -12,7 +12,8 @@ import pytest
 
 from flows.publish.run_folder import Published
 from flows.survey.stage import versions
-from storage.archive.archive import Archive, StageRef
+from storage.archive.archive import Archive
+from storage.archive.keys import StageRef
 from storage.archive.records import read_run
 from tests.conftest import Survey
 from tests.flows.conftest import CommandLine

@@ -16,7 +16,7 @@ from flows.survey.stages.effects import choose_effects, chosen_effects, load_man
 from pipeline.errors import BoundError, IncompleteStoreError
 from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.scenes.scene import RasterScene
-from storage.archive.archive import StageRef
+from storage.archive.keys import StageRef
 
 ASKED = "rotation,vignetting,shot,read-noise"
 Open = Callable[..., CaptureRun]

@@ -21,7 +21,7 @@ from flows.survey.stages.effects import load_manifest
 from pipeline.errors import BoundError
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.registry import BY_NAME
-from storage.archive.archive import StageRef
+from storage.archive.keys import StageRef
 from tests.flows.simulate.test_effect_choice import choose
 
 ASKED = "rotation,vignetting,shot,read-noise"

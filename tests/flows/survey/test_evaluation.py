@@ -21,7 +21,8 @@ from pipeline.simulator.effects.pointing import CommonOffset, PointingErrors
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.image_scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource
-from storage.archive.archive import Archive, StageRef
+from storage.archive.archive import Archive
+from storage.archive.keys import StageRef
 
 OFF = np.array([2.2, -1.4])  # along the line and the scan [px]
 

@@ -11,7 +11,8 @@ from typing import Any, cast, get_args
 import numpy as np
 import pytest
 
-from flows.survey.extent import Extent, Unit, work_done, work_of_map
+from flows.survey.extent import Extent, work_done, work_of_map
+from flows.survey.stage import Unit
 from flows.survey.run import SurveyRun
 from models.network.cost import multiply_adds
 from models.network.sizes import SegmenterConfig

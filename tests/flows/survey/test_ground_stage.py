@@ -18,7 +18,8 @@ from pipeline.errors import PoseError
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.ground.map_grid import GroundGrid
 from pipeline.ground.view import RigPose, pixel_places
-from storage.archive.archive import Archive, StageRef
+from storage.archive.archive import Archive
+from storage.archive.keys import StageRef
 from storage.arrays.class_maps import ClassMap, write_class_map
 from storage.arrays.ground_maps import load_ground_map
 from storage.arrays.layout import AngularGrid

@@ -19,7 +19,7 @@ from models.network.spectral import SpectralBasis
 from models.reading.inference import Glance
 from pipeline.geometry.grid import SceneGrid
 from pipeline.simulator.effects.pointing import PointingErrors
-from storage.archive.archive import StageRef
+from storage.archive.keys import StageRef
 from storage.arrays.layout import open_group, read_array
 from storage.arrays.mosaics import PatchWriter
 

@@ -22,7 +22,7 @@ from flows.schedule.history_page import render_history, render_index
 from flows.terminal.shown_text import Terminal
 from pipeline.errors import is_visible
 from flows.terminal.progress import Terminal
-from pipeline.visible_text import is_visible
+from pipeline.errors import is_visible
 from storage.archive.whole_files import to_json
 
 HOSTILE = "field\x1b]0;owned\x07\x1b[2J\u202egnp.map\x9b31m\u2028\udcff"

@@ -36,7 +36,8 @@ from flows.tradeoff.rectify import (
     draw_waves,
     noise_levels,
 )
-from models.network.segmenter import Segmenter, SegmenterConfig
+from models.network.segmenter import Segmenter
+from models.network.sizes import SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
 from models.weights.files import Weights
 from pipeline.geometry.camera import LineCamera

@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 import torch
 
-from models.network.controls import DenseNetwork, build_network, cut, joined
+from models.network.controls import DenseNetwork, build_network
+from models.network.layers import cut, joined
 from models.network.layers import code_1d
 from models.network.segmenter import Segmenter
 from models.network.sizes import PRESETS, Preset, SegmenterConfig

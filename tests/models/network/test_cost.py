@@ -9,7 +9,8 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
 from models.network.cost import multiply_adds
-from models.network.segmenter import Segmenter, SegmenterConfig
+from models.network.segmenter import Segmenter
+from models.network.sizes import SegmenterConfig
 from pipeline.geometry.grid import SceneGrid
 
 

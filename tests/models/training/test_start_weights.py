@@ -11,7 +11,8 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from models.network.segmenter import Segmenter, SegmenterConfig
+from models.network.segmenter import Segmenter
+from models.network.sizes import SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
 from models.training.pretrained import mixed_channels, rgb_response
 from models.training.start_weights import StartFile, TokenSizes, column_change

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from models.network.controls import build_network
-from models.network.segmenter import Segmenter, SegmenterConfig
+from models.network.segmenter import Segmenter
+from models.network.sizes import SegmenterConfig
 from models.network.sizes import PRESETS, Preset
 from models.training import objective
 from models.training import train as training

@@ -15,10 +15,11 @@ from pipeline.rectify.calibration.calibrate import calibrate
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.lookup import grid_points, lookup
 from pipeline.rectify.mosaic import MosaicPart, edge_distance, mosaic
-from pipeline.rectify.resample import Kernel, resample
+from pipeline.rectify.resample import resample
+from pipeline.rectify.kernels import Kernel
 from pipeline.simulator.effects.registry import effects_on
 from pipeline.rectify.resample import resample
-from pipeline.simulator.instrument import effects_on
+from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.simulated import SimulatedSource
 

@@ -13,7 +13,8 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
 from pipeline.planning.coverage import coarse_sweeps, full_sweeps
 from pipeline.rectify.line_cache import LineCache
-from pipeline.rectify.region import mosaic_rows, place, read_seats, seat_pixels
+from pipeline.rectify.region import mosaic_rows, read_seats, seat_pixels
+from pipeline.rectify.placed import place
 from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.image_scene import raster_from_values

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.geometry.vector_memory import Ends
+from pipeline.geometry.scan import Ends
 from pipeline.rig.devices import ManualClock
 from pipeline.rig.emulator import mirror_state
 from pipeline.rig.emulator.mirror_device import MirrorDevice

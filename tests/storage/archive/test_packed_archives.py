@@ -17,7 +17,8 @@ from flows.archive.commands import run_verify
 from pipeline.errors import IncompleteStoreError, SceneError
 from pipeline.geometry.scan import Sweep
 from pipeline.source import Line, References
-from storage.archive.archive import Archive, StageRef
+from storage.archive.archive import Archive
+from storage.archive.keys import StageRef
 from storage.archive.manifests import listed_bytes, manifest_sha256, read_manifest, write_manifest
 from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
 from storage.readers.scan_files import open_cube_source

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from pipeline.errors import IncompleteStoreError
-from storage.archive.archive import Archive, StageRef
+from storage.archive.archive import Archive
+from storage.archive.keys import StageRef
 from storage.archive.manifests import _seal, _text
 from storage.archive.records import MANIFEST_HASH
 from storage.arrays.layout import create_group, open_group, read_array, write_image, write_small

@@ -27,7 +27,7 @@ from pipeline.simulator.effects.air import (
 )
 from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.rig_model import Air, Optics, Rig
-from tests.pipeline.geometry.second_order import relief_error
+from tests.pipeline.geometry.test_second_order import relief_error
 from tests.pipeline.simulator.fine_image import IMAGES, SWEEP, change, probe_of, shifted
 from tests.pipeline.simulator.made_up_effects import steep_probe
 

@@ -9,8 +9,8 @@ import pytest
 
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.block import SweepBlock
-from pipeline.simulator.effects.mirror_pointing import JITTER, tilt_to_scene
+from pipeline.simulator.effects.effect import SweepBlock
+from pipeline.simulator.effects.pointing import JITTER, tilt_to_scene
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import MirrorMotion, Rig
 from tests.pipeline.geometry.test_second_order import pointing_error

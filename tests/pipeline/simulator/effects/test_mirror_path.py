@@ -16,7 +16,7 @@ from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.mirror_path import LAG, STAIRCASE, beside_plan, responses, transient
 from pipeline.simulator.rig_model import MirrorMotion, Rig
-from tests.pipeline.geometry.second_order import staircase_jitter
+from tests.pipeline.geometry.test_second_order import staircase_jitter
 from tests.pipeline.simulator.made_up_effects import steep_probe
 
 SWEEP = Sweep("strip", "fine", "x", 0.0, -100.0, 200)

@@ -10,9 +10,9 @@ import pytest
 
 from pipeline.geometry.mirror import scene_to_direction
 from pipeline.geometry.scan import Sweep, sweep_to_scene
-from pipeline.simulator.block import SweepBlock
+from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.probe import Probe
-from pipeline.simulator.effects.relief import PARALLAX, closeness
+from pipeline.simulator.effects.air import PARALLAX, closeness
 from pipeline.simulator.rig_model import Air, Rig
 from tests.pipeline.geometry.test_second_order import relief_error
 

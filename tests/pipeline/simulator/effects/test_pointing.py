@@ -32,7 +32,7 @@ from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Rig
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
-from tests.pipeline.geometry.second_order import pointing_error
+from tests.pipeline.geometry.test_second_order import pointing_error
 from tests.pipeline.simulator.made_up_effects import steep_probe
 from tests.pipeline.simulator.small_scenes import image_scene, made_scene
 

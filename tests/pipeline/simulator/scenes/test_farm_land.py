@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from pipeline.geometry.camera import LineCamera, look
-from pipeline.planning.crop_rows import find_rows
+from pipeline.planning.orientation import find_rows
 from pipeline.simulator.scenes.farm.farm_plan import FarmPlan, FieldPlan, Ground, farm_plan
 from pipeline.geometry.camera import LineCamera, expose, footprint
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene

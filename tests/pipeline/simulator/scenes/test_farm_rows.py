@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.planning.orientation import find_rows
-from pipeline.simulator.scenes.farm.canvas import Ground
+from pipeline.simulator.scenes.farm.farm_plan import Ground
 from pipeline.simulator.scenes.farm.farm_plan import FarmPlan, FieldPlan, farm_plan
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.farm.fields import row_gaps, row_shadow, rows_of, stripes_of, wheel_marks

@@ -1,0 +1,74 @@
+"""How `make docs` builds these pages: Markdown by MyST, two tables made from the code, and every reference checked."""
+
+from __future__ import annotations
+
+import sys
+from importlib import metadata
+from pathlib import Path
+
+from docutils import nodes
+from docutils.statemachine import StringList
+from sphinx.application import Sphinx
+from sphinx.util.docutils import SphinxDirective
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from flows.settings.documents import settings_table  # noqa: E402
+from flows.survey.stage import all_stages  # noqa: E402
+
+project = "SpectralZoom"
+version = release = metadata.version("spectralzoom")
+copyright = "Apache-2.0"
+language = "en"
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+exclude_patterns = ["_build"]
+html_theme = "furo"
+html_title = "SpectralZoom"
+html_copy_source = False
+html_show_sphinx = False
+
+myst_heading_anchors = 3  # links such as own-data.md#labels, which are checked
+suppress_warnings = ["config.cache"]
+
+autodoc_typehints = "signature"
+autodoc_member_order = "bysource"
+napoleon_google_docstring = False
+napoleon_use_param = False
+napoleon_use_rtype = False
+napoleon_custom_sections = ["Raises", "Returns"]  # in words: napoleon wants each name on a line of its own
+# Docstrings name more than the reference lists, and types of numpy and xarray, whose pages are not at hand.
+nitpick_ignore_regex = [("py:.*", ".*")]
+
+
+def stage_table() -> str:
+    """Markdown: every stage in the order of a survey, from the records that the survey itself runs by."""
+    head = "| stage | on terminals | stored as, version | made of | work grows with |\n|---|---|---|---|---|\n"
+    return head + "".join(
+        f"| `{one.name}` | {one.title} | `stages/{one.product.name}`, {one.product.version} "
+        f"| {', '.join(f'`{name}`' for name in one.of) or 'nothing'} | {one.unit} |\n"
+        for one in all_stages().values()
+    )
+
+
+TABLES = {"settings": settings_table, "stages": stage_table}
+
+
+class Generated(SphinxDirective):
+    """Parses the Markdown of one of `TABLES` where a page names it, headings included."""
+
+    required_arguments = 1
+
+    def run(self) -> list[nodes.Node]:
+        """Give the table's nodes."""
+        lines = TABLES[self.arguments[0]]().splitlines()
+        holder = nodes.Element()
+        self.state.nested_parse(StringList(lines, source=self.arguments[0]), 0, holder, match_titles=True)
+        return holder.children
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Make the directive known."""
+    app.add_directive("generated", Generated)
+    return {"parallel_read_safe": True}

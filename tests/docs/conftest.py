@@ -1,0 +1,54 @@
+"""One small field, surveyed twice, as the pages speak of it: every page begins with a copy of it."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.conftest import Survey, WeightsMaker, patchy_scene
+
+SETTINGS = 'name = "{name}"\nscene = "field.png"\nlabels = "labels.png"\nweights = "mine.safetensors"\nbudget = 0.8\n'
+CLASSES = 'labels = "labels/{number}_labels.png"\n[classes]\nclass_0 = 0\nclass_1 = 1\nclass_2 = 2\n'
+HEADER = "ENVI\nsamples = 40\nlines = 24\nbands = 3\ndata type = 4\ninterleave = bip\nbyte order = 0\n"
+
+
+@pytest.fixture(scope="session")
+def surveyed(
+    tmp_path_factory: pytest.TempPathFactory,
+    scene_files: Path,
+    weights: Path,
+    make_weights: WeightsMaker,
+    survey_png: Survey,
+) -> Path:
+    """A folder with pictures, labels, a cube, weights, settings of two fields, and the archive of two surveys."""
+    folder = tmp_path_factory.mktemp("surveyed")
+    for name, source in {"field.png": "scene.png", "labels.png": "labels.png"}.items():
+        shutil.copy(scene_files / source, folder / name)
+    shutil.copy(weights, folder / "mine.safetensors")
+    shutil.copy(make_weights(dim=24), folder / "newer.safetensors")
+    patchy_scene((24, 40), 3, seed=3)[0].tofile(folder / "cube.img")
+    (folder / "cube.hdr").write_text(HEADER + "wavelength units = nm\nwavelength = {640, 550, 460}\n")
+    for number in ("001", "002"):
+        values, labels = patchy_scene((64, 64), 3, seed=int(number))
+        for kind, picture in {"images": values.astype(np.uint8), "labels": labels}.items():
+            path = folder / "fields" / kind / f"{number}_{kind.removesuffix('s') if kind == 'images' else kind}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(picture).save(path)
+    (folder / "fields" / "scene.toml").write_text(CLASSES)
+    for name in ("north", "south", "survey"):
+        (folder / f"{name}.toml").write_text(SETTINGS.format(name="south" if name == "south" else "north"))
+    for given in ({"budget": "0.6"}, {"accuracy": False}):
+        survey_png(folder / "archive", name="north", **given)
+    return folder
+
+
+@pytest.fixture
+def place(surveyed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of that folder, which is the current one."""
+    folder = shutil.copytree(surveyed, tmp_path / "place")
+    monkeypatch.chdir(folder)
+    return folder

@@ -1,0 +1,221 @@
+"""How a block of a page is run: commands in this process, Python with the names of its page, TOML by its loader.
+
+The comment before a block says what is other than written, `<!-- test: WORDS -->`:
+
+    with FLAGS      the flags are added to each command: smaller, and nobody waits for a server
+    parses          not run: every command's words are read by its own parser, every target and file is there
+    bucket          s3://bucket/prefix is an archive on the S3 server of the tests
+    tree            run with a copy of the four folders to which the page's files and changes were added
+    meanwhile       begun, and ended once the page is through; the others begin when the file after -o is there
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import tomllib
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import flows.cli.survey_verbs  # noqa: F401 - registers its verbs
+from flows.cli.app import app
+from flows.cli.main import main
+from flows.settings.load import load_settings
+from storage.readers.scene_toml import load_scene_settings
+from tests.docs.pages import ROOT, Block
+
+COMMANDS, TREE = ("sh",), ("pipeline", "models", "storage", "flows")
+SHOWN = ("text",)  # what programs print, and pictures made of letters: nothing to run
+BUILT = ("{toctree}", "{generated} settings", "{generated} stages", "{eval-rst}")  # run by `make docs`
+BUCKET = "s3://bucket/prefix"
+BEGUN_WITHIN_S = 120.0
+
+
+@dataclass
+class Reader:
+    """Somebody who goes through one page and does what it says, in a folder of their own."""
+
+    folder: Path
+    bucket: str | None = None
+    names: dict[str, Any] = field(default_factory=lambda: {"__name__": "page"})
+    left: ExitStack = field(default_factory=ExitStack)  # ends what was begun
+
+    def follow(self, block: Block) -> None:
+        """Do what one block says; AssertionError names it where that does not work."""
+        word, _, rest = block.mark.partition(" ")
+        if block.language in (*SHOWN, *BUILT):
+            assert not block.mark, f"{block.place}: nothing of a {block.language} block is tested"
+        elif block.language in COMMANDS:
+            assert word in ("", "with", "parses", "bucket", "tree", "meanwhile"), f"{block.place}: {block.mark}?"
+            for command in commands_of(block):
+                self._command(block, command, word, rest)
+        elif block.language == "python":
+            self._python(block)
+        elif block.language == "toml":
+            self._toml(block)
+        elif block.language == "diff":
+            self._change(block)
+        else:
+            raise AssertionError(f"{block.place}: no test runs a block of {block.language or 'no language'}")
+
+    @property
+    def tree(self) -> Path:
+        """A copy of the four folders that a page may add to."""
+        root = self.folder / "tree"
+        if not root.exists():
+            for name in TREE:
+                shutil.copytree(ROOT / name, root / name, ignore=shutil.ignore_patterns("__pycache__"))
+        return root
+
+    def _command(self, block: Block, command: str, word: str, rest: str) -> None:
+        words = shlex.split(command.partition(" > ")[0])
+        program = Path(words[0]).name
+        check_words(words, block.place)
+        if word == "parses":
+            return
+        assert program == "spectralzoom", f"{block.place}: only spectralzoom is run; say what is to parse"
+        given = [*words[1:], *shlex.split(rest)]
+        if word == "bucket":
+            assert self.bucket is not None
+            given = [one.replace(BUCKET, self.bucket) for one in given]
+        if word == "tree":
+            self._elsewhere(block, given)
+        elif word == "meanwhile":
+            self._begin(block, given)
+        else:
+            code = run_here(given)
+            assert code == 0, f"{block.place}: {command} ended with {code}"
+
+    def _elsewhere(self, block: Block, words: list[str]) -> None:
+        """Run with the copy of the folders, in a process of its own."""
+        environment = {**os.environ, "PYTHONPATH": str(self.tree)}
+        command = [sys.executable, "-m", "flows.cli.main", *words]
+        ended = subprocess.run(command, env=environment, cwd=self.folder, capture_output=True, text=True, check=False)
+        assert ended.returncode == 0, f"{block.place}: {ended.stderr[-2000:]}"
+
+    def _begin(self, block: Block, words: list[str]) -> None:
+        """Begin what goes on until it is told to end."""
+        made = self.folder / words[words.index("-o") + 1]
+        command = [str(Path(sys.executable).with_name("spectralzoom")), *words]
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=self.folder)
+
+        def end() -> None:
+            process.send_signal(signal.SIGINT)
+            process.wait(30)
+
+        self.left.callback(end)
+        until = time.monotonic() + BEGUN_WITHIN_S
+        while not made.exists():
+            assert process.poll() is None, f"{block.place}: ended with {process.returncode}"
+            assert time.monotonic() < until, f"{block.place}: there is no {made.name} yet"
+            time.sleep(0.1)
+
+    def _python(self, block: Block) -> None:
+        if block.file is not None:
+            self._add(block, block.text)
+            return
+        code = compile("\n" * (block.line - 1) + block.text, str(block.page), "exec", dont_inherit=True)
+        exec(code, self.names)
+
+    def _add(self, block: Block, text: str) -> None:
+        """Put a file of the page into the copy of the folders, where there is none of that name."""
+        assert block.file is not None
+        path = self.tree / block.file
+        assert path.parent.is_dir(), f"{block.place}: there is no folder {path.parent.relative_to(self.tree)}"
+        assert not path.exists(), f"{block.place}: {block.file} is there already"
+        path.write_text(text, encoding="utf-8")
+
+    def _change(self, block: Block) -> None:
+        """Change a file of the copy as a diff says, whose first line names it; each part fits in one place."""
+        first, _, rest = block.text.partition("\n")
+        path = self.tree / first.removeprefix("--- ")
+        text = path.read_text(encoding="utf-8")
+        for part in re.split(r"^@@\n", rest, flags=re.MULTILINE):
+            lines = part.splitlines(keepends=True)
+            old = "".join(line[1:] for line in lines if line[:1] != "+")
+            new = "".join(line[1:] for line in lines if line[:1] != "-")
+            known = text.count(f"\n{old}")
+            assert known == 1, f"{block.place}: {path.relative_to(self.tree)} has no such lines, or several: {old}"
+            text = text.replace(f"\n{old}", f"\n{new}")
+        path.write_text(text, encoding="utf-8")
+
+    def _toml(self, block: Block) -> None:
+        """Load it as a scene.toml, or as settings; by the name in its first line it stays for later blocks."""
+        path = self.folder / (block.file or f"line-{block.line}.toml")
+        path.write_text(block.text, encoding="utf-8")
+        if path.name == "scene.toml":
+            load_scene_settings(path)
+        else:
+            load_settings(path)
+
+
+def run_here(words: list[str]) -> int:
+    """Run the command line in this process; gives the exit code."""
+    try:
+        main(words)
+    except SystemExit as ended:
+        return int(ended.code or 0)
+    return 0
+
+
+def commands_of(block: Block) -> list[str]:
+    """The commands of a block: lines put together, comments gone, variables that it sets filled in."""
+    text, known, found = block.text.replace("\\\n", " "), {"DATA": "data"}, []
+    for line in text.splitlines():
+        bare = shlex.join(shlex.split(Template(line).safe_substitute(known), comments=True))
+        setting = re.fullmatch(r"([A-Z_]+)=(\S*)", bare)
+        if setting:
+            known[setting[1]] = setting[2]
+        elif bare:
+            found.append(bare)
+    return found
+
+
+def check_words(words: list[str], place: str) -> None:
+    """Refuse a command that cannot be meant: an unknown verb or flag, target, file, benchmark or extra."""
+    program, *given = [Path(words[0]).name, *words[1:]]
+    if program == "spectralzoom":
+        app.parse_args(given, exit_on_error=False, print_error=False)
+    elif program == "make":
+        phony = re.search(r"^\.PHONY: (.+)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
+        assert phony is not None
+        assert {word for word in given if "=" not in word} <= set(phony[1].split()), f"{place}: make {given}?"
+    elif program in ("python", "pytest"):
+        check_python(program, given, place)
+    elif program == "pip":
+        check_install(given, place)
+    else:
+        assert program in ("open", "cd", "git"), f"{place}: who knows {program}?"
+
+
+def check_python(program: str, given: list[str], place: str) -> None:
+    """A module or file that is there; of benchmarks those that are."""
+    if given[0] == "-m":
+        assert importlib.util.find_spec(given[1]) is not None, f"{place}: there is no module {given[1]}"
+        return
+    assert (ROOT / given[0]).exists(), f"{place}: there is no {given[0]}"
+    if program == "python" and given[0] == "tests/benchmarks":
+        asked = {word for word in given[1:] if not word.startswith("-") and word.islower()}
+        there = {path.stem.removeprefix("bench_") for path in (ROOT / given[0]).glob("bench_*.py")}
+        assert asked <= there, f"{place}: no benchmark {asked - there}"
+
+
+def check_install(given: list[str], place: str) -> None:
+    """Extras that there are, and packages that the project names."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    named = {re.split(r"[\[<>=]", one)[0] for part in (project["dependencies"], *extras.values()) for one in part}
+    for word in given[1:]:
+        own = re.fullmatch(r"(?:spectralzoom|\.)\[(.+)\]", word)
+        known = own[1].split(",") if own else []
+        assert set(known) <= set(extras) if own else word in named | {"-e"}, f"{place}: pip install {word}?"

@@ -1,0 +1,86 @@
+"""The pages hold what they promise: every block runs, every link and path leads somewhere, README stays short."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+
+from tests.docs.pages import DOCS, LINKED, PAGES, ROOT, Block, anchors_of, blocks_of, links_of, named_code
+from tests.docs.running import Reader
+
+WITH_BLOCKS = [page for page in PAGES if blocks_of(page)]
+README_LINES = 150
+PATH = re.compile(
+    r"(?:pipeline|models|storage|flows|tests|docs|\.ci)(?:/[\w.-]+)*/?|[\w-]+\.(?:md|toml|yaml|txt)|Makefile"
+)
+OF_USERS = {"scene.toml", "emulated.toml", "field.toml", "survey.toml", "north.toml"}  # pages have people write them
+
+
+def named(page: Path) -> str:
+    """A page's name in messages."""
+    return page.relative_to(ROOT).as_posix()
+
+
+@pytest.mark.parametrize("page", WITH_BLOCKS, ids=named)
+def test_every_block_runs(page: Path, place: Path, request: pytest.FixtureRequest) -> None:
+    """From top to bottom, in a folder with a small survey in it."""
+    blocks = blocks_of(page)
+    bucket = request.getfixturevalue("bucket") if any(one.mark == "bucket" for one in blocks) else None
+    reader = Reader(place, bucket)
+    with reader.left:
+        for block in blocks:
+            reader.follow(block)
+
+
+@pytest.mark.parametrize("page", LINKED, ids=named)
+def test_links_lead_somewhere(page: Path) -> None:
+    """Files and anchors are there; addresses of the web are well formed, and not asked."""
+    wrong = []
+    for target in links_of(page):
+        parts = urlsplit(target)
+        if parts.scheme:
+            wrong += [] if parts.scheme == "https" and "." in parts.netloc else [target]
+            continue
+        to = (page.parent / parts.path).resolve() if parts.path else page
+        known = to.exists() and (not parts.fragment or parts.fragment in anchors_of(to))
+        wrong += [] if known else [target]
+    assert wrong == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=named)
+def test_named_paths_are_there(page: Path) -> None:
+    """A path of the repository in backticks is one: what was renamed shows here."""
+    named_paths = {word.split("::")[0] for word in named_code(page) if PATH.fullmatch(word)} - OF_USERS
+    assert [path for path in sorted(named_paths) if not (ROOT / path).exists()] == []
+
+
+def test_readme_is_short() -> None:
+    """What takes longer stands in docs."""
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= README_LINES
+
+
+@pytest.mark.parametrize(
+    ("language", "text", "mark", "words"),
+    [
+        ("sh", "spectralzoom survey --no-such-flag\n", "parses", "no-such-flag"),
+        ("sh", "spectralzoom survey\n", "whatever", r"whatever\?"),
+        ("sh", "make no-such-target\n", "parses", "no-such-target"),
+        ("sh", "python tests/benchmarks no_such\n", "parses", "no_such"),
+        ("sh", "pip install 'spectralzoom[no-such]'\n", "parses", "no-such"),
+        ("sh", "make survey\n", "", "only spectralzoom is run"),
+        ("sh", "spectralzoom ls no-such-archive\n", "", "ended with 1"),
+        ("toml", "budjet = 0.5\n", "", "budget"),
+        ("toml", '# scene.toml\nlabel = "labels.png"\n', "", "unknown key label"),
+        ("diff", "--- flows/cli/app.py\n-no such line\n+another\n", "", "no such lines"),
+        ("", "what is this\n", "", "no language"),
+        ("python", "no_such_name\n", "", "no_such_name"),
+    ],
+)
+def test_a_block_that_does_not_work_is_found(language: str, text: str, mark: str, words: str, tmp_path: Path) -> None:
+    """Unknown flags, targets, keys, names and languages: each fails in words that name it."""
+    block = Block(DOCS / "index.md", 1, language, text, mark)
+    with pytest.raises(Exception, match=words):
+        Reader(tmp_path).follow(block)
