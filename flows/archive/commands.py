@@ -25,9 +25,7 @@ from flows.terminal.progress import StageProgress, put_out
 from models.weights.files import seal_weights
 from pipeline.errors import SettingsError
 from storage.archive.archive import Archive
-from storage.archive.lineage import changes_between, version_before
-from storage.archive.lineage import Catalogue
-from storage.archive.lineage import find_product
+from storage.archive.lineage import Catalogue, changes_between, find_product, version_before
 from storage.archive.records import Run, Store
 from storage.maintenance.garbage import clear_up
 from storage.maintenance.repair import Rerun, plan_repair

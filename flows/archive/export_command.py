@@ -24,9 +24,21 @@ from storage.arrays.ground_maps import load_bands, open_image
 from storage.arrays.layout import SHARD_ROWS
 from storage.export.cog_files import need_rasterio, write_cog
 from storage.export.envi_writer import EnviFile, write_envi
-from storage.export.stac_items import COG, check_owner, need_pystac, write_stac
-from storage.export.stac_items import COG, ZARR, angular, clean_id, footprint, projection, spectral_bands, wavelengths
-from storage.export.stac_items import Collection, Item, check_owner, need_pystac, write_stac
+from storage.export.stac_items import (
+    COG,
+    ZARR,
+    Collection,
+    Item,
+    angular,
+    check_owner,
+    clean_id,
+    footprint,
+    need_pystac,
+    projection,
+    spectral_bands,
+    wavelengths,
+    write_stac,
+)
 from storage.remote.opening import open_archive
 
 ENVI_NUMBERS = "application/octet-stream"

@@ -25,12 +25,9 @@ from flows.terminal.figures import format_bytes, format_seconds
 from flows.terminal.processes import DONE
 from flows.terminal.progress import put_out
 from pipeline.errors import IncompleteStoreError, PipelineError
-from storage.archive.keys import store_at
 from storage.archive.archive import Archive
-from storage.archive.keys import StageRef
-from storage.archive.lineage import Change, changes_between
-from storage.archive.keys import plain
-from storage.archive.lineage import Catalogue
+from storage.archive.keys import StageRef, plain, store_at
+from storage.archive.lineage import Catalogue, Change, changes_between
 from storage.archive.records import Store
 from storage.remote.opening import is_archive, open_archive
 

@@ -32,13 +32,10 @@ from flows.publish.survey_command import run_survey
 from flows.settings.load import of_this_version, parse_settings
 from flows.settings.survey_settings import OF_THE_MACHINE, Settings
 from flows.survey.scores import score_of
-from flows.terminal.figures import format_points, format_seconds
-from pipeline.errors import PipelineError, SettingsError, visible
 from flows.terminal.figures import counted, format_points, format_seconds
 from flows.terminal.processes import DONE, FAILED, PARTLY
 from flows.terminal.progress import put_out
-from pipeline.errors import PipelineError, SettingsError
-from pipeline.errors import visible
+from pipeline.errors import PipelineError, SettingsError, visible
 from storage.archive.lineage import Catalogue
 from storage.archive.records import read_run
 from storage.archive.whole_files import new_file, to_json, write_whole

@@ -14,11 +14,9 @@ from flows.schedule.rig_lock import rig_to_oneself
 from flows.settings.declared import SURVEY, TABLES
 from flows.settings.documents import flag_help
 from flows.settings.load import load_settings
-from flows.terminal.shown_text import print_json
-from pipeline.rig.device_settings import SurveyRig
 from flows.settings.survey_settings import REPLACED
 from flows.terminal.progress import print_json
-from pipeline.rig.survey_rig import SurveyRig
+from pipeline.rig.device_settings import SurveyRig
 
 removed.update(REPLACED)
 IN_TABLES = {"exposure_ms": "camera.exposure_ms"}  # flags of what a settings file has in a table

@@ -27,7 +27,6 @@ from pipeline.planning.coverage import cheapest_full, coarse_sweeps
 from pipeline.planning.fine_pass import plan_fine
 from pipeline.planning.line_blocks import WIDTHS, line_blocks, most_shown
 from pipeline.planning.prices import check_budget, count_lines
-from pipeline.planning.prices import count_lines
 from pipeline.planning.selection import frame_seats
 from pipeline.simulator.scenes.scene import RasterScene
 

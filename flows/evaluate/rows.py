@@ -19,10 +19,6 @@ from numpy.typing import NDArray
 
 from flows.evaluate.frames import Candidate, Look, Sight
 from flows.evaluate.series import Record, Runs, seeds_of
-from models.evaluation.metrics import boundary_counts
-from models.evaluation.metrics import confusion
-from models.evaluation.placement import average_precision, gain_sums, oracle_gain, rank_correlation, top_seats
-from flows.evaluate.frames import Look, Sight
 from models.evaluation.metrics import boundary_counts, confusion
 from models.evaluation.placement import (
     RANDOM_DRAWS,
@@ -32,16 +28,13 @@ from models.evaluation.placement import (
     rank_correlation,
     top_seats,
 )
-from models.network.cost import MultiplyAdds, multiply_adds
+from models.network.cost import MultiplyAdds, control_multiply_adds, multiply_adds
 from models.policies.policies import score_seats
 from models.reading.control_maps import draw_with_control
-from models.network.cost import control_multiply_adds
 from models.reading.inference import Glance, segment
 from models.weights.files import AnyWeights, Weights
 from pipeline.errors import SettingsError
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.planning.prices import BYTES_PER_SAMPLE
-from pipeline.planning.selection import frame_seats
 from pipeline.planning.prices import BYTES_PER_SAMPLE
 from pipeline.planning.selection import frame_seats, select_seats
 

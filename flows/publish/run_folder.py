@@ -23,12 +23,11 @@ from flows.settings.load import anchor_paths
 from flows.survey.extent import work_done, work_of_map
 from flows.survey.run import SurveyRun, now
 from flows.survey.stages.accuracy import load_accuracy
-from flows.survey.stages.attention import load_plan
+from flows.survey.stages.attention import load_orientation, load_plan
 from flows.survey.stages.capture import captured
 from flows.survey.stages.class_map import strange_pixels
 from flows.survey.stages.effects import load_manifest
 from flows.survey.stages.ground import STORE
-from flows.survey.stages.orientation import load_orientation
 from flows.survey.stages.placement import SEATS_AT_ONCE, line_facts, seen_shares
 from flows.survey.stages.registration import load_registration
 from flows.survey.survey import Products, StageRunner
@@ -43,8 +42,6 @@ from storage.archive.keys import StageRef
 from storage.archive.records import StageRecord, read_run
 from storage.archive.run_folders import RunDraft
 from storage.archive.whole_files import to_json
-from storage.arrays.class_maps import ClassMap, load_class_map
-from storage.arrays.mosaics import load_attention
 from storage.arrays.class_maps import load_class_map
 from storage.arrays.cubes import RawCube
 from storage.arrays.ground_maps import load_ground_map, open_image

@@ -15,14 +15,6 @@ from typing import Literal
 from rich.console import Console
 from rich.markup import escape
 
-from flows.schedule.due_runs import Outcome, Tell
-from flows.schedule.fields import alone_on, load_fields, survey_field
-from flows.schedule.notices import notice_address, send_notice
-from flows.schedule.server import serve_prefect
-from flows.schedule.served import ServeRequest
-from flows.schedule.times import parse_timetable
-from pipeline.errors import SettingsError
-from storage.remote.object_stores import is_remote
 from flows.cli.app import stderr
 from flows.schedule.due_runs import Outcome, Survey, Tell, run_all
 from flows.schedule.field_schedule import FieldSchedule

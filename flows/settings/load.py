@@ -12,9 +12,7 @@ from flows.settings.declared import SURVEY, TABLES, Declared
 from flows.settings.survey_settings import BUILT_IN_SCENES, PATHS, REPLACED, RIG_FIELD, MapChoice, Settings
 from models.network.sizes import TRAINED_VGG_FROM, VGG_FROM
 from pipeline.errors import PoseError, SettingsError
-from pipeline.simulator.scenes.farm.farm_scene import REMOVED_LAW
-from storage.archive.staging import read_toml
-from pipeline.rig.mirror.mirror_settings import MOST_PAIRS
+from pipeline.rig.device_settings import MOST_PAIRS
 from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, REMOVED_LAW
 from storage.archive.staging import read_toml
 

@@ -23,7 +23,6 @@ from flows.terminal.progress import print_json
 from pipeline.errors import SettingsError
 from pipeline.geometry.mirror import STRAIGHT
 from pipeline.rig.device_settings import SurveyRig
-from pipeline.geometry.mirror import STRAIGHT
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock, ServedRig
 from pipeline.rig.emulator.fault_names import read_faults
 from pipeline.simulator.simulated import SimulatedSource

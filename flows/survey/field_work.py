@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from flows.survey.run import SurveyRun, weights_path
 from models.network.sizes import saliency_bytes
 from models.policies.policies import IMAGE_POLICIES, NETWORK_POLICIES, score_seats
-from models.network.sizes import saliency_bytes
-from models.policies.policies import IMAGE_POLICIES
 from models.policies.vgg_file import VggFile
 from models.reading.inference import CoarseLook, Glance, look_coarsely, read_glance, segment
 from models.reading.regions import HALO_CELLS, REGION_PX, Region, most_bytes, plan_regions, whole_field
@@ -28,14 +26,9 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.readings import beyond_range, readings_alone
 from storage.arrays.class_maps import write_class_tile
 from storage.arrays.layout import SHARD_COLUMNS, SHARD_ROWS
-from storage.arrays.mosaics import mosaic_wavelengths, open_patches
-from storage.arrays.tile_work import RESERVED_BYTES
-from storage.parallel.crew import Crew, run_blocks
-from storage.arrays.mosaics import mosaic_strips, mosaic_wavelengths
-from storage.arrays.mosaics import PATCHES_A_SHARD, PatchStore, open_patches
+from storage.arrays.mosaics import PATCHES_A_SHARD, PatchStore, mosaic_strips, mosaic_wavelengths, open_patches
 from storage.arrays.tile_work import RESERVED_BYTES, let_tiles_go
-from storage.parallel.crew import run_blocks
-from storage.parallel.crew import Crew
+from storage.parallel.crew import Crew, run_blocks
 
 Strange = tuple[int, int]  # coarse pixels, and fine ones, with a value that is no reading
 

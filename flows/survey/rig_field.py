@@ -12,10 +12,10 @@ from flows.settings.survey_settings import Settings
 from pipeline.geometry.mirror import STRAIGHT
 from pipeline.geometry.scan import Sweep, sweep_positions
 from pipeline.rig.camera.camera_files import KeptInMemory
-from pipeline.rig.device_settings import CameraLimits, check_times
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.capture.capture_runner import RigDevices
 from pipeline.rig.capture.rig_source import RigSource
+from pipeline.rig.device_settings import CameraLimits, check_times
 from pipeline.rig.devices import SYSTEM_CLOCK, Clock
 from pipeline.rig.mirror.mirror_controller import open_mirror
 from pipeline.simulator.effects.effect import Effect

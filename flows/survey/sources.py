@@ -10,11 +10,6 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from flows.settings.survey_settings import Settings
-from pipeline.geometry.mirror import STRAIGHT
-from pipeline.geometry.scan import Sweep, sweep_positions
-from pipeline.rig.camera.camera_files import KeptInMemory
-from pipeline.rig.device_settings import CameraLimits, check_times
-from pipeline.rig.devices import SYSTEM_CLOCK, Clock
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.effect import Effect
 from pipeline.simulator.scenes.scene import RasterScene

@@ -38,8 +38,7 @@ from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
-from storage.arrays.layout import CODECS, store_in_memory
-from storage.arrays.layout import round_bits
+from storage.arrays.layout import CODECS, round_bits, store_in_memory
 
 Values = NDArray[np.float32]
 

@@ -12,21 +12,18 @@ from numpy.typing import NDArray
 from flows.tradeoff.entries import Level, Setting, Tradeoff, register
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.coverage import full_sweeps
-from pipeline.simulator.effects.effect import SweepBlock
-from pipeline.simulator.effects.effect import OFF, Effect
-from pipeline.simulator.effects.probe import noise_electrons
+from pipeline.simulator.effects.effect import OFF, Effect, SweepBlock
 from pipeline.simulator.effects.line import SLIT
-from pipeline.simulator.effects.probe import Probe
+from pipeline.simulator.effects.probe import Probe, noise_electrons
 from pipeline.simulator.effects.registry import EFFECTS, RAYS
 from pipeline.simulator.effects.registry import FOOTPRINT as BLURS
-from pipeline.simulator.simulated import sweep_block
-from pipeline.simulator.render import dark_frame, read_out
-from pipeline.simulator.render import Choice, expected_light
+from pipeline.simulator.render import Choice, dark_frame, expected_light, read_out
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.selection.choice import CHEAP_SHARE, decide
 from pipeline.simulator.selection.survey_probe import probe_scene
+from pipeline.simulator.simulated import sweep_block
 
 SHAPE = (512, 1280)
 LINES = 8  # at each end of a sweep and in its middle

@@ -20,9 +20,8 @@ from models.training.examples import Observation, measured_normalisation, normal
 from models.training.start_weights import StartFile
 from models.training.train import Progress, TrainingSettings, train
 from models.weights.files import AnyWeights, save_weights, with_record
-from pipeline.errors import SceneError, SettingsError, ShapeError
 from models.weights.sealed_files import read_checkpoint
-from pipeline.errors import SceneError, SettingsError
+from pipeline.errors import SceneError, SettingsError, ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES

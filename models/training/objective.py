@@ -20,8 +20,7 @@ from torch import Tensor
 
 from models.network.controls import Control, Network
 from models.network.segmenter import Segmenter
-from models.network.sizes import SegmenterConfig
-from models.network.sizes import MOST_GAIN
+from models.network.sizes import MOST_GAIN, SegmenterConfig
 from models.training.examples import Batch, Example
 from pipeline.geometry.grid import UNLABELLED
 

@@ -9,8 +9,7 @@ from typing import Literal, get_args
 
 from pipeline.errors import SettingsError
 from pipeline.geometry.mirror import STRAIGHT, Axes, Mounting
-from pipeline.geometry.scan import CostModel
-from pipeline.geometry.scan import Ends
+from pipeline.geometry.scan import CostModel, Ends
 from pipeline.stated import assumed, check_stated, stated
 
 ReadBack = Literal["none", "sampled", "all"]

@@ -16,14 +16,10 @@ from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
 from pipeline.geometry.camera import LineCamera, bin_samples
-from pipeline.geometry.scan import CostModel, Sweep, line_positions
-from pipeline.geometry.scan import memory_loads
+from pipeline.geometry.scan import CostModel, Sweep, line_positions, memory_loads
 from pipeline.simulator.effects.counting import DEFECTS, dead_elements, hot_electrons
 from pipeline.simulator.effects.effect import OFF, SweepBlock
 from pipeline.simulator.effects.mirror_throughput import VIGNETTING
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import CostModel, Sweep, line_positions, memory_loads
-from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.pointing import Pointing
 from pipeline.simulator.effects.registry import USUAL
 from pipeline.simulator.effects.sensor import PRNU, STRIPING

@@ -27,9 +27,6 @@ from urllib.parse import quote
 
 from pipeline.checked_lines import read_checked, with_check
 from pipeline.rig.devices import NotKept
-from storage.archive.staging import open_plain, plain_reader, plain_size, read_plain
-from storage.archive.staging import sync_path
-from pipeline.rig.devices import NotKept
 from storage.archive.staging import open_plain, plain_reader, plain_size, read_plain, sync_path
 
 SYNC_BYTES = 1 << 24

@@ -18,13 +18,10 @@ from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.line_cache import LineCache
-from pipeline.rectify.placed import PixelGrid, Placed
-from pipeline.rectify.region import Reaches, Tile, cache_bytes, column_reach, mosaic_tile, plan_tiles, tile_bytes
 from pipeline.rectify.line_numbers import LineNumbers, number_lines
 from pipeline.rectify.placed import PixelGrid, Placed, place
-from pipeline.rectify.region import Reaches, column_reach, mosaic_tile
+from pipeline.rectify.region import Reaches, Tile, cache_bytes, column_reach, mosaic_tile, plan_tiles, tile_bytes
 from pipeline.rectify.registration.alignment import SweepShift, no_shifts
-from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.tie_points import TieTable
 from pipeline.rectify.tracks import Track
 from storage.archive.manifests import read_table

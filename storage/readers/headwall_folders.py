@@ -24,8 +24,6 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from pipeline.rig.camera.camera_texts import LONGEST_LINE, FrameIndex, LineTimes, parse_frame_index, times_of_lines
-from storage.readers.cube_sources import MOST_MISSING
-from pipeline.rig.camera.camera_texts import LONGEST_LINE, FrameIndex, LineTimes, parse_frame_index, times_of_lines
 from storage.readers.cube_sources import MOST_MISSING, Bands, CubeSource, LineFacts
 from storage.readers.envi_cubes import EnviCube, find_envi_pair, open_envi_cube
 

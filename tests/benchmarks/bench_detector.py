@@ -15,13 +15,10 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera, digitise
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.effects.counting import DARK_CURRENT, QUANTISATION, READ_NOISE, SATURATION, SHOT
+from pipeline.simulator.effects.counting import DARK_CURRENT, QUANTISATION, READ_NOISE, SATURATION, SHOT, dark_electrons
 from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.noise import merged_noise, normal_deviates, photon_counts, rounded_counts
 from pipeline.simulator.effects.sensor import PRNU
-from pipeline.simulator.render import read_out
-from pipeline.simulator.effects.sensor import PRNU
-from pipeline.simulator.effects.counting import DARK_CURRENT, dark_electrons
 from pipeline.simulator.render import read_out
 from pipeline.simulator.rig_model import Detector, Rig
 

@@ -21,6 +21,7 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.geometry.scan import Sweep, shifted_position
 from pipeline.planning.coverage import full_sweeps
+from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.lookup import track_lookup
 from pipeline.rectify.mosaic import MosaicPart, edge_distance, mosaic
 from pipeline.rectify.registration.alignment import SweepShift, no_shifts
@@ -28,7 +29,6 @@ from pipeline.rectify.registration.overlaps import LEAST_OVERLAP_PX, BroadSweep,
 from pipeline.rectify.registration.seams import Registration, measure_windows, place_images, register_sweeps
 from pipeline.rectify.registration.shifts import pair_shift
 from pipeline.rectify.resample import resample
-from pipeline.rectify.kernels import Kernel
 from pipeline.simulator.effects.pointing import ACCURACY_PX, REPEATABILITY_PX, PointingErrors
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene

@@ -15,8 +15,7 @@ from models.evaluation.metrics import mean_iou
 from models.evaluation.placement import captured_gain, gain_sums, oracle_gain
 from models.network.layers import ChannelNorm, TokenAttention
 from models.network.segmenter import Segmenter
-from models.network.sizes import SegmenterConfig
-from models.network.sizes import MOST_GAIN
+from models.network.sizes import MOST_GAIN, SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
 from models.reading.inference import glance_of_columns
 from models.training import train as training

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from flows.survey.field_work import seat_columns
 from models.network.spectral import MOST_COLUMN
-from flows.survey.region_work import seat_columns
-from models.network.spectral import MOST_COLUMN
 from models.policies.policies import score_seats
 from models.reading.inference import DrawnMap, Glance, decide, glance, glance_of_columns, look_coarsely, segment
 from models.reading.regions import whole_field

@@ -24,8 +24,6 @@ from pipeline.rig.emulator.emulated_rig import EmulatedRig, InProcessRig
 from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults
 from pipeline.rig.emulator.mirror_device import Fault
 from pipeline.rig.mirror.mirror_controller import MirrorController
-from pipeline.rig.survey_rig import SurveyRig
-from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.image_scene import raster_from_values

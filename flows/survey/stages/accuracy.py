@@ -39,12 +39,11 @@ from pipeline.geometry.scan import Sweep
 from pipeline.planning.fine_pass import price_of_seats
 from pipeline.planning.prices import count_lines
 from pipeline.planning.selection import frame_seats
-from pipeline.rectify.region import read_seats
 from pipeline.rectify.kernels import Kernel
+from pipeline.rectify.region import read_seats
 from pipeline.simulator.effects.pointing import CommonOffset, PointingErrors
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
-from storage.archive.keys import StageRef
-from storage.archive.keys import array_digest
+from storage.archive.keys import StageRef, array_digest
 from storage.archive.manifests import read_table
 from storage.archive.whole_files import to_json
 from storage.arrays.class_maps import load_class_map

@@ -15,16 +15,11 @@ from flows.survey.stage import Product, Wanted, stage
 from models.policies.policies import IMAGE_POLICIES, SEEDED_POLICIES, SEEING_POLICIES, score_seats
 from models.reading.inference import Glance
 from pipeline.geometry.scan import Sweep
-from pipeline.planning.orientation import find_rows
 from pipeline.planning.fine_pass import FinePlan, plan_fine
-from pipeline.planning.orientation import compare_orientations
-from storage.archive.keys import StageRef
-from storage.archive.keys import array_digest
+from pipeline.planning.orientation import compare_orientations, find_rows
+from storage.archive.keys import StageRef, array_digest
 from storage.archive.manifests import read_table, write_table
-from storage.arrays.mosaics import Attention, write_attention
-from storage.archive.manifests import read_table, write_table
-from storage.arrays.mosaics import Attention, load_attention, write_attention
-from storage.arrays.mosaics import mosaic_brightness
+from storage.arrays.mosaics import Attention, load_attention, mosaic_brightness, write_attention
 
 ATTENTION = Product("attend", version=7, by_weights=True)
 

@@ -14,15 +14,13 @@ from flows.survey.stage import Product, Wanted, stage
 from flows.survey.stages.attention import load_plan
 from flows.survey.stages.effects import chosen_effects, load_manifest
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.simulated import BLOCK_LINES
-from pipeline.simulator.simulated import SimulatedSource, sweep_starts
+from pipeline.simulator.simulated import BLOCK_LINES, SimulatedSource, sweep_starts
 from pipeline.source import Line, Source
 from storage.archive.keys import StageRef, stage_key
 from storage.archive.manifests import write_table
 from storage.arrays.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_cube
 from storage.arrays.spool import Spool
-from storage.parallel.crew import run_blocks
-from storage.parallel.crew import Crew
+from storage.parallel.crew import Crew, run_blocks
 
 RAW = Product("capture", version=4)
 RIG_RECORD = "rig.json"  # beside the cubes: what a rig's captures were like

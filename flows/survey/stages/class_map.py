@@ -13,8 +13,7 @@ from flows.survey.run import SurveyRun
 from flows.survey.stage import Product, Wanted, stage
 from models.reading.inference import CoarseLook, Glance, read_glance
 from models.reading.regions import whole_field
-from storage.archive.keys import StageRef
-from storage.archive.keys import array_digest
+from storage.archive.keys import StageRef, array_digest
 from storage.archive.manifests import read_table, write_table
 from storage.arrays.class_maps import ClassNames, clear_classes, create_class_map
 from storage.arrays.mosaics import open_patches

@@ -43,10 +43,6 @@ from pipeline.rig.capture.capture_paths import (
     path_of,
     place_lines,
 )
-from pipeline.rig.capture.capture_runner import CaptureRunner, RigDevices, Say, say_nothing
-from pipeline.rig.devices import DeviceRefused, StateUnknown
-from pipeline.rig.survey_rig import SurveyRig
-from pipeline.simulator.simulated import check_binning
 from pipeline.rig.capture.capture_runner import CaptureJournal, CaptureRunner, RigDevices, Say, say_nothing
 from pipeline.rig.device_settings import SurveyRig
 from pipeline.rig.devices import DeviceRefused, StateUnknown

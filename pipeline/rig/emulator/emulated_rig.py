@@ -16,8 +16,6 @@ from dataclasses import dataclass
 
 from pipeline.errors import SettingsError
 from pipeline.geometry.mirror import STRAIGHT, Mounting
-from pipeline.geometry.mirror import STRAIGHT, Mounting
-from pipeline.rig.device_settings import FileServer
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.device_settings import FileServer, Pulses
 from pipeline.rig.devices import SYSTEM_CLOCK, Clock, Closing, ManualClock

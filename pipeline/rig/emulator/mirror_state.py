@@ -22,9 +22,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.geometry.scan import Ends
 from pipeline.rig.devices import Clock
-from pipeline.geometry.scan import Ends
-from pipeline.rig.devices import Clock
-from pipeline.rig.emulator.mirror_motion import AxisMotion, Stiffness, VectorPlayer
 from pipeline.rig.mirror.registers import (
     CHANNELS,
     FEEDBACK_A,

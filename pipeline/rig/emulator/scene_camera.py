@@ -31,12 +31,8 @@ from pipeline.rig.devices import Clock
 from pipeline.rig.emulator.camera_device import CameraDevice, CameraUnit, EmulatedCapture, Floats, Ints, Raw
 from pipeline.rig.emulator.fault_names import CameraFaults
 from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.mirror.steering import wire_positions
-from pipeline.rig.survey_rig import Pulses
-from pipeline.simulator.effects.effect import Aim, Bound, SweepBlock
 from pipeline.rig.mirror.path_player import wire_positions
-from pipeline.simulator.effects.effect import SweepBlock
-from pipeline.simulator.effects.effect import Aim, Bound
+from pipeline.simulator.effects.effect import Aim, Bound, SweepBlock
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.render import Choice
 from pipeline.simulator.rig_model import Rig

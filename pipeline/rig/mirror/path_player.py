@@ -11,11 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import RigError, SettingsError, ShapeError
-from pipeline.geometry.mirror import check_reach
-from pipeline.geometry.mirror import STRAIGHT, Mounting
+from pipeline.geometry.mirror import STRAIGHT, Mounting, check_reach
 from pipeline.rig.device_settings import ReadBack
-from pipeline.rig.devices import DeviceRefused
-from pipeline.geometry.scan import Ends, device_range
 from pipeline.rig.devices import DeviceRefused
 from pipeline.rig.mirror.mirror_requests import ProLink
 from pipeline.rig.mirror.pro_mode import (

@@ -31,9 +31,6 @@ from pipeline.errors import SceneError, SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.effects.registry import USUAL
 from pipeline.simulator.scenes.farm.farm_plan import CLASSES
-from tests.flows.small_fields import FRAMES, QUICK, looked_at, scene_at, write_field, write_weights
-from pipeline.simulator.effects.registry import USUAL
-from pipeline.simulator.scenes.farm.farm_plan import CLASSES
 from tests.flows.small_fields import FRAMES, QUICK, looked_at, scene_at, write_weights
 from tests.models.conftest import make_weights
 

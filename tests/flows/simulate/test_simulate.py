@@ -13,10 +13,7 @@ import pytest
 import xarray as xr
 from rich.console import Console
 
-from flows.publish.effect_table import print_effects
 from flows.publish.receipt_table import print_effects
-from flows.survey.stages import effects as effect_choice
-from pipeline.errors import BoundError
 from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from flows.survey.extent import Extent, work_done, work_of_map
-from flows.survey.stage import Unit
 from flows.survey.run import SurveyRun
+from flows.survey.stage import Unit
 from models.network.cost import multiply_adds
 from models.network.sizes import SegmenterConfig
 from pipeline.geometry.camera import LineCamera

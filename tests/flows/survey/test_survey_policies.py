@@ -12,22 +12,21 @@ import pytest
 import torch
 from rich.console import Console
 
-from flows.publish.receipt_table import sentences
 from flows.publish.receipt import check_receipt
+from flows.publish.receipt_table import sentences
 from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings, parse_settings
 from flows.survey.field_work import SHARD, FieldWork
 from flows.survey.run import open_run
 from flows.survey.stages.attention import attend
-from models.policies.vgg import VggFeatures
 from models.network.sizes import saliency_multiply_adds
 from models.policies.policies import IMAGE_POLICIES, NETWORK_POLICIES, POLICIES, SEEDED_POLICIES
+from models.policies.vgg import VggFeatures
 from models.reading.regions import plan_regions
 from models.weights.files import describe_weights
 from pipeline.errors import SettingsError, WeightsError
 from storage.archive.keys import StageRef
-from storage.arrays.mosaics import load_attention
 from storage.arrays.mosaics import load_attention
 from tests.conftest import Survey
 

@@ -16,9 +16,6 @@ from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.lookup import grid_points, lookup
 from pipeline.rectify.mosaic import MosaicPart, edge_distance, mosaic
 from pipeline.rectify.resample import resample
-from pipeline.rectify.kernels import Kernel
-from pipeline.simulator.effects.registry import effects_on
-from pipeline.rectify.resample import resample
 from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.simulated import SimulatedSource

@@ -10,13 +10,9 @@ import numpy as np
 import pytest
 
 from pipeline.errors import PoseError, ShapeError
-from pipeline.geometry.camera import LineCamera, look
+from pipeline.geometry.camera import LineCamera, expose, footprint
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.geometry.scan import Sweep, line_positions
-from pipeline.geometry.camera import LineCamera, expose, footprint
-from pipeline.geometry.mirror import direction_to_scene, mirror_throughput, position_to_normal, reflect
-from pipeline.geometry.scan import Sweep, line_positions, sweep_positions
-from pipeline.lazy import Once
 from pipeline.simulator.effects.pointing import CommonOffset
 from pipeline.simulator.effects.registry import EFFECTS, USUAL, effects_on
 from pipeline.simulator.render import Choice, expected_light

@@ -13,8 +13,16 @@ from pyproj import CRS
 
 from pipeline.errors import ChunkError, IncompleteStoreError, PoseError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
-from storage.arrays.ground_maps import BLOCK, ON_THE_MAP, GroundMapWriter, load_geobox, load_ground_map, map_attributes, write_map_coordinates
 from storage.arrays.class_maps import ClassNames
+from storage.arrays.ground_maps import (
+    BLOCK,
+    ON_THE_MAP,
+    GroundMapWriter,
+    load_geobox,
+    load_ground_map,
+    map_attributes,
+    write_map_coordinates,
+)
 from storage.arrays.layout import SHARD_COLUMNS, SHARD_ROWS, AngularGrid, create_group, write_image
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3

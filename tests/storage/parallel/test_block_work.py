@@ -19,14 +19,6 @@ import pytest
 from dask.distributed import LocalCluster
 
 from pipeline.errors import SettingsError, ShapeError, WorkerError
-from pipeline.geometry.camera import LineCamera
-from pipeline.rectify.placed import PixelGrid
-from pipeline.rectify.region import plan_tiles
-from storage.arrays.mosaics import MosaicWriter
-from storage.parallel import cluster_work, worker_facts
-from storage.parallel.block_work import block_graph
-from storage.parallel.crew import run_blocks
-from storage.parallel.crew import Crew, count_cores
 from storage.parallel import cluster_work
 from storage.parallel.crew import Crew, count_cores, run_blocks
 

@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from pipeline.geometry.camera import LineCamera, look
+from pipeline.geometry.camera import LineCamera, expose, footprint
 from pipeline.planning.orientation import find_rows
 from pipeline.simulator.scenes.farm.farm_plan import FarmPlan, FieldPlan, Ground, farm_plan
-from pipeline.geometry.camera import LineCamera, expose, footprint
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.farm.fields import row_gaps, row_shadow, rows_of, stripes_of, wheel_marks
 from pipeline.simulator.scenes.farm.land import (
