@@ -15,7 +15,7 @@ from pipeline.geometry.paper_equations import LINE_MODELS, LineModel, line_point
 from pipeline.geometry.scan import CostModel, Sweep, line_positions, scene_to_sweep
 from pipeline.rectify.calibration.calibrate import reflectance
 from pipeline.rectify.kernels import Kernel
-from pipeline.rectify.lookup import grid_lookup
+from pipeline.rectify.lookup import grid_points, lookup
 from pipeline.rectify.registration.shifts import PairShift, pair_shift
 from pipeline.rectify.resample import resample
 from pipeline.rectify.tie_points import tie_table
@@ -265,9 +265,7 @@ def _capture(source: SimulatedSource, step: int) -> tuple[SimulatedSweep, Values
 
 def _rectify(camera: LineCamera, lines: SimulatedSweep, values: Values) -> Values:
     origin = (-(SHAPE[0] - 1) / 2, -(SHAPE[1] - 1) / 2)
-    coordinates = grid_lookup(
-        lines.position, camera, along="x", binning=1, origin_px=origin, spacing_px=1.0, shape=SHAPE
-    )
+    coordinates = lookup(lines.position, camera, grid_points(origin, 1.0, SHAPE), along="x")
     seen, _ = resample(values, np.ones(values.shape[:2], bool), coordinates.reshape(-1, 2))
     return seen.reshape(*SHAPE, -1)
 

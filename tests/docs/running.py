@@ -27,8 +27,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-import flows.cli.survey_verbs  # noqa: F401 - registers its verbs
-from flows.cli.app import app
+from flows.cli.app import build_app
 from flows.cli.main import main
 from flows.settings.load import load_settings
 from storage.readers.scene_toml import load_scene_settings
@@ -185,7 +184,7 @@ def check_words(words: list[str], place: str) -> None:
     """Refuse a command that cannot be meant: an unknown verb or flag, target, file, benchmark or extra."""
     program, *given = [Path(words[0]).name, *words[1:]]
     if program == "spectralzoom":
-        app.parse_args(given, exit_on_error=False, print_error=False)
+        build_app(listed=False).parse_args(given, exit_on_error=False, print_error=False)
     elif program == "make":
         phony = re.search(r"^\.PHONY: (.+)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
         assert phony is not None
