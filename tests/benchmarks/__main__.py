@@ -10,12 +10,10 @@ import argparse
 import importlib
 import os
 import sys
-import textwrap
 import time
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 # Before numpy and torch are loaded: one thread, as the figures are meant.
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -23,8 +21,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE), str(HERE.parents[1])]
 
-if TYPE_CHECKING:
-    from measure import Row
+from measure import Row, aligned, markdown_lines  # noqa: E402
 
 HEADINGS = ("what", "figure", "goal", "met", "peers")
 WIDTHS = (58, 26, 24, 3, 60)
@@ -64,37 +61,16 @@ def main(arguments: Sequence[str]) -> int:
 
 def plain_table(rows: Sequence[Row]) -> str:
     """Set rows in aligned columns, long texts folded inside their own."""
-    cells = [HEADINGS, *(_cells(row) for row in rows)]
-    widths = [
-        min(width, max(len(line[column]) for line in cells)) for column, width in zip(range(5), WIDTHS, strict=True)
-    ]
-    lines = [line for cell in cells for line in _folded(cell, widths)]
-    lines.insert(1, "  ".join("-" * width for width in widths))
-    return "\n".join(line.rstrip() for line in lines)
+    return aligned([HEADINGS, *(_cells(row) for row in rows)], WIDTHS)
 
 
 def markdown_table(rows: Sequence[Row]) -> str:
     """Set rows as a table of Markdown."""
-    lines = [f"| {' | '.join(HEADINGS)} |", "|---|---|---|---|---|"]
-    lines += [f"| {' | '.join(text.replace('|', chr(92) + '|') for text in _cells(row))} |" for row in rows]
-    return "\n".join([*lines, "", _machine(), ""])
+    return "\n".join([*markdown_lines([HEADINGS, *(_cells(row) for row in rows)]), "", _machine(), ""])
 
 
 def _cells(row: Row) -> tuple[str, str, str, str, str]:
     return row.what, row.figure, row.goal or "-", MET[row.met], row.peers or "-"
-
-
-def _folded(cells: Sequence[str], widths: Sequence[int]) -> list[str]:
-    """One row of cells as lines of text."""
-    columns = [textwrap.wrap(text, width) or [""] for text, width in zip(cells, widths, strict=True)]
-    height = max(map(len, columns))
-    return [
-        "  ".join(
-            (column[line] if line < len(column) else "").ljust(width)
-            for column, width in zip(columns, widths, strict=True)
-        )
-        for line in range(height)
-    ]
 
 
 def _summarise(tables: dict[str, Sequence[Row]], failed: Sequence[str]) -> None:
@@ -107,7 +83,6 @@ def _summarise(tables: dict[str, Sequence[Row]], failed: Sequence[str]) -> None:
 
 
 def _machine() -> str:
-    """Processor, cores, load and versions, on one line."""
     from flows.tradeoff.machine import describe_machine, mean_load
 
     it = describe_machine(threads=1)

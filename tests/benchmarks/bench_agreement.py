@@ -66,7 +66,6 @@ def _mapped(seed: int, **flags: str) -> tuple[Classes, float]:
 
 
 def _borders(classes: Classes) -> NDArray[np.bool_]:
-    """Pixels that touch one of another class, above, below or beside."""
     found = np.zeros(classes.shape, bool)
     for axis in (0, 1):
         differs = np.diff(classes.astype(np.int16), axis=axis) != 0

@@ -120,7 +120,6 @@ def _image(scene: RasterScene, block: SweepBlock, chosen: Mapping[Effect, str]) 
 
 
 def _apart(light: Sequence[Light], exact: Sequence[Light], rig: Rig) -> float:
-    """Greatest difference over the noise at every sample, on expected light."""
     pairs = zip(light, exact, strict=True)
     return max(float((np.abs(one - other) / noise_electrons(other, rig)).max()) for one, other in pairs)
 

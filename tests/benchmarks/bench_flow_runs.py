@@ -119,7 +119,6 @@ def _in_turn(
 
 
 def _one_stage(step: Callable[[str], object], rounds: int = 1) -> object:
-    """A survey that ends after its first stage."""
     assert STAGE in STAGES
     return step(STAGE)
 

@@ -25,12 +25,10 @@ IFOV = LineCamera().ifov_rad
 
 
 def rows() -> list[Row]:
-    """Round trips, 50 digits, rotation, and time."""
     return [_round_trip(np.float64, 1e-12), _round_trip(np.float32, 1e-6), _fifty_digits(), *_rotation(), _time()]
 
 
 def _disk(count: int, seed: int = 0) -> NDArray[np.float64]:
-    """Positions spread evenly over the disk, a tenth of them on its rim."""
     rng = np.random.default_rng(seed)
     radius, turn = np.sqrt(rng.uniform(0, 1, count)), rng.uniform(0, 2 * np.pi, count)
     radius[: count // 10] = 1

@@ -56,7 +56,6 @@ class Moments:
 
 
 def rows() -> list[Row]:
-    """The wait, in a process of its own, as surveys are."""
     words = [sys.executable, __file__, "--json"]
     done = subprocess.run(words, capture_output=True, text=True, check=True)
     found = Moments(**json.loads(done.stdout.splitlines()[-1]))
@@ -161,7 +160,6 @@ def _devices(rig: EmulatedRig, line: Any) -> Callable[..., RigDevices]:
 
 
 def main() -> int:
-    """Print one measurement, stage by stage."""
     parser = argparse.ArgumentParser(description="The wait between the coarse and the fine pass.")
     parser.add_argument("--px", type=int, default=PX)
     parser.add_argument("--json", action="store_true", help="one line of JSON")

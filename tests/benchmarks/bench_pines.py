@@ -86,7 +86,6 @@ def rows(weights: Sequence[Path] = ()) -> list[Row]:
 
 
 def _compared(ours: Sequence[Result], peers: Sequence[Result]) -> list[Row]:
-    """Rows of one input. The goal is the best peer in each of the three figures."""
     if not peers:
         return [*map(_row, ours), Row("peers", "not run: needs scikit-learn")]
     bars = [max(peer.figures[number] for peer in peers) for number in range(3)]
@@ -133,7 +132,6 @@ def halves(labels: Labels) -> NDArray[np.int64]:
 
 
 def _peers(split: Split, source: str) -> list[Result]:
-    """Each classifier on single spectra and on spectra averaged over a window."""
     try:
         import sklearn  # noqa: F401 - an extra of the benchmarks
     except ImportError:
@@ -150,7 +148,6 @@ def _peers(split: Split, source: str) -> list[Result]:
 
 
 def _classifiers() -> dict[str, tuple[Any, dict[str, list[Any]]]]:
-    """Classifiers with the settings to choose from."""
     from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
     from sklearn.ensemble import RandomForestClassifier
     from sklearn.pipeline import make_pipeline
@@ -181,7 +178,6 @@ def _peer(name: str, values: Values, split: Split, classifier: Any, grid: dict[s
 
 
 def _trained(folder: Path, out: Path) -> Path:
-    """Weights as the command makes them."""
     from flows.training.train import TrainRequest, train_weights
 
     path = out / "pines.safetensors"
@@ -215,7 +211,6 @@ def _seen_by_camera(folder: Path) -> Values:
 
 
 def _through_camera(folder: Path, path: Path) -> list[Result]:
-    """The segmenter that the command trained, with several shares of the seats."""
     from flows.evaluate.frames import look_at
     from models.weights.files import load_weights
     from pipeline.geometry.camera import LineCamera
@@ -278,7 +273,6 @@ def _judged(source: str, weights: Weights, seen: Glance, fine: Values, labels: L
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Print the table for weights that were trained before."""
     parser = argparse.ArgumentParser(description="Indian Pines beside LDA, SVM and random forest.")
     parser.add_argument("--weights", type=Path, action="append", default=[], metavar="FILE", help="several are seeds")
     for row in rows(parser.parse_args(arguments).weights):

@@ -47,7 +47,6 @@ class Compared:
 
 
 def rows() -> list[Row]:
-    """All figures, in a folder that is removed."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for side in SMALL_PX:
@@ -67,7 +66,6 @@ def _clocks(folder: Path, small: Path) -> list[Row]:
 
 
 def _clock(what: str, archive: Path) -> Row:
-    """Wall seconds of the process, the best of some, and its processor seconds."""
     command = [sys.executable, "-m", "flows.cli.main", "plan", "--scene", "farm", "--out", str(archive), "--json"]
     command += ["--no-controls", "--size", f"{FIELD_PX}x{FIELD_PX}"]
     walls, cpus = [], []
@@ -195,7 +193,6 @@ def _print_table(title: str, found: list[Compared]) -> None:
 
 
 def main() -> None:
-    """The figure itself: a 1/64 part of the field measured, and the field's estimate by it."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--full", action="store_true", help="survey 1280 x 1280 px instead of small fields")
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="where the archive of the part stays")

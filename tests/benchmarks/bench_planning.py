@@ -28,7 +28,6 @@ Worth = NDArray[np.float64]
 
 
 def rows() -> list[Row]:
-    """All rows of the subject."""
     return [*_frames(), *_patches(), *_optimum(), *_farm(), *_speed()]
 
 
@@ -97,7 +96,6 @@ def _vegetation(folder: Path) -> tuple[SceneGrid, list[Worth]]:
 
 
 def _real_field(grid: SceneGrid, along: Axis, worth: Worth, prices: ScanPrices) -> Field:
-    """Seats as the rays show them."""
     views = look_from(grid, CAMERA, strips_at_seats(grid, CAMERA, along), worth > 0)
     return Field(views, worth, _columns(grid, along), prices)
 
@@ -315,7 +313,6 @@ def _milp(field: Field, prices: ScanPrices, budget_s: float) -> float:
 
 
 def _smooth(shape: tuple[int, int], *, seed: int, sigma: float) -> Worth:
-    """A smooth random score map, log-normal, as entropy looks."""
     from scipy.ndimage import gaussian_filter
 
     drawn = gaussian_filter(np.random.default_rng(seed).normal(size=shape), sigma, mode="wrap")

@@ -89,7 +89,6 @@ def measure_halos() -> list[dict[int, Seams]]:
 
 
 def _survey(folder: Path, seed: int) -> dict[int, Seams]:
-    """Survey a farm once, and draw it in regions with each halo."""
     flags = {"scene": "farm", "seed": seed, "out": str(folder / str(seed)), "engine": "plain", "controls": False}
     settings = load_settings(None, flags)
     published = run_survey(settings, Console(quiet=True))
@@ -268,7 +267,6 @@ def _write_field(folder: Path, side: int) -> None:
 
 
 def _write_patches(path: Path, grid: SceneGrid, seats: NDArray[np.integer], nm: NDArray[np.float64]) -> None:
-    """Store random patches of these seats."""
     rng = np.random.default_rng(1)
     patches = PatchWriter(path, seats, grid.seat_origin(seats), grid.patch, nm)
     for first in range(0, len(seats), PATCHES_A_SHARD):
@@ -297,7 +295,6 @@ def _shipped() -> WeightsFile:
 
 
 def main() -> None:
-    """Print the table of halos by seed."""
     print("seed  halo  same class  near seams    mIoU   seats in common  read/kept")
     for seed, by_halo in zip(SEEDS, measure_halos(), strict=True):
         for halo, one in by_halo.items():

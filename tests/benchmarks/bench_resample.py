@@ -11,8 +11,7 @@ import numpy as np
 import torch
 from measure import Clock, Row, ratio, time_in_turn
 from numpy.typing import NDArray
-from resample_engines import ENGINES
-from resample_peers import BANDS, Peer, Turned, cv2_parts, peers, spline, turned_waves
+from resample_peers import BANDS, ENGINES, Peer, Turned, cv2_parts, peers, spline, turned_waves
 
 from pipeline.rectify.kernels import windows
 from pipeline.rectify.resample import Kernel, resample
@@ -29,7 +28,6 @@ TILES = 3  # in a row, as a worker does them
 
 
 def rows() -> list[Row]:
-    """All figures, on one thread."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -179,7 +177,6 @@ def _prepared(others: Sequence[Peer], scene: Turned) -> str:
 
 
 def _by_bands(scene: Turned) -> Row:
-    """Nanoseconds per pixel and band at few and many bands."""
     many, figures = (2, 4, 15, 64, 270, 939), []
     for bands in many:
         samples = np.random.default_rng(bands).random((*scene.samples.shape[:2], bands), np.float32)

@@ -7,9 +7,21 @@ from collections.abc import Callable
 import numpy as np
 from measure import Row, not_run
 from numpy.typing import NDArray
-from seam_pictures import RGBN, cut_and_join, given_neighbours, join_neighbours
-from seam_survey import LINES, SAMPLES, left_again, line_errors, make_survey, seam_offsets
-from seam_views import ROW_PX, row_views, wave_views
+from seam_data import (
+    LINES,
+    RGBN,
+    ROW_PX,
+    SAMPLES,
+    cut_and_join,
+    given_neighbours,
+    join_neighbours,
+    left_again,
+    line_errors,
+    make_survey,
+    row_views,
+    seam_offsets,
+    wave_views,
+)
 
 from pipeline.rectify.registration.shifts import PairShift, pair_shift
 
@@ -21,7 +33,6 @@ PRIOR_PX = 26.0
 
 
 def rows() -> list[Row]:
-    """Registration, crop rows, the survey, the pictures."""
     waves = [_waves("4-40 px", (4, 40), 50), _waves("40-400 px", (40, 400), 50), _waves("4-40 px", (4, 40), 1)]
     return [*waves, _rows_with_gaps(), _rows_without(), *_survey(), *_pictures()]
 

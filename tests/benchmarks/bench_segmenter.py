@@ -55,7 +55,6 @@ class Frame:
 
 
 def rows() -> list[Row]:
-    """All figures, on one thread."""
     keep_freed_memory()
     with one_thread():
         return [*_batches(), *_bands(), *_shares()]
@@ -195,7 +194,6 @@ def _masked(
 
 
 def _drawn(frame: Frame, coarse: torch.Tensor, fine: torch.Tensor) -> DrawnMap:
-    """The map of one frame of a padded batch."""
     grid, p = frame.look.grid, frame.look.grid.patch
     y, x = frame.look.columns.shape[:2]
     drawn = draw_coarse(coarse[None, :, :y, :x], grid)
@@ -278,7 +276,6 @@ def _shares() -> list[Row]:
 
 
 def _adaptive(weights: Weights, every: Frame, count: int, precision: str = "float32") -> DrawnMap:
-    """Glance, score by the learned gain, and draw with so many seats."""
     seen: Glance = read_glance(weights, every.look, precision=precision)  # type: ignore[arg-type]
     scores = score_seats("gain", seen).ravel()[every.seats]
     best = np.sort(np.argsort(-scores, kind="stable")[:count])

@@ -25,7 +25,6 @@ ROUNDS = 3
 
 
 def rows() -> list[Row]:
-    """All figures, in a folder that is removed."""
     with tempfile.TemporaryDirectory() as name:
         folder, raw = Path(name), _raw()
         return [*_against_zarr(folder, raw), _spool(folder, raw), _warm(folder)]

@@ -29,7 +29,6 @@ ROUNDS = 3
 
 
 def rows() -> Sequence[Row]:
-    """Time uploads, the least of three each."""
     return [_row(baud, read_back) for baud in BAUDS for read_back in READ_BACKS]
 
 

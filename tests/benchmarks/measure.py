@@ -5,9 +5,11 @@ from __future__ import annotations
 import gc
 import os
 import statistics
+import textwrap
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -70,3 +72,23 @@ def time_in_turn(calls: Mapping[str, Callable[[], object]], rounds: int = 5) -> 
 def ratio(clocks: Mapping[str, Clock], of: str, to: str) -> float:
     """Median over the rounds of one call's processor time over another's: what a loaded machine leaves unchanged."""
     return statistics.median(a / b for a, b in zip(clocks[of].cpu_s, clocks[to].cpu_s, strict=True) if b > 0)
+
+
+def aligned(cells: Sequence[Sequence[str]], most: Sequence[int]) -> str:
+    """Rows of texts, the first of them headings, in aligned columns; longer texts are folded inside their own."""
+    widths = [min(width, max(len(line[column]) for line in cells)) for column, width in enumerate(most)]
+    lines = []
+    for cell in cells:
+        columns = [textwrap.wrap(text, width) or [""] for text, width in zip(cell, widths, strict=True)]
+        lines += [
+            "  ".join(f"{text:{width}}" for text, width in zip(line, widths, strict=True))
+            for line in zip_longest(*columns, fillvalue="")
+        ]
+    lines.insert(1, "  ".join("-" * width for width in widths))
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def markdown_lines(cells: Sequence[Sequence[str]]) -> list[str]:
+    """The same as lines of a table of Markdown."""
+    lines = [f"| {' | '.join(text.replace('|', chr(92) + '|') for text in row)} |" for row in cells]
+    return [lines[0], "|" + "---|" * len(cells[0]), *lines[1:]]

@@ -139,7 +139,6 @@ def run_field(folder: Path, side: int, bands: int, workers: int | None) -> Spent
 
 
 def main() -> None:
-    """Both fields, one after the other."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("folder", type=Path, help="on a disk with enough room")
     parser.add_argument("--side", type=int, default=10240, help="of the field [px]")

@@ -24,8 +24,19 @@ import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
 from matplotlib.patches import Rectangle  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
-from seam_pictures import CUT_LEFT, CUT_RIGHT, RGBN, cut_and_join, given_neighbours, join_neighbours  # noqa: E402
-from seam_survey import Survey, left_again, line_errors, make_survey, seam_offsets  # noqa: E402
+from seam_data import (  # noqa: E402  # noqa: E402
+    CUT_LEFT,
+    CUT_RIGHT,
+    RGBN,
+    Survey,
+    cut_and_join,
+    given_neighbours,
+    join_neighbours,
+    left_again,
+    line_errors,
+    make_survey,
+    seam_offsets,
+)
 
 from pipeline.rectify.region import PixelGrid, mosaic_tile, place  # noqa: E402
 from pipeline.rectify.registration.alignment import SweepShift  # noqa: E402
@@ -39,7 +50,6 @@ COLOURS = (2, 1, 0)  # bands shown as red, green and blue
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Write both pictures into the folder named."""
     if len(arguments) != 1:
         print("usage: python tests/benchmarks/show_seams.py FOLDER", file=sys.stderr)
         return 2

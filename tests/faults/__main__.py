@@ -5,14 +5,11 @@ A demand that is not met is printed like one that is, the others go on, and the 
 
 from __future__ import annotations
 
-import argparse
-import importlib
 import logging
 import os
 import subprocess
 import sys
 import tempfile
-import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -23,48 +20,14 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 sys.path[0] = str(ROOT)  # not this folder: its modules go by their full names
 
-from tests.faults.fault_table import Clock, Row, Rows, markdown_table, plain_table  # noqa: E402
+from tests.faults.fault_table import HEADINGS, Clock, Row, Rows, rows_of, run_table  # noqa: E402
 
 SURVEY = ("survey", "--scene", "farm", "--size", "256x256", "--no-controls", "--engine", "plain", "--out")
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the faults asked for, or all; print the table, and write it as Markdown where asked."""
-    parser = argparse.ArgumentParser(prog="python tests/faults", description="Faults, and what they leave.")
-    parser.add_argument("names", nargs="*", help=f"faults to run, all where none is given: {', '.join(FAULTS)}")
-    parser.add_argument("--quick", action="store_true", help="a small part of each")
-    parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the table as Markdown as well")
-    asked = parser.parse_args(arguments)
-    unknown = sorted(set(asked.names) - set(FAULTS))
-    if unknown:
-        parser.error(f"no fault {', '.join(unknown)}; there are: {', '.join(FAULTS)}")
     logging.disable(logging.WARNING)  # what is put right stands in the table
-    found: list[Row] = []
-    for name in asked.names or FAULTS:
-        clock = Clock()
-        try:
-            rows = list(FAULTS[name](asked.quick))
-        except Exception:
-            traceback.print_exc()
-            rows = [Row(name, "", 0, "that it can be tried", "crashed; the others went on", False, clock.seconds)]
-        found += rows
-        print("\n".join(f"{row.fault}: {row.found}" for row in rows), flush=True)
-    print(f"\n{plain_table(found)}")
-    missed = [row.fault for row in found if not row.met]
-    print(f"\n{len(found) - len(missed)} of {len(found)} as demanded{': not ' + ', '.join(missed) if missed else ''}")
-    if asked.markdown:
-        asked.markdown.write_text(markdown_table(found), encoding="utf-8")
-    return 1 if missed else 0
-
-
-def _module(name: str) -> Rows:
-    """Rows of a module that gives them."""
-
-    def rows(quick: bool) -> Sequence[Row]:
-        found: Sequence[Row] = importlib.import_module(f"tests.faults.{name}").rows(quick)
-        return found
-
-    return rows
+    return run_table(arguments, "python tests/faults", "fault", FAULTS, FAULTS, HEADINGS)
 
 
 def _script(name: str, words: tuple[str, str, str], counts: tuple[int, int]) -> Rows:
@@ -91,7 +54,6 @@ def _run_script(name: str, words: tuple[str, str, str], count: int, before: Sequ
 
 
 def _flips(quick: bool) -> Sequence[Row]:
-    """Bits flipped in an archive that is made for it."""
     words = ("a bit flips", "one bit of a random file of an archive", "each found by verify, and named")
     with tempfile.TemporaryDirectory(prefix="flips-") as name:
         command = [sys.executable, "-m", "flows.cli.main", *SURVEY, name]
@@ -109,7 +71,7 @@ FAULTS: dict[str, Callable[[bool], Sequence[Row]]] = {
         ),
         (100, 3),
     ),
-    "terminations": _module("terminations"),
+    "terminations": rows_of("tests.faults.terminations"),
     "flips": _flips,
     "headers": _script(
         "mutated_headers",
@@ -129,15 +91,15 @@ FAULTS: dict[str, Callable[[bool], Sequence[Row]]] = {
         ),
         (5000, 100),
     ),
-    "disk_full": _module("disk_full"),
-    "refused_writes": _module("refused_writes"),
-    "many_writers": _module("many_writers"),
-    "clocks": _module("clocks"),
-    "lost_lines": _module("lost_lines"),
-    "growing_files": _module("growing_files"),
-    "spool_rate": _module("spool_rate"),
-    "hostile_rig": _module("hostile_rig"),
-    "sealed_flips": _module("sealed_flips"),
+    "disk_full": rows_of("tests.faults.disk_full"),
+    "refused_writes": rows_of("tests.faults.refused_writes"),
+    "many_writers": rows_of("tests.faults.many_writers"),
+    "clocks": rows_of("tests.faults.clocks"),
+    "lost_lines": rows_of("tests.faults.lost_lines"),
+    "growing_files": rows_of("tests.faults.growing_files"),
+    "spool_rate": rows_of("tests.faults.spool_rate"),
+    "hostile_rig": rows_of("tests.faults.hostile_rig"),
+    "sealed_flips": rows_of("tests.faults.sealed_flips"),
 }
 
 if __name__ == "__main__":

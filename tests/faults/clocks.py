@@ -1,4 +1,4 @@
-"""Surveys on a machine whose clock is wrong: ``python tests/faults/clocks.py``.
+"""Surveys on a machine whose clock is wrong: ``python tests/faults clocks``.
 
 What the process sees of the time of day is changed from the inside; the dates of files are set as that clock would
 have set them. Each case gives what was wrong, and is counted by the surveys that it took.
@@ -9,14 +9,11 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import sys
 import tempfile
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 from typing import Any
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from storage.archive.archive import Archive
 from storage.archive.staging import MANIFEST_NAME
@@ -109,7 +106,6 @@ CASES: dict[str, tuple[Case, tuple[str, ...], str]] = {
 
 
 def _order(out: Path) -> list[str]:
-    """Whether runs are listed by the dates that they state, to the second."""
     runs = Archive.open(out, create=False, write=False).runs()
     dates = [folder.name.split("-")[0] for folder in runs]
     return [] if dates == sorted(dates) and len(set(runs)) == len(runs) else [f"runs are listed as {dates}"]
@@ -140,7 +136,6 @@ def _redate(folder: Path, shift_s: float) -> None:
 
 
 def rows(quick: bool = False) -> list[Row]:
-    """Every case by every clock that concerns it."""
     with tempfile.TemporaryDirectory(prefix="clocks-") as name, Nursery(Path(name)) as nursery:
         subject = prepare(nursery)
         return [_row(subject, fault, quick) for fault in CASES]
@@ -164,9 +159,3 @@ def _row(subject: Subject, fault: str, quick: bool) -> Row:
         not wrong,
         timer.seconds,
     )
-
-
-if __name__ == "__main__":
-    results = rows("--quick" in sys.argv)
-    print("\n".join(f"{row.fault} ({row.injected}): {row.found}" for row in results))
-    sys.exit(0 if all(row.met for row in results) else 1)

@@ -120,7 +120,6 @@ def try_sizes(subject: Subject, count: int, found: Fills) -> None:
 
 
 def _taken(subject: Subject) -> int:
-    """Bytes of disk after a survey."""
     with small_disk(subject.folder / "large", LARGE) as disk:
         assert subject.nursery.run(words(disk / "a")).code == 0
         state = os.statvfs(disk)
@@ -156,7 +155,6 @@ def _met_at(ended: Ended) -> str:
 
 
 def rows(quick: bool = False) -> list[Row]:
-    """Full disks at every kind of place, and disks of all sizes."""
     if can_mount():
         return _rows(quick, "a tmpfs")
     if _can_unshare():
@@ -198,14 +196,12 @@ def _rows(quick: bool, kind: str) -> list[Row]:
 
 
 def _everywhere(found: Fills) -> bool:
-    """Whether the disk was full under everything that a survey writes."""
     stages = ("capture", "locate", "rectify", "attend", "patches", "segment")
     wanted = {"spool", "run", "run manifest", *stages, *(f"{stage} manifest" for stage in stages)}
     return wanted <= set(found.met_at)
 
 
 def main(arguments: list[str]) -> int:
-    """Print what was found; with ``--rows`` as JSON for the process that started this one."""
     results = rows("--quick" in arguments)
     if "--rows" in arguments:
         plain: list[dict[str, Any]] = [asdict(row) for row in results]

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
-import textwrap
+import argparse
+import importlib
 import time
-from collections.abc import Callable, Sequence
+import traceback
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass
+from pathlib import Path
+
+from tests.benchmarks.measure import aligned, markdown_lines
 
 HEADINGS = ("fault", "how it is injected", "times", "demanded", "found", "met", "s")
 WIDTHS = (22, 36, 6, 40, 44, 3, 5)
@@ -47,27 +52,57 @@ Rows = Callable[[bool], Sequence[Row]]  # quick or in full
 
 def plain_table(rows: Sequence[Row], headings: Sequence[str] = HEADINGS) -> str:
     """Rows in aligned columns, long texts folded inside their own."""
-    cells = [headings, *(row.cells for row in rows)]
-    widths = [min(width, max(len(line[column]) for line in cells)) for column, width in enumerate(WIDTHS)]
-    lines = [line for cell in cells for line in _folded(cell, widths)]
-    lines.insert(1, "  ".join("-" * width for width in widths))
-    return "\n".join(line.rstrip() for line in lines)
+    return aligned([headings, *(row.cells for row in rows)], WIDTHS)
 
 
 def markdown_table(rows: Sequence[Row], headings: Sequence[str] = HEADINGS) -> str:
     """Rows as a table of Markdown."""
-    lines = [f"| {' | '.join(headings)} |", "|" + "---|" * len(headings)]
-    lines += [f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row.cells)} |" for row in rows]
-    return "\n".join([*lines, ""])
+    return "\n".join([*markdown_lines([headings, *(row.cells for row in rows)]), ""])
 
 
-def _folded(cells: Sequence[str], widths: Sequence[int]) -> list[str]:
-    """One row of cells as lines of text."""
-    columns = [textwrap.wrap(text, width) or [""] for text, width in zip(cells, widths, strict=True)]
-    return [
-        "  ".join(
-            (column[line] if line < len(column) else "").ljust(width)
-            for column, width in zip(columns, widths, strict=True)
-        )
-        for line in range(max(map(len, columns)))
-    ]
+def run_table(
+    arguments: Sequence[str],
+    prog: str,
+    what: str,
+    tables: Mapping[str, Rows],
+    usual: Iterable[str],
+    headings: Sequence[str],
+) -> int:
+    """Make the rows asked for, or the usual ones; print the table, and write it as Markdown where asked.
+
+    A demand that is not met is printed like one that is, the others go on, and the exit code is 1.
+    """
+    parser = argparse.ArgumentParser(prog=prog, description=f"One table of every {what} that is asked for.")
+    parser.add_argument("names", nargs="*", help=f"of {', '.join(tables)}; by default {', '.join(usual)}")
+    parser.add_argument("--quick", action="store_true", help="a small part of each")
+    parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the table as Markdown as well")
+    asked = parser.parse_args(arguments)
+    unknown = sorted(set(asked.names) - set(tables))
+    if unknown:
+        parser.error(f"no {what} {', '.join(unknown)}; there are: {', '.join(tables)}")
+    found: list[Row] = []
+    for name in asked.names or usual:
+        clock = Clock()
+        try:
+            rows = list(tables[name](asked.quick))
+        except Exception:
+            traceback.print_exc()
+            rows = [Row(name, "", 0, "that it can be tried", "crashed; the others went on", False, clock.seconds)]
+        found += rows
+        print("\n".join(f"{row.fault}: {row.found}" for row in rows), flush=True)
+    print(f"\n{plain_table(found, headings)}")
+    missed = [row.fault for row in found if not row.met]
+    print(f"\n{len(found) - len(missed)} of {len(found)} as demanded{': not ' + ', '.join(missed) if missed else ''}")
+    if asked.markdown:
+        asked.markdown.write_text(markdown_table(found, headings), encoding="utf-8")
+    return 1 if missed else 0
+
+
+def rows_of(module: str) -> Rows:
+    """The rows that a module gives, which is imported when they are asked for."""
+
+    def rows(quick: bool) -> Sequence[Row]:
+        found: Sequence[Row] = importlib.import_module(module).rows(quick)
+        return found
+
+    return rows

@@ -13,7 +13,6 @@ from storage.archive.archive import Archive
 
 
 def main(root: Path, flips: int, seed: int = 0) -> int:
-    """Print how many were found and how many were named; 1 where one was not."""
     archive = Archive.open(root, create=False, write=False)
     folders = [ref.path for ref in archive.refs()] + archive.runs()
     files = sorted(path for folder in folders for path in folder.rglob("*") if path.is_file() and path.stat().st_size)

@@ -1,4 +1,4 @@
-"""Bits that flip in files that only grow: ``python tests/faults/growing_files.py 2000``.
+"""Bits that flip in files that only grow: ``python tests/faults growing_files``.
 
 A spool's index, numbers and ENVI header, a field's ledger, a rig's journal. Each is opened again as a capture, a
 schedule or a rig would, and gone on with. Demanded: no other number without a word, no defect, every other line kept.
@@ -6,18 +6,13 @@ schedule or a rig would, and gone on with. Demanded: no other number without a w
 
 from __future__ import annotations
 
-import json
-import logging
 import random
 import shutil
-import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from pipeline.errors import PipelineError
 from pipeline.geometry.scan import Sweep
@@ -69,7 +64,6 @@ def flip_spool(name: str, flips: int, folder: Path, seed: int = 0) -> Rot:
 
 
 def _go_on(place: Path, truth: dict[str, bytes]) -> list[str]:
-    """Open a spool, have back what is lost, read every line."""
     wrong = []
     with Spool.open(place, SAMPLES, BANDS, header=HEADER) as spool:
         if len(spool.lost) + LINES - spool.count > 1:
@@ -149,7 +143,6 @@ def _told(root: Path) -> list[str]:
 
 
 def _guarded(tried: Callable[[], list[str]]) -> list[str]:
-    """What is wrong, a defect among it."""
     try:
         return tried()
     except PipelineError as error:
@@ -166,7 +159,6 @@ def rot_everything(flips: int, folder: Path, seed: int = 0) -> dict[str, Rot]:
 
 
 def rows(quick: bool = False) -> Sequence[Row]:
-    """One row for all kinds of files."""
     clock = Clock()
     with tempfile.TemporaryDirectory(prefix="growing-") as name:
         found = rot_everything(200 if quick else FLIPS, Path(name))
@@ -182,11 +174,3 @@ def rows(quick: bool = False) -> Sequence[Row]:
             clock.seconds,
         )
     ]
-
-
-if __name__ == "__main__":
-    logging.disable(logging.WARNING)
-    FLIPS = int(sys.argv[1]) if len(sys.argv) > 1 else FLIPS
-    (row,) = rows()
-    print(json.dumps({"flips": row.count, "found": row.found}, indent=1))
-    sys.exit(0 if row.met else 1)

@@ -1,4 +1,4 @@
-"""A camera and a mirror that mean harm, and a line that changes bytes: python tests/faults/hostile_rig.py [seconds].
+"""A camera and a mirror that mean harm, and a line that changes bytes: python tests/faults hostile_rig.
 
 Random replies in place of every one that the protocols have: whole, torn, mangled, in pieces, a byte now and then,
 without end, or none. Whoever asks is done by the deadline that its settings make, with one message, in bounded memory;
@@ -7,20 +7,15 @@ and no survey through a line that puts in, doubles or cuts out bytes ends with o
 
 from __future__ import annotations
 
-import argparse
 import logging
 import resource
 import socket
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from pipeline.errors import PipelineError
 from pipeline.rig.camera.camera_files import KeptInMemory, RemoteFile, fetch_files
@@ -180,7 +175,6 @@ def meet_for(seconds: float, seed: int, meet: Callable[[np.random.Generator, Out
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Drivers warn of each of these bytes."""
     before = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
@@ -190,7 +184,6 @@ def _quiet() -> Iterator[None]:
 
 
 def rows(quick: bool = False) -> list[Row]:
-    """Both devices, and the line to the camera."""
     seconds = (QUICK_S if quick else FULL_S) / 2
     demanded = "each done by its deadline, in one message and bounded memory"
     found = []
@@ -215,12 +208,3 @@ def rows(quick: bool = False) -> list[Row]:
         )
     )
     return found
-
-
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
-    parser.add_argument("seconds", nargs="?", type=float, default=FULL_S)
-    asked = parser.parse_args()
-    for meeting in (meet_camera, meet_mirror):
-        result = meet_for(asked.seconds / 2, 21, meeting)
-        print(f"{meeting.__name__}: {result.count} times, {result.slowest:.0%} of the deadline; {result.wrong}")

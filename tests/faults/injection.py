@@ -136,7 +136,6 @@ class _Watch:
         return guarded
 
     def _path(self, name: str, given: tuple[Any, ...], named: dict[str, Any]) -> str | None:
-        """What is changed, or None where nothing below the root is."""
         if name == "open" and not (given[1] if len(given) > 1 else named.get("flags", 0)) & _WRITING:
             return None
         first = given[0]
@@ -165,7 +164,6 @@ class _Watch:
 
 
 def _fill(ballast: Path) -> None:
-    """Write zeros until the disk takes no more."""
     with io.FileIO(str(ballast), "w") as file:
         size = 1 << 20
         while size:

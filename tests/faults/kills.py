@@ -44,7 +44,6 @@ def start(archive: Path) -> subprocess.Popen[bytes]:
 
 
 def main(kills: int, seed: int = 0) -> int:
-    """Print the table; 1 where anything was lost or wrong."""
     with tempfile.TemporaryDirectory(prefix="kills-") as name:
         return kill_surveys(Path(name), kills, random.Random(seed))
 

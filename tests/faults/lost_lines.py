@@ -1,4 +1,4 @@
-"""What a capture loses when it dies: ``python tests/faults/lost_lines.py 400``.
+"""What a capture loses when it dies: ``python tests/faults lost_lines``.
 
 A killed process loses nothing that it had written: the system has it. When the power fails, a file is what the disk
 was last asked to keep, and of what came after anything: cut off, zeros, other bytes, in one file and not in the other.
@@ -20,8 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from pipeline.source import Line
 from storage.arrays.spool import SYNC_LINES, Spool
@@ -159,7 +157,6 @@ def try_power(cuts: int, folder: Path, seed: int = 0) -> Losses:
 
 
 def _go_on(place: Path, appended: int, found: Losses) -> Iterator[str]:
-    """Open what is left, compare each line, append the rest."""
     with Spool.open(place, SAMPLES, BANDS, header=HEADER) as spool:
         lost = max(appended - spool.count, 0) + len(spool.lost)
         found.lost[lost] += 1
@@ -208,7 +205,6 @@ def _contents(folder: Path) -> dict[str, bytes]:
 
 
 def rows(quick: bool = False) -> list[Row]:
-    """Captures killed, and captures whose power failed."""
     found = []
     with tempfile.TemporaryDirectory(prefix="lost-") as name:
         clock, kills = Clock(), 3 if quick else KILLS
@@ -239,11 +235,3 @@ def rows(quick: bool = False) -> list[Row]:
             )
         )
     return found
-
-
-if __name__ == "__main__":
-    CUTS = int(sys.argv[1]) if len(sys.argv) > 1 else CUTS
-    results = rows()
-    for row in results:
-        print(f"{row.fault}: {row.count} times; {row.found}")
-    sys.exit(0 if all(row.met for row in results) else 1)

@@ -1,4 +1,4 @@
-"""Several processes write one archive at once: ``python tests/faults/many_writers.py 10``.
+"""Several processes write one archive at once: ``python tests/faults many_writers``.
 
 The same survey two and four times; surveys that share their first stages; and one that is killed in the middle while
 others wait for what it was making.
@@ -8,14 +8,11 @@ from __future__ import annotations
 
 import random
 import shutil
-import sys
 import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from storage.archive.archive import Archive
 from tests.faults.fault_table import Clock, Row
@@ -131,10 +128,3 @@ def _row(
         not found.wrong,
         clock.seconds,
     )
-
-
-if __name__ == "__main__":
-    ROUNDS = int(sys.argv[1]) if len(sys.argv) > 1 else ROUNDS
-    results = rows()
-    print("\n".join(f"{row.fault}: {row.found}" for row in results))
-    sys.exit(0 if all(row.met for row in results) else 1)

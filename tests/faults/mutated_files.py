@@ -21,8 +21,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from tests.faults.cube_files import FORMATS
-from tests.faults.reading import try_reading
+from tests.faults.cube_files import FORMATS, try_reading
 
 BATCH = 500  # mutations a process
 RATIO = 1100  # zlib's: files that pack numbers may hold this many times their bytes

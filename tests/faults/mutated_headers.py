@@ -17,7 +17,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from pipeline.errors import PipelineError
 from storage.readers.envi_cubes import parse_envi_header
-from tests.faults.reading import try_reading
+from tests.faults.cube_files import try_reading
 
 LARGEST_DATA = 200_000  # bytes
 SPARE_BYTES = 1 << 20  # what Python itself takes, whatever the files hold

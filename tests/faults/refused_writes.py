@@ -1,4 +1,4 @@
-"""Refuse a survey one call of the system, or all from one on: ``python tests/faults/refused_writes.py 150``.
+"""Refuse a survey one call of the system, or all from one on: ``python tests/faults refused_writes``.
 
 Rights do not hinder root, so the calls are refused from the inside: whatever changes something in the archive, by
 whichever library, counts as a place. Places are drawn at random over a whole survey, each with a random refusal.
@@ -8,13 +8,10 @@ from __future__ import annotations
 
 import random
 import shutil
-import sys
 import tempfile
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from tests.faults.fault_table import Clock, Row
 from tests.faults.injection import errors_by_name, logged_calls
@@ -88,7 +85,6 @@ def _runs(hit: list[tuple[int, str, str]]) -> int | None:
 
 
 def rows(quick: bool = False) -> list[Row]:
-    """Refusals of all kinds over a whole survey."""
     clock, count = Clock(), 12 if quick else PLACES
     with tempfile.TemporaryDirectory(prefix="refused-") as name, Nursery(Path(name)) as nursery:
         found = refuse_places(prepare(nursery), count)
@@ -103,10 +99,3 @@ def rows(quick: bool = False) -> list[Row]:
             clock.seconds,
         )
     ]
-
-
-if __name__ == "__main__":
-    PLACES = int(sys.argv[1]) if len(sys.argv) > 1 else PLACES
-    (row,) = rows()
-    print(row.found)
-    sys.exit(0 if row.met else 1)

@@ -27,7 +27,6 @@ Read = Callable[[Path], Content]
 
 
 def _weights(path: Path) -> Content:
-    """As a survey reads them."""
     found = load_any_weights(path)
     normal = {name: torch.from_numpy(value) for name, value in vars(found.normalisation).items()}
     tensors = {**found.network.state_dict(), **normal, "colours": torch.from_numpy(found.class_colours)}
@@ -35,13 +34,11 @@ def _weights(path: Path) -> Content:
 
 
 def _start(path: Path) -> Content:
-    """As training begins from them."""
     start = StartFile(path)
     return (start.kind, start.sizes, start.earlier), start.state
 
 
 def _state(path: Path) -> Content:
-    """As training goes on from it."""
     found = load_checkpoint(path, RUN)
     assert found is not None, "a checkpoint that is there counts as none"
     return found
@@ -95,7 +92,6 @@ def _try(name: str, path: Path, before: Content, called: str, found: Flips) -> N
 
 
 def _alike(one: Content, other: Content) -> bool:
-    """Whether two readings are the same in every bit."""
     if one[0] != other[0] or one[1].keys() != other[1].keys():
         return False
     return all(_bits(value) == _bits(other[1][name]) for name, value in one[1].items())
@@ -106,7 +102,6 @@ def _bits(tensor: torch.Tensor) -> tuple[object, ...]:
 
 
 def _written(folder: Path) -> dict[str, Path]:
-    """Small weights and a small state of training."""
     weights, state = folder / "weights.safetensors", folder / "weights.safetensors.checkpoint"
     save_weights(random_weights(RGB_NM), weights)
     numbers = torch.Generator().manual_seed(0)
@@ -117,7 +112,6 @@ def _written(folder: Path) -> dict[str, Path]:
 
 
 def rows(quick: bool) -> Sequence[Row]:
-    """One row."""
     clock, count = Clock(), 60 if quick else 2000
     with tempfile.TemporaryDirectory() as place:
         found = flip_bits(count, Path(place))

@@ -1,4 +1,4 @@
-"""Lines into a spool at a camera's pace: ``python tests/faults/spool_rate.py SECONDS [--load]``.
+"""Lines into a spool at a camera's pace: ``python tests/faults spool_rate``.
 
 A camera has line n ready n periods after the first, and keeps some until they are fetched; what is not fetched by then
 is dropped. ``--load`` lets a second process read the disk and sync files of its own meanwhile.
@@ -6,10 +6,8 @@ is dropped. ``--load`` lets a second process read the disk and sync files of its
 
 from __future__ import annotations
 
-import argparse
 import os
 import signal
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -19,8 +17,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from pipeline.source import Line
 from storage.arrays.spool import SYNC_LINES, Spool
@@ -158,19 +154,3 @@ def rows(quick: bool = False) -> list[Row]:
             )
         )
     return found
-
-
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
-    parser.add_argument("seconds", nargs="?", type=float, default=300.0)
-    parser.add_argument("--load", action="store_true", help="a second process writes, syncs and reads meanwhile")
-    parser.add_argument("--folder", type=Path, help="where; a temporary folder by default")
-    asked = parser.parse_args()
-    with tempfile.TemporaryDirectory(dir=asked.folder) as name:
-        if asked.load:
-            with loaded_disk(Path(name)):
-                result = keep_pace(Path(name) / "spool", asked.seconds)
-        else:
-            result = keep_pace(Path(name) / "spool", asked.seconds)
-    print(result.words())
-    sys.exit(0 if result.met else 1)

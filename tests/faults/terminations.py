@@ -1,4 +1,4 @@
-"""SIGTERM at random moments of a survey, as a service manager sends it: ``python tests/faults/terminations.py 40``.
+"""SIGTERM at random moments of a survey, as a service manager sends it: ``python tests/faults terminations``.
 
 It goes to all processes of the survey's session, Prefect's server among them, as systemd ends a service. Every other
 survey is told to end while its map is judged, after its run is published. Then the same command runs again.
@@ -19,8 +19,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from flows.publish.receipt import comparable, is_pending
 from flows.terminal.termination import EXIT_CODE
@@ -153,7 +151,6 @@ def _receipts(out: Path) -> list[Any]:
 
 
 def rows(quick: bool = False) -> list[Row]:
-    """SIGTERM on both engines."""
     found = []
     for engine, counts in COUNTS.items():
         clock, count = Clock(), counts[quick]
@@ -171,11 +168,3 @@ def rows(quick: bool = False) -> list[Row]:
         )
         found.append(row)
     return found
-
-
-if __name__ == "__main__":
-    if len(sys.argv) > 1:
-        COUNTS = {engine: (int(sys.argv[1]),) * 2 for engine in COUNTS}
-    table = rows()
-    print("\n".join(f"{row.fault}: {row.found}" for row in table))
-    sys.exit(0 if all(row.met for row in table) else 1)

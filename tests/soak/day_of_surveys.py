@@ -138,7 +138,6 @@ class Day:
         (self.disk / "ballast").unlink(missing_ok=True)
 
     def _next_kill(self) -> int | None:
-        """Number of a run of this round that is to be killed, if there is one."""
         next_one = self.serving.begun() + 1
         for number in range(next_one, next_one + len(self.serving.fields)):
             if self.plan.get(number) == "kill":
