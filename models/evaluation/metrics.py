@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import UNLABELLED
 
+DIAGONAL_SHARE = 0.02  # the default of Cheng et al.
+
 
 def confusion(labels: NDArray[np.integer], predicted: NDArray[np.integer], classes: int) -> NDArray[np.int64]:
     """Count pixels by label (row) and prediction (column), (classes, classes) int64; counts of parts add up.
@@ -142,9 +144,6 @@ def miou_over_frame_classes(frames: NDArray[np.int64]) -> float:
 def _mean_of_known(values: NDArray[np.float64]) -> float:
     known = values[~np.isnan(values)]
     return float(known.mean()) if known.size else float("nan")
-
-
-DIAGONAL_SHARE = 0.02  # the default of Cheng et al.
 
 
 def boundary_px(shape: tuple[int, int], share: float = DIAGONAL_SHARE) -> int:

@@ -5,28 +5,25 @@ Evaluation only: all of it needs labels and the whole scene at full resolution, 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-import numpy as np
-from numpy.typing import NDArray
-
-from models.network.sizes import MOST_GAIN
-from models.reading.inference import Glance, captured, origin_of, readings_of
-from models.weights.files import Weights
-from pipeline.geometry.grid import UNLABELLED
-
-if TYPE_CHECKING:
-    pass
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from models.evaluation.metrics import agreement, confusion, gap_closed, mean_iou
+from models.network.sizes import MOST_GAIN
 from models.policies.policies import score_seats
-from models.reading.inference import segment
+from models.reading.inference import Glance, captured, origin_of, readings_of, segment
+from models.weights.files import Weights
+from pipeline.geometry.grid import UNLABELLED
 from pipeline.planning.selection import frame_seats
 
 Values = NDArray[np.floating]
+RANDOM_DRAWS = 5
+CONTROL_SHARE = 0.35  # of the valid seats: K = 35 % of surveys' receipts and of the weights' records
+Counts = NDArray[np.int64]
 
 
 def oracle_gain(
@@ -114,11 +111,6 @@ def rank_correlation(score: Values, gain: Values) -> float:
     first, second = (rankdata(values) - (len(values) + 1) / 2 for values in (score, gain))
     spread = float(np.sqrt((first**2).sum() * (second**2).sum()))
     return float((first * second).sum() / spread) if spread > 0 else float("nan")
-
-
-RANDOM_DRAWS = 5
-CONTROL_SHARE = 0.35  # of the valid seats: K = 35 % of surveys' receipts and of the weights' records
-Counts = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

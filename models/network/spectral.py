@@ -18,6 +18,9 @@ REACH = 1.5  # a column is reached by a band within this many column spacings of
 LONGEST_NM, SHORTEST_NM = 3000.0, 200.0
 SPREAD_FLOOR = 1e-3  # least spread of a column, as a share of the median spread
 VARIANCE_FLOOR = 1e-5  # least variance of a direction that whitening brings to 1, as a share of the largest
+Kind = TypeVar("Kind", bound=np.generic)
+MOST_DEAD = 0.5  # a token with more dead pixels than this share is not read
+MOST_COLUMN = 1e12  # of normalised columns: no reading gives more, and squares of more would end the range of float32
 
 
 @dataclass(frozen=True)
@@ -189,11 +192,6 @@ class Normalisation:
     def gain_shift(self) -> NDArray[np.float32]:
         """What 100 % more light adds to normalised columns beyond doubling them, (column,)."""
         return np.asarray((self.centre / self.spread) @ self.whitening, np.float32)
-
-
-Kind = TypeVar("Kind", bound=np.generic)
-MOST_DEAD = 0.5  # a token with more dead pixels than this share is not read
-MOST_COLUMN = 1e12  # of normalised columns: no reading gives more, and squares of more would end the range of float32
 
 
 def all_alive(columns: NDArray[np.floating]) -> bool:

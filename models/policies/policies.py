@@ -26,6 +26,25 @@ LEVELS = 65535  # of a stretched band; whole numbers add up alike in any order
 DARK, BRIGHT = 0.1, 99.9  # percentiles between which a band is stretched: one dead pixel is not its range
 FLAT = 1e-6  # a range smaller than this share of the values is rounding, not contrast
 MOST_PX = 1024  # a side of the image whose spectrum is taken: work and memory of larger ones grow, seats do not show it
+Scores = NDArray[np.float64]
+Policy = Literal[
+    "gain",
+    "entropy",
+    "margin",
+    "sobel",
+    "saliency",
+    "spectral-residual",
+    "random",
+    "stratified",
+    "centre",
+    "uniform",
+    "mask",
+    "vgg-static",
+    "vgg-trained",
+    "self-attention",
+]
+POLICIES: tuple[Policy, ...] = get_args(Policy)
+MOST_SUMMED = 1e280  # of a mask's values: larger ones are summed in a larger unit
 
 
 def fine_grained(bands: NDArray[np.floating]) -> Pixels:
@@ -94,27 +113,6 @@ def _opencv() -> Any:
             "the policies saliency and spectral-residual need OpenCV with its contrib modules;"
             " pip install opencv-contrib-python-headless, or choose another policy"
         ) from error
-
-
-Scores = NDArray[np.float64]
-Policy = Literal[
-    "gain",
-    "entropy",
-    "margin",
-    "sobel",
-    "saliency",
-    "spectral-residual",
-    "random",
-    "stratified",
-    "centre",
-    "uniform",
-    "mask",
-    "vgg-static",
-    "vgg-trained",
-    "self-attention",
-]
-POLICIES: tuple[Policy, ...] = get_args(Policy)
-MOST_SUMMED = 1e280  # of a mask's values: larger ones are summed in a larger unit
 
 
 def score_seats(

@@ -5,7 +5,7 @@ a captured seat is what the scorer learns to tell; a seat without a label tells 
 other: seats are placed at random and by the entropy of the first reading; then also by the scorer; then in larger
 crops, of which fewer make a batch, as far as the scenes have larger ones.
 
-A control (``models.baselines.designs``) has one map and no scorer: it is asked for that map's loss alone, from the
+A control (``models.network.controls``) has one map and no scorer: it is asked for that map's loss alone, from the
 same crops.
 """
 

@@ -32,6 +32,7 @@ _UNUSED = {
     "decoder": "a decoder for its own classes",
     "decode_head": "a decoder for its own classes",
 }
+RGB_NM = (650.0, 550.0, 450.0)
 
 
 @dataclass
@@ -97,9 +98,6 @@ def _refusal(value: Tensor, shape: torch.Size) -> str:
     if not value.is_floating_point() or not bool(torch.isfinite(value).all()):
         return "values that are not finite numbers"
     return "" if value.shape == shape else f"{tuple(value.shape)} does not fit {tuple(shape)}"
-
-
-RGB_NM = (650.0, 550.0, 450.0)
 
 
 def rgb_response(basis: SpectralBasis) -> NDArray[np.float32]:

@@ -38,6 +38,24 @@ from models.weights.state_files import read_heads, read_notes, read_state
 from pipeline.errors import SettingsError, WeightsError
 
 STEMS = ("coarse_stem", "fine_stem")
+HEAD_WIDTH = 64  # of every common vision transformer: its file does not say how many heads it has
+START_FROM = (  # in words
+    "a vision transformer of timm or DeiT, a Segmenter checkpoint with its variant.yml, or weights that `spectralzoom"
+    " train` made"
+)
+LICENCES = ("licence", "license")
+CLASS_HEADS = ("coarse_classes", "fine_classes", "scorer")  # the scorer reads probabilities of classes
+_BLOCK = "encoder.blocks.*."
+_TRANSFORMER = {
+    "blocks.*.attn.qkv": _BLOCK + "attention.qkv",
+    "blocks.*.attn.proj": _BLOCK + "attention.out",
+    "blocks.*.mlp.fc1": _BLOCK + "mlp.0",
+    "blocks.*.mlp.fc2": _BLOCK + "mlp.2",
+    "blocks.*.norm1": _BLOCK + "norm1",
+    "blocks.*.norm2": _BLOCK + "norm2",
+    "norm": "encoder.norm",
+}
+_OURS = {"blocks": "encoder.blocks", "norm": "encoder.norm"}
 
 
 def column_change(
@@ -90,26 +108,6 @@ def with_patch_kernels(
     for stem in STEMS:
         fitted[f"{stem}.embed.weight"], fitted[f"{stem}.embed.bias"] = mapped, bias
     return fitted, how
-
-
-HEAD_WIDTH = 64  # of every common vision transformer: its file does not say how many heads it has
-START_FROM = (  # in words
-    "a vision transformer of timm or DeiT, a Segmenter checkpoint with its variant.yml, or weights that `spectralzoom"
-    " train` made"
-)
-LICENCES = ("licence", "license")
-CLASS_HEADS = ("coarse_classes", "fine_classes", "scorer")  # the scorer reads probabilities of classes
-_BLOCK = "encoder.blocks.*."
-_TRANSFORMER = {
-    "blocks.*.attn.qkv": _BLOCK + "attention.qkv",
-    "blocks.*.attn.proj": _BLOCK + "attention.out",
-    "blocks.*.mlp.fc1": _BLOCK + "mlp.0",
-    "blocks.*.mlp.fc2": _BLOCK + "mlp.2",
-    "blocks.*.norm1": _BLOCK + "norm1",
-    "blocks.*.norm2": _BLOCK + "norm2",
-    "norm": "encoder.norm",
-}
-_OURS = {"blocks": "encoder.blocks", "norm": "encoder.norm"}
 
 
 @dataclass(frozen=True)

@@ -15,18 +15,19 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
+
+from pipeline.errors import WeightsError
 
 if TYPE_CHECKING:
     from torch import Tensor
-from safetensors import safe_open
-
-from pipeline.errors import WeightsError
 
 ABOUT = "about"  # the text's name in the file
 TENSORS, SEAL = "tensors", "seal"  # entries of the description: hashes of the tensors by name, and its own
 # what reading a description may raise over bytes that are not what they should be
 DAMAGED = (SafetensorError, OSError, UnicodeDecodeError, json.JSONDecodeError, RecursionError)
+CHECKPOINT, UNSEALED_CHECKPOINT = "spectralzoom-checkpoint/2", "spectralzoom-checkpoint/1"  # the earlier has no hashes
+Checkpoint = tuple[dict[str, Any], "dict[str, Tensor]"]
 
 
 def write_sealed(path: Path, about: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
@@ -101,13 +102,6 @@ def hash_without_seal(path: Path, spared: Mapping[str, Any]) -> str:
     digest = hashlib.sha256(len(text).to_bytes(8, "little") + text)
     digest.update(memoryview(raw)[8 + size :])
     return digest.hexdigest()
-
-
-CHECKPOINT, UNSEALED_CHECKPOINT = (
-    "spectralzoom-checkpoint/2",
-    "spectralzoom-checkpoint/1",
-)  # the earlier one has no hashes
-Checkpoint = tuple[dict[str, Any], "dict[str, Tensor]"]
 
 
 def save_checkpoint(path: Path, identity: str, about: dict[str, Any], tensors: dict[str, Tensor]) -> None:

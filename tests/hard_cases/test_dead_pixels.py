@@ -7,43 +7,18 @@ holds for dead pixels, whose captured values are not numbers.
 from __future__ import annotations
 
 import tracemalloc
-from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from models.evaluation.placement import oracle_gain
-from models.network.segmenter import Segmenter, SegmenterConfig
-from models.network.spectral import Normalisation, SpectralBasis, fill_dead
+from models.network.spectral import fill_dead
 from models.policies.policies import score_seats
 from models.reading.inference import CoarseLook, Glance, glance, look_coarsely, segment
-from models.weights.files import Weights
 from pipeline.geometry.grid import SceneGrid
+from tests.models.conftest import plain_weights
 
 NM = np.linspace(400, 1000, 9)
-
-
-def _weights(**sizes: Any) -> Weights:
-    small = {
-        "classes": 3,
-        "columns": 4,
-        "patch": 8,
-        "factor": 2,
-        "width": 8,
-        "coarse_width": 8,
-        "dim": 16,
-        "layers": 2,
-        "heads": 2,
-    }
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        model = Segmenter(SegmenterConfig(**{**small, **sizes})).eval()
-        for parameter in model.parameters():
-            if not parameter.any():
-                torch.nn.init.normal_(parameter, std=0.3)
-    normalisation = Normalisation(np.full(4, 0.3, np.float32), np.full(4, 0.1, np.float32), np.eye(4, dtype=np.float32))
-    return Weights(model, SpectralBasis(400.0, 1000.0, 4), normalisation, ("a", "b", "c"), np.zeros((3, 3), np.uint8))
 
 
 def _scene(height: int, width: int, seed: int = 0) -> np.ndarray:
@@ -58,7 +33,7 @@ def _patches(count: int) -> np.ndarray:
 @pytest.mark.parametrize(("dead", "lives"), [(1, True), (4, True), (5, False), (9, False)])
 def test_17_a_pixel_dead_in_most_of_its_bands_is_dead(dead: int, lives: bool, bad: float):
     """Up to half of the bands may be lost: a flat spectrum stays flat; with more the pixel is nothing at all."""
-    weights, values = _weights(), np.full((2, 9), 0.35, np.float32)
+    weights, values = plain_weights(), np.full((2, 9), 0.35, np.float32)
     values[1, np.random.default_rng(0).permutation(9)[:dead]] = bad
     whole, broken = weights.columns(values, NM)
     assert np.isnan(broken).tolist() == [not lives] * 4
@@ -70,7 +45,7 @@ def test_17_a_pixel_dead_in_most_of_its_bands_is_dead(dead: int, lives: bool, ba
 @pytest.mark.parametrize(("patch", "token"), [(8, 8), (32, 16)])
 def test_17_a_token_dead_in_most_of_its_pixels_is_not_read(patch: int, token: int, more: int):
     """With half of its pixels dead a coarse token is read; with one more it is left out, and still has a map."""
-    weights, grid = _weights(patch=patch), SceneGrid(4 * patch, 2 * patch, patch, 2)
+    weights, grid = plain_weights(patch=patch), SceneGrid(4 * patch, 2 * patch, patch, 2)
     values = _scene(2 * patch, patch)
     values[: token // 2, :token] = np.nan
     values[token // 2, :more] = np.nan
@@ -83,7 +58,7 @@ def test_17_a_token_dead_in_most_of_its_pixels_is_not_read(patch: int, token: in
 
 def test_17_dead_pixels_are_filled_by_the_mean_of_their_patch():
     """A coarse pixel without a value takes the mean column of the living ones of its patch."""
-    weights, grid, values = _weights(), SceneGrid(32, 32, 8, 2), _scene(16, 16)
+    weights, grid, values = plain_weights(), SceneGrid(32, 32, 8, 2), _scene(16, 16)
     whole = look_coarsely(weights, [values], NM, grid).columns
     values[2:4, 9:14] = np.nan
     seen = look_coarsely(weights, [values], NM, grid).columns
@@ -96,7 +71,7 @@ def test_17_dead_pixels_are_filled_by_the_mean_of_their_patch():
 
 def test_18_a_dead_coarse_patch_is_as_if_the_scene_ended_there():
     """A scene whose last coarse patches are all dead reads outside them as one without them, but for one cell."""
-    weights, values = _weights(), _scene(24, 32)
+    weights, values = plain_weights(), _scene(24, 32)
     values[:, 24:] = np.nan
     dead = glance(weights, values, NM, SceneGrid(48, 64, 8, 2))
     shorter = glance(weights, values[:, :24], NM, SceneGrid(48, 48, 8, 2))
@@ -112,7 +87,7 @@ def test_18_a_dead_coarse_patch_is_as_if_the_scene_ended_there():
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_18_a_dead_fine_patch_is_as_if_not_captured(bad: float):
     """A captured patch that is all dead changes nothing anywhere: the map is that without its seat."""
-    weights = _weights()
+    weights = plain_weights()
     seen = glance(weights, _scene(24, 32), NM, SceneGrid(48, 64, 8, 2))
     patches, seats = _patches(5), np.array([3, 40, 11, 12, 30])
     patches[1] = bad
@@ -125,7 +100,7 @@ def test_18_a_dead_fine_patch_is_as_if_not_captured(bad: float):
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_18_what_a_look_showed_is_told_of_the_map_that_is_drawn(bad: float):
     """Holes in either scale: gain compares the map without patches with the one that has them."""
-    weights, grid, values = _weights(classes=2), SceneGrid(48, 64, 8, 2), _scene(24, 32)
+    weights, grid, values = plain_weights(classes=2), SceneGrid(48, 64, 8, 2), _scene(24, 32)
     values[:8, 8:16] = bad
     seen = glance(weights, values, NM, grid)
     seats = np.arange(48)
@@ -156,7 +131,7 @@ def test_18_filling_holes_takes_the_memory_of_the_patches_once():
 
 def test_18_holes_in_a_coarse_look_take_no_further_copy_of_it():
     """A look with a dead pixel in every patch is made in the memory of one without, but for a mask."""
-    weights, peaks = _weights(), []
+    weights, peaks = plain_weights(), []
     for bad in (0.3, np.nan):
         values = _scene(256, 256)
         values[3::8, 4::8] = bad
@@ -172,7 +147,7 @@ def test_18_holes_in_a_coarse_look_take_no_further_copy_of_it():
 
 def test_18_what_is_dead_reaches_nobody():
     """Holes of any content give one map; a saturated column of pixels leaves every figure finite."""
-    weights, grid = _weights(), SceneGrid(48, 64, 8, 2)
+    weights, grid = plain_weights(), SceneGrid(48, 64, 8, 2)
     maps = []
     for bad in (np.nan, np.inf, -np.inf):
         values = _scene(24, 32)
@@ -184,7 +159,7 @@ def test_18_what_is_dead_reaches_nobody():
 
 def test_18_a_scene_all_dead_still_has_a_map():
     """Nothing seen at all gives finite probabilities, of every policy's score too, and captured patches still count."""
-    weights, grid = _weights(), SceneGrid(32, 32, 8, 2)
+    weights, grid = plain_weights(), SceneGrid(32, 32, 8, 2)
     seen = glance(weights, np.full((16, 16, 9), np.nan), NM, grid)
     assert np.isfinite(seen.probability).all()
     for policy in ("gain", "entropy", "sobel", "self-attention"):
@@ -195,7 +170,7 @@ def test_18_a_scene_all_dead_still_has_a_map():
 
 def test_18_a_scene_without_holes_is_read_as_ever():
     """Where every pixel lives no token is left out and nothing is filled."""
-    weights, grid = _weights(), SceneGrid(30, 31, 8, 2)
+    weights, grid = plain_weights(), SceneGrid(30, 31, 8, 2)
     seen = look_coarsely(weights, [_scene(15, 16)], NM, grid)
     assert seen.living is None
     alone = Glance(grid, seen.columns, np.empty((0, 0, 0), np.float32))
@@ -209,7 +184,7 @@ def test_21_the_pad_is_a_mirror_image():
     No seat of the pad is bought, its pixels have no label and no place on the map. Attention does read the part of a
     border patch that lies in it: it shows the scene once more, as the crops do that the weights are trained on.
     """
-    weights = _weights()
+    weights = plain_weights()
     for height, width in ((40, 40), (2, 34), (1, 1)):
         grid = SceneGrid(height, width, 8, 2)
         values = _scene(*grid.coarse_shape)

@@ -27,18 +27,9 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.geometry.scan import CostModel
 from pipeline.planning.fine_pass import plan_fine
+from tests.models.conftest import SMALL
 
-SIZES: dict[str, Any] = {
-    "classes": 2,
-    "columns": 4,
-    "patch": 8,
-    "factor": 2,
-    "width": 8,
-    "coarse_width": 8,
-    "dim": 16,
-    "heads": 2,
-    "layers": 1,
-}
+SIZES: dict[str, Any] = SMALL | {"classes": 2}
 SETTINGS = TrainingSettings(steps=4, batch=1, crop=16)
 NO_SHIFT = np.zeros(4, np.float32)
 

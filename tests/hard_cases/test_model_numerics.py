@@ -18,52 +18,20 @@ from torch import Tensor
 
 from models.evaluation.metrics import average_accuracy, confusion, iou_per_class, kappa, mean_iou, overall_accuracy
 from models.network.layers import Encoder, code_1d, code_2d
-from models.network.segmenter import Segmenter, SegmenterConfig
-from models.network.spectral import Normalisation, SpectralBasis
+from models.network.segmenter import SegmenterConfig
+from models.network.spectral import Normalisation
 from models.policies.policies import pixel_entropy, score_seats
 from models.reading.inference import Glance, check_seats, glance, glance_of_columns, segment
 from models.training import train as training
 from models.training.examples import Example
 from models.training.objective import class_weights, draw_seats, map_loss, phase_at, pixel_losses
 from models.training.train import TrainingSettings, train
-from models.weights.files import Weights, load_weights, save_weights
+from models.weights.files import load_weights, save_weights
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.selection import frame_seats, select_seats
+from tests.models.conftest import SMALL, make_network, noise, plain_weights
 
-SIZES: dict[str, Any] = {
-    "classes": 3,
-    "columns": 4,
-    "patch": 8,
-    "factor": 2,
-    "width": 8,
-    "coarse_width": 8,
-    "dim": 16,
-    "heads": 2,
-}
 NONE = torch.zeros(1, 0, dtype=torch.int64)
-
-
-def _drawn(*shape: int, seed: int = 0) -> Tensor:
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
-
-
-def _model(seed: int = 0, **sizes: Any) -> Segmenter:
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        model = Segmenter(SegmenterConfig(**{**SIZES, "layers": 2, **sizes})).eval()
-        for parameter in model.parameters():
-            if not parameter.any():
-                torch.nn.init.normal_(parameter, std=0.3)
-    return model
-
-
-def _weights(**sizes: Any) -> Weights:
-    model = _model(**sizes)
-    j = model.config.columns
-    normalisation = Normalisation(np.full(j, 0.3, np.float32), np.full(j, 0.1, np.float32), np.eye(j, dtype=np.float32))
-    colours = np.zeros((model.config.classes, 3), np.uint8)
-    names = tuple("abcdefgh"[: model.config.classes])
-    return Weights(model, SpectralBasis(400.0, 1000.0, j), normalisation, names, colours)
 
 
 def _encoder(layers: int = 2) -> Encoder:
@@ -73,7 +41,7 @@ def _encoder(layers: int = 2) -> Encoder:
 
 
 def _fine(batch: int, seats: int) -> Tensor:
-    return _drawn(batch, seats, 4, 8, 8, seed=1)
+    return noise(1, batch, seats, 4, 8, 8)
 
 
 @pytest.fixture
@@ -86,7 +54,7 @@ def threads() -> Iterator[None]:
 
 def test_1_a_query_without_a_key_gives_zero():
     """Where every token is invalid the result is exactly 0 and every gradient finite."""
-    encoder, x = _encoder(), _drawn(2, 5, 16).requires_grad_()
+    encoder, x = _encoder(), noise(0, 2, 5, 16).requires_grad_()
     valid = torch.tensor([[False] * 5, [True] * 5])
     out, _ = encoder(x, valid=valid)
     assert not out[0].any()
@@ -100,7 +68,7 @@ def test_1_a_query_without_a_key_gives_zero():
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -1e30])
 def test_2_what_an_invalid_token_holds_does_not_leak(bad: float):
     """NaN in a token that is left out gives what the others give without it, with finite gradients."""
-    encoder, x = _encoder(), _drawn(1, 7, 16)
+    encoder, x = _encoder(), noise(0, 1, 7, 16)
     x[0, [2, 5]] = bad
     keep = torch.tensor([0, 1, 3, 4, 6])
     valid = torch.zeros(1, 7, dtype=torch.bool).index_fill(1, keep, True)
@@ -127,7 +95,7 @@ def test_3_no_tokens_and_no_images_give_nothing(batch: int, count: int):
 @pytest.mark.parametrize("seats", [0, 3])
 def test_3_no_images_give_no_maps(seats: int):
     """The whole segmenter takes a batch of no scene, with and without seats."""
-    model, numbers = _model(), torch.zeros(0, seats, dtype=torch.int64)
+    model, numbers = make_network(layers=2), torch.zeros(0, seats, dtype=torch.int64)
     logits, patches = model(torch.zeros(0, 4, 16, 24), torch.zeros(0, seats, 4, 8, 8), numbers)
     assert logits.shape == (0, 3, 16, 24)
     assert patches.shape == (0, seats, 3, 8, 8)
@@ -138,7 +106,7 @@ def test_3_no_images_give_no_maps(seats: int):
 @pytest.mark.parametrize("soft_dice", [False, True])
 def test_4_nothing_labelled_is_no_loss(images: int, soft_dice: bool):
     """Without a labelled pixel, or with weights that are all 0, the loss is 0 and its gradient is 0."""
-    logits = _drawn(images, 3, 4, 4).requires_grad_()
+    logits = noise(0, images, 3, 4, 4).requires_grad_()
     for value, weight in ((255, torch.ones(3)), (1, torch.zeros(3)), (1, torch.tensor([1.0, 0.0, 1.0]))):
         labels = torch.full((images, 4, 4), value)
         loss = map_loss(logits, pixel_losses(logits, labels), labels, weight, soft_dice=soft_dice)
@@ -157,8 +125,8 @@ def test_4_no_pixels_have_finite_class_weights():
 @torch.inference_mode()
 def test_5_no_seat_is_the_glance_bit_by_bit():
     """With K = 0 training's forward, the glance and the survey's map come from one and the same logits."""
-    weights, grid = _weights(), SceneGrid(48, 64, 8, 2)
-    seen = glance_of_columns(weights, _drawn(24, 32, 4).numpy(), grid)
+    weights, grid = plain_weights(), SceneGrid(48, 64, 8, 2)
+    seen = glance_of_columns(weights, noise(0, 24, 32, 4).numpy(), grid)
     coarse = torch.from_numpy(seen.columns).permute(2, 0, 1)[None].contiguous()
     model = weights.segmenter
     logits, patches = model(coarse, _fine(1, 0), NONE)
@@ -171,7 +139,7 @@ def test_5_no_seat_is_the_glance_bit_by_bit():
 @torch.inference_mode()
 def test_6_every_seat_in_any_order_is_one_map():
     """With K = all the order in which a policy ranked the seats does not show."""
-    model, coarse, fine = _model(), _drawn(1, 4, 16, 24), _fine(1, 24)
+    model, coarse, fine = make_network(layers=2), noise(0, 1, 4, 16, 24), _fine(1, 24)
     maps = []
     for seed in range(3):
         order = torch.randperm(24, generator=torch.Generator().manual_seed(seed))[None]
@@ -218,7 +186,11 @@ def test_8_training_ranks_ties_by_number():
             return 0.2 if isinstance(args[0], tuple) else 1
 
     seats = draw_seats(
-        torch.zeros(16, 3, 16, 16), torch.zeros(16, 16), _model().config, Even(np.random.PCG64(0)), phase_at(0.0)
+        torch.zeros(16, 3, 16, 16),
+        torch.zeros(16, 16),
+        make_network(layers=2).config,
+        Even(np.random.PCG64(0)),
+        phase_at(0.0),
     )
     assert (seats == torch.arange(seats.shape[1])).all()
 
@@ -246,7 +218,7 @@ def test_10_a_seat_given_twice_is_refused():
 @torch.inference_mode()
 def test_11_bfloat16_agrees():
     """Under autocast to bfloat16 the map differs by 2e-2 at most and nearly all classes agree."""
-    model, coarse, fine = _model(), _drawn(1, 4, 32, 32), _fine(1, 20)
+    model, coarse, fine = make_network(layers=2), noise(0, 1, 4, 32, 32), _fine(1, 20)
     seats = torch.arange(0, 60, 3)[None]
     exact = model.composite(*model(coarse, fine, seats), seats).softmax(dim=1)
     with warnings.catch_warnings(), torch.autocast("cpu", dtype=torch.bfloat16):
@@ -260,7 +232,7 @@ def test_11_bfloat16_agrees():
 @pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16])
 def test_11_attention_stays_finite_in_half_precision(kind: torch.dtype):
     """Normalised queries and keys keep the logits of inputs of 300 finite in 16 bits, masked keys included."""
-    encoder, x = _encoder().to(kind), (300 * _drawn(1, 8, 16)).to(kind)
+    encoder, x = _encoder().to(kind), (300 * noise(0, 1, 8, 16)).to(kind)
     valid = torch.tensor([[True] * 6 + [False] * 2])
     assert encoder(x, valid=valid)[0].isfinite().all()
 
@@ -281,7 +253,7 @@ def test_12_places_far_out_keep_their_code(place: float):
 def test_12_a_tile_far_out_has_the_codes_of_its_field():
     """The origin of a tile is added in float64: codes of its tokens are exact to 1e-6 at 1e7 seats."""
     origin = np.array([9_999_997, 10_000_000])
-    model = _model(dim=32, patch=32, factor=2)
+    model = make_network(layers=2, dim=32, patch=32, factor=2)
     coded = model.code_coarse(torch.zeros(6, 4, 32), 2, 3, torch.from_numpy(origin)[None]) - model.scale_code[0]
     y, x = np.divmod(np.arange(6), 3)
     corner = np.stack([y, x], axis=-1)[:, None] + np.array([[0.25, 0.25], [0.25, 0.75], [0.75, 0.25], [0.75, 0.75]])
@@ -351,7 +323,7 @@ def test_20_numbers_that_are_no_class_are_refused(label: int, guess: int):
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (37, 53), (100, 31)])
 def test_21_any_size_gives_its_own_map(size: tuple[int, int]):
     """Scenes that do not divide are padded and cropped back, from one pixel on; no seat of the pad is bought."""
-    weights, grid = _weights(factor=4, patch=8), SceneGrid(*size, 8, 4)
+    weights, grid = plain_weights(factor=4, patch=8), SceneGrid(*size, 8, 4)
     values = np.random.default_rng(0).uniform(0.1, 0.5, (*grid.coarse_shape, 5))
     seen = glance(weights, values, np.linspace(450, 950, 5), grid)
     valid = grid.valid_share().ravel() > 0
@@ -382,7 +354,7 @@ def test_22_a_scene_alike_everywhere_scores_alike():
 @torch.inference_mode()
 def test_23_a_scene_reads_alike_alone_and_in_a_batch():
     """Batch-mates, the size of the batch and the order of tokens do not show."""
-    model, coarse, fine = _model(), _drawn(8, 4, 16, 16), _fine(8, 5)
+    model, coarse, fine = make_network(layers=2), noise(0, 8, 4, 16, 16), _fine(8, 5)
     seats = torch.stack([torch.randperm(16, generator=torch.Generator().manual_seed(i))[:5] for i in range(8)])
     together = model.composite(*model(coarse, fine, seats), seats)
     for i in (0, 3, 7):
@@ -397,7 +369,7 @@ def test_23_a_scene_reads_alike_alone_and_in_a_batch():
 @torch.inference_mode()
 def test_23_padded_tokens_equal_packed_ones():
     """Scenes of different counts in one padded batch read as each by itself."""
-    encoder, x = _encoder(), _drawn(3, 9, 16)
+    encoder, x = _encoder(), noise(0, 3, 9, 16)
     counts = [9, 4, 1]
     valid = torch.arange(9) < torch.tensor(counts)[:, None]
     padded, _ = encoder(x, valid=valid)
@@ -409,7 +381,7 @@ def test_23_padded_tokens_equal_packed_ones():
 @pytest.mark.parametrize("change", ["reversed", "shuffled", "twice"])
 def test_24_bands_in_any_order_and_number_give_one_glance(change: str):
     """Descending, unsorted and repeated wavelengths change no probability by more than 1e-5."""
-    weights, grid = _weights(), SceneGrid(32, 32, 8, 2)
+    weights, grid = plain_weights(), SceneGrid(32, 32, 8, 2)
     rng, nm = np.random.default_rng(0), np.linspace(400, 1000, 31)
     values = rng.uniform(0.1, 0.5, (16, 16, 31))
     orders = {"reversed": np.arange(31)[::-1], "shuffled": rng.permutation(31), "twice": np.tile(np.arange(31), 2)}
@@ -422,7 +394,7 @@ def test_24_bands_in_any_order_and_number_give_one_glance(change: str):
 def test_24_wavelengths_in_another_unit_are_refused(nm: list[float]):
     """Micrometres and numbers outside 200-3000 nm are a ValueError that says so."""
     with pytest.raises(ValueError, match="outside 200-3000 nm"):
-        glance(_weights(), np.zeros((8, 8, 2)), np.array(nm), SceneGrid(16, 16, 8, 2))
+        glance(plain_weights(), np.zeros((8, 8, 2)), np.array(nm), SceneGrid(16, 16, 8, 2))
 
 
 def test_25_certainty_has_no_entropy():
@@ -437,13 +409,13 @@ def test_25_certainty_has_no_entropy():
 @pytest.mark.parametrize("gate", [60.0, -60.0])
 def test_27_closed_and_open_gates(gate: float):
     """An open pixel gate shows the patch alone, a shut one the coarse features alone; both have finite gradients."""
-    model = _model()
+    model = make_network(layers=2)
     with torch.no_grad():
         model.pixel_gate.weight.zero_()
         model.pixel_gate.bias.fill_(gate)
-    features, _ = model.fine_stem(_drawn(2, 4, 8, 8))
-    under = [_drawn(2, 8, 8, 8, seed=seed).requires_grad_() for seed in (1, 2)]
-    context = [_drawn(2, 1, 16, seed=seed) for seed in (3, 4)]
+    features, _ = model.fine_stem(noise(0, 2, 4, 8, 8))
+    under = [noise(seed, 2, 8, 8, 8).requires_grad_() for seed in (1, 2)]
+    context = [noise(seed, 2, 1, 16) for seed in (3, 4)]
     base = model.decode_fine(features, context[0], under[0])
     same_own, same_under = (
         model.decode_fine(features, context[0], under[1]),
@@ -461,7 +433,7 @@ def test_29_bad_steps_are_counted_and_end_a_run(value: float, monkeypatch: pytes
     """A loss that is not finite is skipped and counted; three in a row stop the run."""
     labels = np.zeros((16, 16), np.uint8)
     example = Example("e", np.zeros((16, 16, 4), np.float16), np.zeros((8, 8, 4), np.float32), labels, (16, 16))
-    config, settings = SegmenterConfig(**SIZES, layers=1), TrainingSettings(steps=4, batch=1, crop=16)
+    config, settings = SegmenterConfig(**SMALL), TrainingSettings(steps=4, batch=1, crop=16)
     honest, calls = training.batch_loss, iter(range(100))
     monkeypatch.setattr(training, "batch_loss", lambda *a, **k: honest(*a, **k) * (value if next(calls) % 2 else 1))
     _, summary = train(config, [example], np.zeros(4, np.float32), settings)
@@ -473,7 +445,7 @@ def test_29_bad_steps_are_counted_and_end_a_run(value: float, monkeypatch: pytes
 
 def test_30_a_checkpoint_reads_other_bands(tmp_path: Path):
     """Weights come back bit by bit and read any number of bands."""
-    weights, path = _weights(), tmp_path / "w.safetensors"
+    weights, path = plain_weights(), tmp_path / "w.safetensors"
     save_weights(weights, path)
     loaded = load_weights(path)
     assert all(
@@ -486,7 +458,7 @@ def test_30_a_checkpoint_reads_other_bands(tmp_path: Path):
 
 def test_30_another_number_of_classes_names_the_tensor(tmp_path: Path):
     """Tensors of three classes under a description of five are refused by the tensor's name."""
-    weights, path = _weights(), tmp_path / "w.safetensors"
+    weights, path = plain_weights(), tmp_path / "w.safetensors"
     weights.segmenter.config = replace(weights.config, classes=5)
     save_weights(replace(weights, class_names=tuple("abcde")), path)
     with pytest.raises(ValueError, match=r"tensor coarse_classes.weight should be \(5, 8, 1, 1\)"):
@@ -495,8 +467,8 @@ def test_30_another_number_of_classes_names_the_tensor(tmp_path: Path):
 
 def test_31_one_and_two_threads_choose_the_same_seats(threads: None):
     """The same scene gives the same plan on 1 and 2 threads, and no global stream is touched."""
-    weights, grid = _weights(), SceneGrid(96, 96, 8, 2)
-    columns = _drawn(48, 48, 4).numpy()
+    weights, grid = plain_weights(), SceneGrid(96, 96, 8, 2)
+    columns = noise(0, 48, 48, 4).numpy()
     before, plans = torch.random.get_rng_state(), []
     for count in (1, 2):
         torch.set_num_threads(count)

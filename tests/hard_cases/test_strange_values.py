@@ -40,7 +40,6 @@ STRANGE = st.one_of(
 
 
 def _drawn(coarse: NDArray[np.float32], fine: NDArray[np.float32]) -> tuple[Glance, DrawnMap]:
-    """Glance and map as a survey makes them of stored values."""
     seen = glance(WEIGHTS, coarse, NM, GRID)
     store: Any = SimpleNamespace(seats=SEATS, pick=lambda entries: fine[entries])
     seats, columns = seat_columns(WEIGHTS, store, NM, seen, whole_field(GRID))

@@ -3,47 +3,98 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from models.network.controls import build_network
-from models.network.segmenter import Segmenter, SegmenterConfig
-from models.network.sizes import PRESETS, Preset
+from models.network.sizes import PRESETS, Preset, SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
+from models.reading.inference import CoarseLook
+from models.training.examples import Example
+from models.training.train import Progress
 from models.weights.files import AnyWeights, Weights
+from pipeline.geometry.grid import SceneGrid
 
+SMALL: dict[str, Any] = {"classes": 3, "columns": 4, "patch": 8, "factor": 2, "width": 8, "coarse_width": 8} | {
+    "dim": 16,
+    "heads": 2,
+    "layers": 1,
+}
 Maker = Callable[..., Weights]
+ControlMaker = Callable[..., AnyWeights]
+
+
+def noise(seed: int, *shape: int) -> Tensor:
+    """Seeded normal numbers."""
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def scene_tensors(config: SegmenterConfig, rows: int = 2, columns: int = 3) -> tuple[Tensor, Tensor, Tensor]:
+    """Coarse image, every fine patch of a scene of ``rows`` x ``columns`` coarse patches, and their numbers."""
+    p, j, count = config.patch, config.columns, rows * columns * config.factor**2
+    return noise(0, 1, j, rows * p, columns * p), noise(1, 1, count, j, p, p), torch.arange(count)[None]
+
+
+def scene_columns(weights: AnyWeights, height: int, width: int, seed: int = 0) -> tuple[CoarseLook, np.ndarray]:
+    """A look at a scene of noise, and a patch for every seat of its padded grid."""
+    p, s, columns = weights.config.patch, weights.config.factor, weights.config.columns
+    grid, rng = SceneGrid(height, width, p, s), np.random.default_rng(seed)
+    y, x = (side // s for side in grid.padded_shape)
+    look = CoarseLook(grid, rng.standard_normal((y, x, columns), np.float32))
+    return look, rng.standard_normal((int(np.prod(grid.seat_shape)), p, p, columns), np.float32)
+
+
+def block_example(size: int = 32, block: int = 8, share: float = 1.0) -> Example:
+    """Two classes in blocks, told apart by the first column, with noise in the second; a ``share`` is labelled."""
+    rng = np.random.default_rng(4)
+    labels = np.kron(rng.integers(0, 2, (size // block, size // block)), np.ones((block, block))).astype(np.uint8)
+    fine = np.stack([2.0 * labels - 1, rng.normal(0, 1, labels.shape)], axis=-1)
+    coarse = fine.reshape(size // 2, 2, size // 2, 2, 2).mean(axis=(1, 3))
+    labels[rng.random(labels.shape) >= share] = 255
+    return Example("e", fine.astype(np.float16), coarse.astype(np.float32), labels, labels.shape)
+
+
+def killed_after(step: int) -> Callable[[Progress], None]:
+    """A report that ends the process, as far as training can tell, after some steps."""
+
+    def report(now: Progress) -> None:
+        if now.step == step:
+            raise KeyboardInterrupt
+
+    return report
+
+
+def make_network(seed: int = 0, **sizes: Any) -> Any:
+    """A small network of the given sizes; whatever training starts from zero is drawn too, so that nothing is idle."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        model = build_network(SegmenterConfig(**{**SMALL, **sizes})).eval()
+        for parameter in model.parameters():
+            if not parameter.any():
+                torch.nn.init.normal_(parameter, std=0.3)
+    return model
 
 
 def make_weights(seed: int = 0, **sizes: Any) -> Weights:
-    """Random weights of the given sizes; whatever training starts from zero is drawn too, so that nothing is idle."""
-    made = make_any_weights(seed, **sizes)
-    assert isinstance(made.network, Segmenter)
-    return Weights(made.network, made.basis, made.normalisation, made.class_names, made.class_colours, made.record)
+    """Random weights of a two-scale segmenter."""
+    return Weights(**vars(make_any_weights(seed, **sizes)))
+
+
+def plain_weights(**sizes: Any) -> Weights:
+    """Those of two layers, with columns of one scale that have no correlation."""
+    made = make_weights(**{"layers": 2, **sizes})
+    one = np.ones(made.config.columns, np.float32)
+    return replace(made, normalisation=Normalisation(0.3 * one, 0.1 * one, np.diag(one)))
 
 
 def make_any_weights(seed: int = 0, **sizes: Any) -> AnyWeights:
     """Random weights of the network that the sizes name."""
-    small = {
-        "classes": 3,
-        "columns": 4,
-        "patch": 8,
-        "factor": 2,
-        "width": 8,
-        "coarse_width": 8,
-        "dim": 16,
-        "layers": 1,
-        "heads": 2,
-    }
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        model = build_network(SegmenterConfig(**{**small, **sizes})).eval()
-        for parameter in model.parameters():
-            if not parameter.any():
-                torch.nn.init.normal_(parameter, std=0.3)
+    model = make_network(seed, **sizes)
     columns = model.config.columns
     centre, spread = np.linspace(0.2, 0.4, columns), np.linspace(0.05, 0.1, columns)
     whitening = np.eye(columns) + 0.1

@@ -73,11 +73,13 @@ def test_seeds_that_differ_widen_the_interval():
     assert (same.low, same.high) == (0, 0)
 
 
-def test_every_run_has_a_seed():
-    """The message names how many there are."""
+def test_rows_that_do_not_go_together_are_refused():
+    """The messages name both shapes, or how many seeds there are."""
     row = _frames(2, 3)
     with pytest.raises(ShapeError, match="a seed for each of 2 and 2 runs"):
         paired_interval(row, row, seeds=(np.arange(1), np.arange(2)))
+    with pytest.raises(ShapeError, match="the same frames and classes"):
+        paired_interval(_frames(1, 3), _frames(1, 4))
 
 
 def test_one_frame_has_no_interval():
@@ -92,12 +94,6 @@ def test_the_same_seed_draws_the_same():
     first, second = _frames(1, 9, 1), _frames(1, 9, 2)
     same = [paired_interval(first, second, draws=60, seed=seed) for seed in (3, 3, 4)]
     assert same[0] == same[1] != same[2]
-
-
-def test_rows_of_other_frames_are_refused():
-    """The message names both shapes."""
-    with pytest.raises(ShapeError, match="the same frames and classes"):
-        paired_interval(_frames(1, 3), _frames(1, 4))
 
 
 def test_stray_pixels_in_some_frames_do_not_make_a_row_worse():

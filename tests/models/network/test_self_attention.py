@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -21,8 +20,9 @@ from models.network.self_attention import (
 from models.policies.policies import score_seats
 from models.reading.inference import CoarseLook, Glance, glance_of_columns, read_glance
 from models.weights.files import Weights
-from pipeline.errors import SettingsError, ShapeError
+from pipeline.errors import ShapeError
 from pipeline.geometry.grid import SceneGrid
+from tests.models.conftest import Maker
 
 Array = NDArray[np.float32]
 
@@ -81,7 +81,7 @@ def test_queries_and_keys_that_do_not_belong_together_are_refused(shapes: tuple[
         received_attention(*(np.ones(shape, np.float32) for shape in shapes))
 
 
-def test_it_is_what_the_last_layer_computes(tiny: Callable[..., Weights]):
+def test_it_is_what_the_last_layer_computes(tiny: Maker):
     """Queries and keys are those with which torch mixes values: values that name the tokens give the weights back."""
     weights = tiny(layers=2)
     read = seen_by(weights).tokens
@@ -95,7 +95,7 @@ def test_it_is_what_the_last_layer_computes(tiny: Callable[..., Weights]):
     assert received_attention(read.queries, read.keys) == pytest.approx(mixed.mean(dim=(0, 1, 2)).numpy(), abs=1e-6)
 
 
-def test_queries_are_kept_inside_alone(tiny: Callable[..., Weights]):
+def test_queries_are_kept_inside_alone(tiny: Maker):
     """Neither after a reading that failed nor in another thread is anything kept; those of the last layer are."""
     weights = tiny(layers=2)
     image = torch.from_numpy(noise(9, 1, 4, 16, 24))
@@ -115,7 +115,7 @@ def test_queries_are_kept_inside_alone(tiny: Callable[..., Weights]):
     assert LAST_QUERIES.get() is None
 
 
-def test_threads_that_read_at_once_keep_their_own(tiny: Callable[..., Weights]):
+def test_threads_that_read_at_once_keep_their_own(tiny: Maker):
     """Regions of a field are read by one network in several threads: each scores as it does alone."""
     weights = tiny(layers=2)
     alone = [score_seats("self-attention", seen_by(weights, seed=seed)) for seed in range(8)]
@@ -159,7 +159,7 @@ def test_seats_over_the_token_that_is_read_come_first(side: int, factor: int):
 
 
 @pytest.mark.parametrize("patch", [8, 32])
-def test_the_policy_scores_seats_by_their_share(tiny: Callable[..., Weights], patch: int):
+def test_the_policy_scores_seats_by_their_share(tiny: Maker, patch: int):
     """Seats off the scene score 0, those on it what they receive, border seats a share of it; 1 is the usual."""
     weights = tiny(patch=patch)
     seen = seen_by(weights, 5 * patch - 3, 7 * patch - 5)
@@ -171,7 +171,7 @@ def test_the_policy_scores_seats_by_their_share(tiny: Callable[..., Weights], pa
     assert np.ptp(received) > 1e-4
 
 
-def test_two_readings_score_alike(tiny: Callable[..., Weights]):
+def test_two_readings_score_alike(tiny: Maker):
     """Reading a look again changes no score, and places of a larger field tell in it."""
     weights = tiny()
     seen = seen_by(weights)
@@ -179,11 +179,3 @@ def test_two_readings_score_alike(tiny: Callable[..., Weights]):
     assert (score_seats("self-attention", again) == score_seats("self-attention", seen)).all()
     moved = read_glance(weights, CoarseLook(seen.grid, seen.columns, origin=(5, 3)))
     assert np.abs(score_seats("self-attention", moved) - score_seats("self-attention", seen)).max() > 1e-6
-
-
-def test_a_look_that_nobody_read_has_no_attention():
-    """The message says that the weights were not asked."""
-    grid = SceneGrid(16, 16, 8, 2)
-    seen = Glance(grid, np.zeros((8, 8, 2), np.float32), np.zeros((8, 8, 3), np.float32))
-    with pytest.raises(SettingsError, match="'self-attention' asks the weights, and nothing was read"):
-        score_seats("self-attention", seen)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -17,8 +16,8 @@ from models.reading.inference import CoarseLook, Glance, glance_batch, packs, re
 from models.weights.files import Weights
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import SceneGrid
+from tests.models.conftest import Maker
 
-Maker = Callable[..., Weights]
 Scenes = tuple[list[CoarseLook], list[np.ndarray], list[np.ndarray]]
 SIZES = [(37, 53), (1, 1), (48, 16), (16, 16), (60, 44), (17, 90)]
 COUNTS = [5, 1, 0, 4, 40, 9]

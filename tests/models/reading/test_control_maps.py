@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -18,8 +17,8 @@ from models.reading.inference import CoarseLook, look_coarsely
 from models.weights.files import AnyWeights
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import SceneGrid
+from tests.models.conftest import ControlMaker, Maker
 
-Maker = Callable[..., AnyWeights]
 NM = np.linspace(400, 1000, 9)
 CONTROLS = [preset for preset in PRESETS if preset != "two-scale"]
 
@@ -35,7 +34,7 @@ def _look(weights: AnyWeights, height: int, width: int) -> tuple[CoarseLook, np.
 
 @pytest.mark.parametrize("size", [(37, 53), (1, 1), (32, 16), (48, 15)])
 @pytest.mark.parametrize("preset", CONTROLS)
-def test_maps_have_the_size_of_the_scene(make_control: Maker, preset: str, size: tuple[int, int]):
+def test_maps_have_the_size_of_the_scene(make_control: ControlMaker, preset: str, size: tuple[int, int]):
     """Any size works, down to a single pixel."""
     weights = make_control(preset)
     look, fine = _look(weights, *size)
@@ -47,7 +46,7 @@ def test_maps_have_the_size_of_the_scene(make_control: Maker, preset: str, size:
 
 
 @pytest.mark.parametrize("preset", CONTROLS)
-def test_maps_are_those_that_training_saw(make_control: Maker, preset: str):
+def test_maps_are_those_that_training_saw(make_control: ControlMaker, preset: str):
     """Patches read some at a time and logits brought up in strips give the map that the loss is taken of."""
     weights = make_control(preset, factor=4)
     look, fine = _look(weights, 64, 96)
@@ -62,7 +61,7 @@ def test_maps_are_those_that_training_saw(make_control: Maker, preset: str):
 
 
 @pytest.mark.parametrize("preset", ["dense", "upsampled", "coarser"])
-def test_the_size_of_chunks_changes_nothing(make_control: Maker, preset: str, monkeypatch: pytest.MonkeyPatch):
+def test_the_size_of_chunks_changes_nothing(make_control: ControlMaker, preset: str, monkeypatch: pytest.MonkeyPatch):
     """Patches read 3 at a time give the map of all at once."""
     weights = make_control(preset)
     look, fine = _look(weights, 45, 61)
@@ -75,7 +74,7 @@ def test_the_size_of_chunks_changes_nothing(make_control: Maker, preset: str, mo
 
 
 @pytest.mark.parametrize("preset", CONTROLS)
-def test_the_order_of_seats_changes_nothing(make_control: Maker, preset: str):
+def test_the_order_of_seats_changes_nothing(make_control: ControlMaker, preset: str):
     """Patches come with their numbers: in another order, and with padded ones among them, the map is the same."""
     weights = make_control(preset)
     look, fine = _look(weights, 24, 40)
@@ -86,7 +85,7 @@ def test_the_order_of_seats_changes_nothing(make_control: Maker, preset: str):
 
 
 @pytest.mark.parametrize("preset", ["dense", "coarser"])
-def test_missing_seats_are_counted(make_control: Maker, preset: str):
+def test_missing_seats_are_counted(make_control: ControlMaker, preset: str):
     """A dense control that does not get the whole scene says how much is missing."""
     weights = make_control(preset)
     look, fine = _look(weights, 24, 40)
@@ -95,7 +94,7 @@ def test_missing_seats_are_counted(make_control: Maker, preset: str):
         draw_with_control(weights, look, fine[seats], seats)
 
 
-def test_upsampled_needs_no_seat(make_control: Maker):
+def test_upsampled_needs_no_seat(make_control: ControlMaker):
     """With each seat or none, the map is the same."""
     weights = make_control("upsampled")
     look, fine = _look(weights, 24, 40)
@@ -104,7 +103,7 @@ def test_upsampled_needs_no_seat(make_control: Maker):
     assert (drawn[0].confidence == drawn[1].confidence).all()
 
 
-def test_pixels_without_a_value_are_the_median(make_control: Maker):
+def test_pixels_without_a_value_are_the_median(make_control: ControlMaker):
     """NaN and infinity count as 0, which is the median of a normalised column."""
     for preset in CONTROLS:
         weights = make_control(preset)
@@ -117,7 +116,7 @@ def test_pixels_without_a_value_are_the_median(make_control: Maker):
         assert (maps[0].confidence == maps[1].confidence).all()
 
 
-def test_what_does_not_fit_is_refused(make_control: Maker, tiny: Maker):
+def test_what_does_not_fit_is_refused(make_control: ControlMaker, tiny: Maker):
     """Weights of two scales, seats given twice or off the grid, and patches of another shape."""
     weights = make_control("paper")
     look, fine = _look(weights, 24, 40)
@@ -137,7 +136,7 @@ def _attention(q: Any, k: Any, v: Any, *args: Any, out_shape: Any = None, **kwar
 
 @pytest.mark.parametrize("sizes", [{"patch": 16, "factor": 4}, {"patch": 8, "factor": 2}, {"patch": 32, "factor": 4}])
 @pytest.mark.parametrize("preset", CONTROLS)
-def test_closed_forms_equal_the_counter(make_control: Maker, preset: str, sizes: dict[str, int]):
+def test_closed_forms_equal_the_counter(make_control: ControlMaker, preset: str, sizes: dict[str, int]):
     """The closed form counts just what torch counts while the map is drawn, at borders too."""
     weights = make_control(preset, layers=2, **sizes)
     step = sizes["patch"]
@@ -151,7 +150,7 @@ def test_closed_forms_equal_the_counter(make_control: Maker, preset: str, sizes:
     assert control_multiply_adds(weights.config, look.grid, len(seats), 0).total == counter.get_total_flops() / 2
 
 
-def test_bands_are_paid_for_what_is_looked_at(make_control: Maker):
+def test_bands_are_paid_for_what_is_looked_at(make_control: ControlMaker):
     """Gathering bands costs a product a band and column for each px that is read: fine, coarse or mean."""
     grid = SceneGrid(64, 96, 8, 4)
     looked_at = {"dense": 64 * 96, "upsampled": 16 * 24, "coarser": 32 * 48, "paper": 16 * 24 + 5 * 64}

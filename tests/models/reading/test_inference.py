@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -15,8 +14,8 @@ from models.reading.inference import Glance, glance, look_coarsely, read_glance,
 from models.weights.files import Weights
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import SceneGrid
+from tests.models.conftest import Maker
 
-Maker = Callable[..., Weights]
 NM = np.linspace(400, 1000, 9)
 NONE = np.empty(0, np.int64)
 
@@ -70,20 +69,6 @@ def test_without_a_seat_the_map_is_the_glance_brought_up(tiny: Maker):
     confidence, classes = (array.numpy()[:90, :70] for array in whole.max(dim=0))
     assert np.abs(drawn.confidence - confidence).max() <= 1e-6
     assert (drawn.classes == classes).mean() > 0.999  # a tie may fall either way
-
-
-def test_the_survey_draws_what_training_saw(tiny: Maker):
-    """Inference in steps and chunks gives the composite that the loss of training is taken of."""
-    weights = tiny()
-    seen, fine = _look(weights, 32, 48)
-    seats = np.array([5, 0, 17, 23, 9])
-    drawn = segment(weights, seen, fine[seats], seats)
-    model, numbers = weights.segmenter, torch.from_numpy(seats)[None]
-    with torch.inference_mode():
-        patches = torch.from_numpy(fine[seats]).permute(0, 3, 1, 2)[None]
-        coarse = torch.from_numpy(seen.columns).permute(2, 0, 1)[None]
-        logits = model.composite(*model(coarse, patches, numbers), numbers)[0].softmax(dim=0)
-    assert np.abs(drawn.confidence - logits.max(dim=0)[0].numpy()).max() <= 1e-5
 
 
 def test_patches_lie_at_their_seats(tiny: Maker):
@@ -196,18 +181,18 @@ def test_strips_that_do_not_make_the_mosaic_are_refused(tiny: Maker, rows: list[
 
 
 @pytest.mark.parametrize("positions", ["2d", "paper"])
-def test_a_region_has_the_places_that_crops_have_in_training(tiny: Maker, positions: str):
-    """A look with an origin is read as the training's forward reads a crop with that origin."""
+@pytest.mark.parametrize("origin", [(0, 0), (12, 40)])
+def test_a_region_is_drawn_as_training_saw_crops(tiny: Maker, positions: str, origin: tuple[int, int]):
+    """Reading in steps and chunks gives the composite that the loss of training is taken of, at the same places."""
     weights = tiny(positions=positions)
     seen, fine = _look(weights, 32, 48)
-    moved, seats = replace(seen, origin=(12, 40)), np.array([5, 0, 17])
+    moved, seats = replace(seen, origin=origin), np.array([5, 0, 17, 23, 9])
     drawn, model = segment(weights, moved, fine[seats], seats), weights.segmenter
     with torch.inference_mode():
         columns = torch.from_numpy(seen.columns).permute(2, 0, 1)[None]
-        origin, numbers = torch.tensor([[12, 40]]), torch.from_numpy(seats)[None]
-        patches = torch.from_numpy(fine[seats]).permute(0, 3, 1, 2)[None]
-        coarse, detail = model(columns, patches, numbers, origin)
+        numbers, patches = torch.from_numpy(seats)[None], torch.from_numpy(fine[seats]).permute(0, 3, 1, 2)[None]
+        coarse, detail = model(columns, patches, numbers, torch.tensor([origin]))
         confidence = model.composite(coarse, detail, numbers)[0].softmax(dim=0).max(dim=0).values.numpy()
     assert np.abs(drawn.confidence - confidence).max() <= 1e-5
     same = (drawn.confidence == segment(weights, seen, fine[seats], seats).confidence).all()
-    assert same == (positions == "paper")
+    assert same == (positions == "paper" or origin == (0, 0))

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from models.network.segmenter import SegmenterConfig
+from models.network.sizes import PRESETS, SegmenterConfig
 from models.training.examples import Example
-from models.training.train import Progress, TrainingSettings, run_identity, train
+from models.training.train import TrainingSettings, run_identity, train
 from models.weights.sealed_files import load_checkpoint, save_checkpoint
 from pipeline.errors import WeightsError
+from tests.models.conftest import killed_after
 
 CONFIG = SegmenterConfig(classes=2, columns=2, patch=8, factor=2, width=8, dim=16, layers=1, heads=2)
 SETTINGS = TrainingSettings(steps=6, batch=2, crop=16)
@@ -26,16 +27,6 @@ def example(seed: int = 1) -> Example:
     fine = np.random.default_rng(seed).normal(0, 1, (32, 32, 2))
     coarse = fine.reshape(16, 2, 16, 2, 2).mean(axis=(1, 3)).astype(np.float32)
     return Example("e", fine.astype(np.float16), coarse, (fine[..., 0] > 0).astype(np.uint8), (32, 32))
-
-
-def killed_after(step: int):
-    """A report that ends the process, as far as training can tell, after some steps."""
-
-    def report(now: Progress) -> None:
-        if now.step == step:
-            raise KeyboardInterrupt
-
-    return report
 
 
 def left_behind(file: Path, identity: str) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
@@ -67,6 +58,8 @@ def test_another_run_starts_from_the_beginning(tmp_path: Path) -> None:
     file = tmp_path / "c"
     with pytest.raises(KeyboardInterrupt):
         train(CONFIG, [example()], SHIFT, SETTINGS, killed_after(4), checkpoint=file, keep_every_s=0)
+    kinds = [run_identity(replace(CONFIG, **sizes), [example()], SETTINGS) for sizes in PRESETS.values()]
+    assert len(set(kinds)) == len(PRESETS)
     for settings, scene in ((replace(SETTINGS, seed=7), example()), (SETTINGS, example(2))):
         steps: list[int] = []
         train(CONFIG, [scene], SHIFT, settings, lambda now, s=steps: s.append(now.step), checkpoint=file)

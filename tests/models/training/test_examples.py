@@ -9,6 +9,7 @@ import pytest
 from torch import Tensor
 
 from models.network.spectral import SpectralBasis
+from models.training import examples
 from models.training.examples import CropSampler, Example, Observation, measured_normalisation, normalised, observe
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera, look
@@ -172,3 +173,14 @@ def test_equal_generators_draw_equal_crops():
     assert (first.fine == same.fine).all()
     assert (first.origin == same.origin).all()
     assert (first.origin != other.origin).any()
+
+
+def test_a_coarse_pixel_has_the_noise_of_more_light(monkeypatch: pytest.MonkeyPatch):
+    """It gathers ``factor`` times the light of a fine one: its noise is that of the fine look over the root of it."""
+    monkeypatch.setattr(examples, "NOISY", 1.0)
+    sampler = CropSampler([replace(_example((64, 64)), labels=np.zeros((64, 64), np.uint8))], 8, 4, 64, noise=1.0)
+    flat = sampler.examples[0]
+    flat.fine[:], flat.coarse[:] = 0, 0
+    for seed in range(3):
+        batch = sampler.draw(1, np.random.default_rng(seed), np.zeros(1, np.float32))
+        assert batch.fine.std() / batch.coarse.std() == pytest.approx(2, rel=0.1)

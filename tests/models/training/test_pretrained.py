@@ -1,21 +1,17 @@
-"""Other people's weights into our modules: what matched, what was skipped and why."""
+"""Other people's weights into our modules: what matched, what was skipped and why, kernels fitted to other bands."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor, nn
 
-from models.network.sizes import VggSizes
-from models.policies.vgg import VggFeatures, load_vgg
-from models.training.pretrained import load_into
-from models.weights.state_files import read_state
+from models.network.spectral import SpectralBasis
+from models.training.pretrained import load_into, map_rgb_kernel, resize_patch_kernel, rgb_response
 from pipeline.errors import WeightsError
-
-NARROW = VggSizes(widths=(4, 6, 8, 10, 10))
+from tests.models.conftest import noise
 
 
 class Block(nn.Module):
@@ -116,64 +112,36 @@ def test_nothing_that_fits_is_an_error_and_changes_nothing():
     assert all(torch.equal(value, before[name]) for name, value in module.state_dict().items())
 
 
-def test_vgg_is_read_from_torch_files_and_safetensors(tmp_path):
-    """Both give the same network, frozen, and the classifier is reported as skipped."""
-    from safetensors.torch import save_file
-
-    state = VggFeatures(NARROW).state_dict() | {"classifier.0.weight": torch.zeros(3, 3)}
-    torch.save(state, tmp_path / "vgg.pth")
-    save_file(state, tmp_path / "vgg.safetensors")
-    for name in ("vgg.pth", "vgg.safetensors"):
-        network, report = load_vgg(tmp_path / name, NARROW)
-        assert (len(report.matched), list(report.skipped)) == (32, ["classifier.0.weight"])
-        assert not any(value.requires_grad for value in network.parameters())
-        assert all(torch.equal(value, state[key]) for key, value in network.state_dict().items())
+def test_colours_look_at_their_wavelengths():
+    """Each colour weighs most the column nearest to it, and the weights of a colour sum to 1."""
+    response = rgb_response(SpectralBasis(400.0, 1000.0, 25))  # a column every 25 nm
+    assert response.argmax(axis=1).tolist() == [10, 6, 2]
+    assert response.sum(axis=1) == pytest.approx([1, 1, 1])
 
 
-def test_another_network_is_no_vgg19(tmp_path):
-    """VGG16's file lacks convolutions, batch normalisation moves them, a transformer has none: each is refused."""
-    sixteen = VggFeatures(VggSizes((2, 2, 3, 3, 3), NARROW.widths)).state_dict()
-    torch.save(sixteen, tmp_path / "vgg16.pth")
-    with pytest.raises(WeightsError, match=r"vgg16.pth lacks \d+ of 32 tensors of VGG19's convolutions"):
-        load_vgg(tmp_path / "vgg16.pth", NARROW)
-    torch.save(photographs(), tmp_path / "vit.pth")
-    with pytest.raises(WeightsError, match="none of 32 tensors fits"):
-        load_vgg(tmp_path / "vit.pth", NARROW)
-    assert read_state(tmp_path / "vit.pth").keys() == photographs().keys()
+@pytest.mark.parametrize(("low", "high", "columns"), [(660.0, 800.0, 2), (900.0, 2500.0, 24), (700.0, 700.0, 1)])
+def test_colours_outside_the_data_take_the_nearest_end(low: float, high: float, columns: int):
+    """Every colour is seen in something, whatever the wavelengths."""
+    response = rgb_response(SpectralBasis(low, high, columns))
+    assert np.isfinite(response).all()
+    assert response.argmax(axis=1).tolist() == [0, 0, 0]
+    assert response.sum(axis=1) == pytest.approx([1, 1, 1])
 
 
-def test_a_trained_vgg_may_read_other_channels(tmp_path):
-    """As many as its first convolution has, at the wavelengths that its file names; one of photographs has three."""
-    sizes = replace(NARROW, channels=5)
-    state = VggFeatures(sizes).state_dict()
-    torch.save(state, tmp_path / "five.pth")
-    network, report = load_vgg(tmp_path / "five.pth", NARROW, trained=True)
-    assert (network.sizes, network.wavelength_nm, len(report.matched)) == (sizes, None, 32)
-    with pytest.raises(WeightsError, match=r"five\.pth reads 5 channels.* 3; .* is for the policy vgg-trained"):
-        load_vgg(tmp_path / "five.pth", NARROW)
-    bare = {name.removeprefix("features."): value for name, value in state.items()}
-    torch.save(bare | {"wavelength_nm": torch.linspace(500, 900, 5)}, tmp_path / "named.pth")
-    network, report = load_vgg(tmp_path / "named.pth", NARROW, trained=True)
-    assert network.wavelength_nm == (500.0, 600.0, 700.0, 800.0, 900.0)
-    assert report.skipped == {}
+def test_a_mapped_kernel_sees_what_the_old_one_saw_of_the_mixed_colours():
+    """Mixing columns to colours first and mapping the kernel are the same; grey stays grey."""
+    response = rgb_response(SpectralBasis(400.0, 1000.0, 12))
+    kernel, columns = noise(0, 5, 3, 3, 3), noise(1, 1, 12, 9, 9)
+    mapped = map_rgb_kernel(kernel, response)
+    colours = torch.einsum("bjyx,cj->bcyx", columns, torch.from_numpy(response))
+    torch.testing.assert_close(F.conv2d(columns, mapped), F.conv2d(colours, kernel), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(mapped.sum(dim=1), kernel.sum(dim=1), rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("named", [torch.ones(4), torch.tensor([0.5] * 5), torch.full((5,), np.nan), torch.tensor(3.0)])
-def test_wavelengths_that_do_not_belong_to_the_channels_are_refused(tmp_path, named: Tensor):
-    """Another number of them, micrometres, or none at all: the message names file and tensor."""
-    state = VggFeatures(replace(NARROW, channels=5)).state_dict()
-    torch.save(state | {"wavelength_nm": named}, tmp_path / "v.pth")
-    with pytest.raises(WeightsError, match=r"v\.pth, tensor 'wavelength_nm': .*wavelength"):
-        load_vgg(tmp_path / "v.pth", NARROW, trained=True)
-
-
-@pytest.mark.parametrize("channels", [1, 4])
-def test_a_mixing_convolution_of_other_channels_is_no_vgg19(tmp_path, channels: int):
-    """The normalised variant begins with three colours; anything else there is refused, whoever trained it."""
-    state = {"0.weight": torch.ones(3, channels, 1, 1), "0.bias": torch.ones(3)}
-    for number, place in enumerate(NARROW.places):
-        layer = VggFeatures(NARROW).features[place]
-        state |= {f"{3 * number + 2}.weight": layer.weight, f"{3 * number + 2}.bias": layer.bias}
-    torch.save(state, tmp_path / "v.pth")
-    with pytest.raises(WeightsError, match=r"v\.pth (is no VGG19|lacks \d+ of 32)"):
-        load_vgg(tmp_path / "v.pth", NARROW, trained=True)
+def test_a_larger_patch_kernel_answers_enlarged_patches_alike():
+    """The pseudo-inverse of bilinear enlarging: the answer to the enlarged patch is the old one."""
+    kernel, patch = noise(2, 6, 3, 8, 8), noise(3, 1, 3, 8, 8)
+    larger = F.interpolate(patch, size=(16, 16), mode="bilinear", align_corners=False)
+    answer = F.conv2d(larger, resize_patch_kernel(kernel, (16, 16)))
+    torch.testing.assert_close(answer, F.conv2d(patch, kernel), rtol=1e-3, atol=1e-3)
+    assert resize_patch_kernel(kernel, (4, 4)).shape == (6, 3, 4, 4)

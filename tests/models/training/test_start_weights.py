@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from models.training.pretrained import mixed_channels, rgb_response
 from models.training.start_weights import StartFile, TokenSizes, column_change
 from models.weights.files import Weights, save_weights, with_record
 from pipeline.errors import SettingsError, WeightsError
+from tests.models.conftest import Maker
 
 DIM, HEADS = 128, 2
 CONFIG = SegmenterConfig(
@@ -162,7 +162,7 @@ def test_a_patch_kernel_of_colours_reads_columns(tmp_path: Path, patch: int, siz
         torch.testing.assert_close(difference, kernel(columns).flatten(2).transpose(1, 2), rtol=1e-3, atol=1e-3)
 
 
-def test_a_patch_kernel_goes_on_in_weights_of_ours(tmp_path: Path, tiny: Callable[..., Weights]):
+def test_a_patch_kernel_goes_on_in_weights_of_ours(tmp_path: Path, tiny: Maker):
     """Weights with one are taken whole again; those without one have none, and say nothing of it in their file."""
     weights = tiny(patch=16, patch_kernel=True)
     file = _kept(weights, tmp_path / "w.safetensors")
@@ -223,7 +223,7 @@ def _kept(weights: Weights, path: Path) -> StartFile:
     return StartFile(path)
 
 
-def test_earlier_weights_of_the_same_data_are_taken_whole(tmp_path: Path, tiny: Callable[..., Weights]):
+def test_earlier_weights_of_the_same_data_are_taken_whole(tmp_path: Path, tiny: Maker):
     """Every tensor of the segmenter is copied exactly, the scorer's included, and nothing is missing."""
     weights = tiny(1)
     file = _kept(with_record(weights, licence="non-commercial"), tmp_path / "w.safetensors")
@@ -237,7 +237,7 @@ def test_earlier_weights_of_the_same_data_are_taken_whole(tmp_path: Path, tiny: 
     assert file.earlier["seed"] == 1
 
 
-def test_other_classes_leave_their_heads_fresh(tmp_path: Path, tiny: Callable[..., Weights]):
+def test_other_classes_leave_their_heads_fresh(tmp_path: Path, tiny: Maker):
     """Same number or not: what tells classes apart, and the scorer that reads it, begin anew."""
     weights = tiny(2)
     file = _kept(weights, tmp_path / "w.safetensors")
@@ -250,7 +250,7 @@ def test_other_classes_leave_their_heads_fresh(tmp_path: Path, tiny: Callable[..
         assert not any(name.split(".")[0] in fresh for name in start.state)
 
 
-def test_the_licence_goes_on(tmp_path: Path, tiny: Callable[..., Weights]):
+def test_the_licence_goes_on(tmp_path: Path, tiny: Maker):
     """Weights begun from some with a licence pass it on to what is begun from them."""
     weights = with_record(tiny(), begun_from={"file": "x", "licence": "CC BY-NC"})
     start = _kept(weights, tmp_path / "w.safetensors").begin(
@@ -259,7 +259,7 @@ def test_the_licence_goes_on(tmp_path: Path, tiny: Callable[..., Weights]):
     assert start.record["licence"] == "CC BY-NC"
 
 
-def test_other_columns_are_reached_by_wavelength(tmp_path: Path, tiny: Callable[..., Weights]):
+def test_other_columns_are_reached_by_wavelength(tmp_path: Path, tiny: Maker):
     """First kernels are brought to the new number of columns and are no larger; the report says so."""
     weights = tiny(3)
     file = _kept(weights, tmp_path / "w.safetensors")

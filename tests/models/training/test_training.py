@@ -9,15 +9,18 @@ import pytest
 import torch
 from torch import Tensor
 
+from models.network.controls import build_network
 from models.network.segmenter import Segmenter, SegmenterConfig
+from models.network.sizes import PRESETS, Preset
 from models.training import objective
 from models.training import train as training
-from models.training.examples import CropSampler, Example
+from models.training.examples import CropSampler
 from models.training.objective import (
     PHASES,
     SHARES,
     batch_loss,
     class_weights,
+    draw_paper_seats,
     draw_seats,
     map_loss,
     phase_at,
@@ -25,40 +28,36 @@ from models.training.objective import (
 )
 from models.training.train import Progress, TrainingError, TrainingSettings, rate_at, train
 from pipeline.errors import PipelineError, WeightsError
+from tests.models.conftest import block_example
 
 CONFIG = SegmenterConfig(classes=3, columns=2, patch=8, factor=2, width=8, dim=16, layers=1, heads=2)
 SETTINGS = TrainingSettings(steps=6, batch=2, crop=16, learning_rate=3e-3)
 SHIFT = np.zeros(2, np.float32)
 
 
-def _example(share: float = 1.0, size: int = 32) -> Example:
-    """Two classes told apart by the first column, with noise in the second."""
-    rng = np.random.default_rng(4)
-    labels = np.kron(rng.integers(0, 2, (size // 8, size // 8)), np.ones((8, 8))).astype(np.uint8)
-    fine = np.stack([2.0 * labels - 1, rng.normal(0, 1, labels.shape)], axis=-1)
-    coarse = fine.reshape(size // 2, 2, size // 2, 2, 2).mean(axis=(1, 3))
-    labels[rng.random(labels.shape) >= share] = 255
-    return Example("e", fine.astype(np.float16), coarse.astype(np.float32), labels, labels.shape)
-
-
-def test_training_learns():
-    """Forty small steps bring the loss of two easily told classes down to a third."""
+@pytest.mark.parametrize("preset", PRESETS)
+def test_training_learns(preset: Preset):
+    """Sixty small steps bring the loss of two easily told classes down to less than two thirds."""
     losses: list[float] = []
-    settings = replace(SETTINGS, steps=40, learning_rate=1e-2)
-    model, summary = train(CONFIG, [_example()], SHIFT, settings, lambda now: losses.append(now.loss))
-    batch = CropSampler([_example()], 8, 2, 16).draw(8, np.random.default_rng(0), SHIFT)
-    weight = class_weights([_example()], 3, 5.0)
+    scene, settings = block_example(64, 16), replace(SETTINGS, steps=60, crop=32, learning_rate=1e-2)
+    model, summary = train(
+        replace(CONFIG, **PRESETS[preset]), [scene], SHIFT, settings, lambda now: losses.append(now.loss)
+    )
+    batch = CropSampler([scene], 8, 2, 32).draw(8, np.random.default_rng(0), SHIFT)
+    weight = class_weights([scene], 3, 5.0)
     with torch.no_grad():
         last = batch_loss(model, batch, weight, np.random.default_rng(0), phase_at(0.0), soft_dice=False)
-    assert last < losses[0] / 3
-    assert summary["steps"] == 40
-    assert summary["skipped_steps"] == 0
+    assert last < losses[0] / (3 if preset == "two-scale" else 1.5)
+    assert (summary["steps"], summary["skipped_steps"]) == (60, 0)
+    assert (model.config.preset, model.training) == (preset, False)
 
 
 def test_equal_seeds_give_equal_weights_and_leave_global_streams_alone():
     """Weights follow from the settings, to rounding; torch's and numpy's own streams are as they were."""
     torch_before, numpy_before = torch.random.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
-    first, same, other = (train(CONFIG, [_example()], SHIFT, replace(SETTINGS, seed=seed))[0] for seed in (3, 3, 4))
+    first, same, other = (
+        train(CONFIG, [block_example()], SHIFT, replace(SETTINGS, seed=seed))[0] for seed in (3, 3, 4)
+    )
     assert torch.equal(torch.random.get_rng_state(), torch_before)
     assert (np.random.get_state()[1] == numpy_before).all()  # noqa: NPY002
     weights = [torch.cat([value.flatten() for value in model.parameters()]) for model in (first, same, other)]
@@ -70,7 +69,7 @@ def test_equal_seeds_give_equal_weights_and_leave_global_streams_alone():
 @pytest.mark.parametrize(("crop", "last"), [(48, (2, 64)), (64, (4, 64)), (16, (4, 16))])
 def test_batches_are_halved_where_crops_grow(crop: int, last: tuple[int, int]):
     """The last phase has larger crops and fewer of them; where scenes have no larger ones, as many as before."""
-    trainer = training.Trainer(CONFIG, [_example(size=64)], SHIFT, replace(SETTINGS, batch=4, crop=crop))
+    trainer = training.Trainer(CONFIG, [block_example(64)], SHIFT, replace(SETTINGS, batch=4, crop=crop))
     sizes = []
     for done in (0.1, 0.9):
         trainer.step(done)
@@ -82,7 +81,7 @@ def test_batches_are_halved_where_crops_grow(crop: int, last: tuple[int, int]):
 def test_progress_runs_to_the_end():
     """Every step reports itself and how far the run is, by steps here."""
     seen: list[Progress] = []
-    train(CONFIG, [_example()], SHIFT, SETTINGS, seen.append)
+    train(CONFIG, [block_example()], SHIFT, SETTINGS, seen.append)
     assert [now.step for now in seen] == [1, 2, 3, 4, 5, 6]
     assert [now.done for now in seen] == pytest.approx([step / 6 for step in range(6)], abs=1e-6)
     assert all(np.isfinite(now.loss) for now in seen)
@@ -93,7 +92,7 @@ def test_minutes_end_a_run(monkeypatch: pytest.MonkeyPatch):
     clock = iter(range(0, 10_000, 30))
     monkeypatch.setattr(training.time, "monotonic", lambda: next(clock))
     seen: list[Progress] = []
-    _, summary = train(CONFIG, [_example()], SHIFT, replace(SETTINGS, steps=1000, minutes=2.5), seen.append)
+    _, summary = train(CONFIG, [block_example()], SHIFT, replace(SETTINGS, steps=1000, minutes=2.5), seen.append)
     assert len(seen) == summary["steps"] == 3
     assert seen[-1].done == pytest.approx(0.8)
 
@@ -113,7 +112,7 @@ def _spoilt(monkeypatch: pytest.MonkeyPatch, bad: set[int], value: float = float
 def test_steps_without_a_finite_loss_are_skipped(monkeypatch: pytest.MonkeyPatch, value: float):
     """Two bad steps in a row are counted and leave finite weights and a finite loss to report."""
     _spoilt(monkeypatch, {1, 3, 4}, value)
-    model, summary = train(CONFIG, [_example()], SHIFT, SETTINGS)
+    model, summary = train(CONFIG, [block_example()], SHIFT, SETTINGS)
     assert summary["skipped_steps"] == 3
     assert np.isfinite(summary["last_loss"])
     assert all(parameter.isfinite().all() for parameter in model.parameters())
@@ -123,7 +122,7 @@ def test_three_bad_steps_in_a_row_end_training(monkeypatch: pytest.MonkeyPatch):
     """The message names the steps and what to do; the command line shows it as any other error."""
     _spoilt(monkeypatch, {2, 3, 4})
     with pytest.raises(TrainingError, match="not finite in steps 2 to 4; lower the learning rate"):
-        train(CONFIG, [_example()], SHIFT, SETTINGS)
+        train(CONFIG, [block_example()], SHIFT, SETTINGS)
     assert issubclass(TrainingError, PipelineError)
 
 
@@ -149,11 +148,11 @@ def test_rare_classes_weigh_more():
     """Weights go by one over the root of the share, with mean 1 over pixels; a class without a pixel has none."""
     labels = np.full((10, 10), 255, np.uint8)
     labels[:8], labels[8:9, :8], labels[9:, :0] = 0, 1, 2
-    weight = class_weights([replace(_example(), labels=labels)], 3, 100.0).numpy()
+    weight = class_weights([replace(block_example(), labels=labels)], 3, 100.0).numpy()
     assert weight[1] / weight[0] == pytest.approx(np.sqrt(10))
     assert (80 * weight[0] + 8 * weight[1]) / 88 == pytest.approx(1)
     assert weight[2] == 0
-    assert class_weights([replace(_example(), labels=labels)], 3, 2.0).max() == 2
+    assert class_weights([replace(block_example(), labels=labels)], 3, 2.0).max() == 2
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -237,7 +236,7 @@ def test_the_scorer_is_told_of_labelled_seats_alone(monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr(objective, "scoring_loss", scoring)
     monkeypatch.setattr(objective, "draw_seats", lambda *_: torch.arange(4)[None])
-    batch = CropSampler([_example()], 8, 2, 16).draw(1, np.random.default_rng(0), SHIFT)
+    batch = CropSampler([block_example()], 8, 2, 16).draw(1, np.random.default_rng(0), SHIFT)
     batch.labels[:] = 255
     batch.labels[0, 3, 12] = 1
     with torch.no_grad():
@@ -250,4 +249,32 @@ def test_the_scorer_is_told_of_labelled_seats_alone(monkeypatch: pytest.MonkeyPa
 def test_a_start_that_has_no_place_is_refused():
     """A tensor of another network is not passed over in silence."""
     with pytest.raises(WeightsError, match=r"two-scale has no place for 1 tensors, the first encoder\.extra"):
-        train(CONFIG, [_example()], SHIFT, SETTINGS, start={"encoder.extra": torch.zeros(1)})
+        train(CONFIG, [block_example()], SHIFT, SETTINGS, start={"encoder.extra": torch.zeros(1)})
+
+
+@pytest.mark.parametrize("preset", ["dense", "coarser", "upsampled"])
+def test_dense_controls_draw_no_chance(preset: Preset):
+    """They read each seat, whatever the generator says: two streams give one loss."""
+    batch = CropSampler([block_example(64, 16)], 8, 2, 32).draw(2, np.random.default_rng(0), SHIFT)
+    model, streams = build_network(replace(CONFIG, **PRESETS[preset])), map(np.random.default_rng, (0, 1))
+    first, other = (batch_loss(model, batch, torch.ones(3), rng, phase_at(0.0), soft_dice=True) for rng in streams)
+    assert first == other
+    assert first.requires_grad
+
+
+def test_paper_seats_are_distinct_and_sometimes_none():
+    """Every share of the segmenter's training occurs, no seat twice in a scene; some crops get no seat."""
+    coarse = torch.randn(3, 2, 32, 32, generator=torch.Generator().manual_seed(0))
+    drawn = [draw_paper_seats(coarse, 64, CONFIG, np.random.default_rng(seed)) for seed in range(80)]
+    assert {row.shape[1] for row in drawn} == {0, *(round(64 * share) for share, _ in SHARES)}
+    assert all(len(scene.unique()) == len(scene) for row in drawn for scene in row)
+    assert {int(row.max()) for row in drawn if row.numel()} <= set(range(64))
+
+
+def test_half_of_the_papers_seats_lie_on_edges():
+    """With one edge in the coarse image, about half of the draws begin with a seat that touches it."""
+    coarse = torch.zeros(1, 2, 32, 32)
+    coarse[..., 18:] = 1.0  # an edge between columns 17 and 18: seats of column 4
+    drawn = (draw_paper_seats(coarse, 64, CONFIG, np.random.default_rng(seed)) for seed in range(80))
+    first = [int(row[0, 0]) % 8 == 4 for row in drawn if row.numel()]
+    assert 0.35 < np.mean(first) < 0.75

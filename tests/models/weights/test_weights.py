@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import struct
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,14 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from models.reading.inference import glance
+from models.network.sizes import PRESETS, Preset
 from models.weights.files import (
     FORMAT,
     UNSEALED,
     Weights,
+    check_two_scale,
     content_key,
     describe_weights,
     load_any_weights,
@@ -31,9 +30,7 @@ from models.weights.files import (
 )
 from models.weights.sealed_files import SEAL, TENSORS
 from pipeline.errors import WeightsError
-from pipeline.geometry.grid import SceneGrid
-
-Maker = Callable[..., Weights]
+from tests.models.conftest import Maker, make_any_weights
 
 
 def _about(path: Path) -> dict[str, Any]:
@@ -57,29 +54,22 @@ def saved(tiny: Maker, tmp_path: Path) -> Path:
     return tmp_path / "w.safetensors"
 
 
-def test_everything_comes_back_bit_by_bit(tiny: Maker, saved: Path):
-    """Parameters, basis, normalisation, classes, colours and record are those that were saved."""
-    before, after = tiny(), load_weights(saved)
-    old, new = before.segmenter.state_dict(), after.segmenter.state_dict()
+@pytest.mark.parametrize("preset", PRESETS)
+def test_everything_comes_back_bit_by_bit(tmp_path: Path, preset: Preset):
+    """Parameters, basis, normalisation, classes, colours and record of any design are those that were saved."""
+    path, before = tmp_path / "w.safetensors", make_any_weights(**PRESETS[preset])
+    save_weights(before, path)
+    after, described = load_any_weights(path), describe_weights(path)
+    old, new = before.network.state_dict(), after.network.state_dict()
     assert list(old) == list(new)
     assert all(torch.equal(old[name], new[name]) for name in old)
-    assert (after.config, after.basis, after.class_names, after.record) == (
-        before.config,
-        before.basis,
-        before.class_names,
-        before.record,
-    )
+    for one in (after, described):
+        told = (one.config, one.basis, one.class_names, one.record)
+        assert told == (before.config, before.basis, before.class_names, before.record)
     for name in ("centre", "spread", "whitening"):
         assert (getattr(after.normalisation, name) == getattr(before.normalisation, name)).all()
     assert (after.class_colours == before.class_colours).all()
-    assert not after.segmenter.training
-
-
-def test_loaded_weights_draw_the_same(tiny: Maker, saved: Path):
-    """A glance through loaded weights equals that through the original ones, bit by bit."""
-    values, nm = np.random.default_rng(0).uniform(0.1, 0.5, (16, 8, 7)), np.linspace(420, 980, 7)
-    first, second = (glance(weights, values, nm, SceneGrid(32, 16, 8, 2)) for weights in (tiny(), load_weights(saved)))
-    assert (first.probability == second.probability).all()
+    assert (isinstance(after, Weights), after.network.training) == (preset == "two-scale", False)
 
 
 def test_saving_twice_gives_equal_files(tiny: Maker, saved: Path, tmp_path: Path):
@@ -123,17 +113,13 @@ def test_a_missing_file_says_how_to_make_one(tmp_path: Path):
         load_weights(tmp_path / "gone.safetensors")
 
 
-@pytest.mark.parametrize("keep", [0, 5, 400, -100])
-def test_a_file_cut_short_is_not_readable(saved: Path, keep: int):
-    """A file that ends early is named, whatever is left of it."""
-    saved.write_bytes(saved.read_bytes()[:keep])
-    with pytest.raises(WeightsError, match="not a readable safetensors file"):
-        load_weights(saved)
-
-
-def test_a_pickle_is_never_opened(saved: Path, tiny: Maker):
-    """A file of torch's own kind is refused without being unpickled."""
-    torch.save(tiny().segmenter.state_dict(), saved)
+@pytest.mark.parametrize("keep", [0, 5, 400, -100, None])
+def test_what_is_no_whole_file_is_not_readable(saved: Path, keep: int | None):
+    """A file that ends early is named, whatever is left of it, and so is torch's own kind: no pickle is opened."""
+    if keep is None:
+        torch.save({"a": torch.zeros(1)}, saved)
+    else:
+        saved.write_bytes(saved.read_bytes()[:keep])
     with pytest.raises(WeightsError, match="not a readable safetensors file"):
         load_weights(saved)
 
@@ -215,14 +201,6 @@ def test_a_write_that_fails_leaves_the_old_file(tiny: Maker, saved: Path, monkey
     assert [path.name for path in saved.parent.iterdir()] == ["w.safetensors"]
 
 
-def test_a_description_is_what_the_weights_say(saved: Path):
-    """Read without the tensors: sizes, basis, classes and record are those of the weights themselves."""
-    described, weights = describe_weights(saved), load_weights(saved)
-    assert described.config == weights.config
-    assert (described.basis, described.class_names) == (weights.basis, weights.class_names)
-    assert described.record == weights.record
-
-
 def _flipped(path: Path, place: int, bit: int) -> None:
     raw = bytearray(path.read_bytes())
     raw[place] ^= 1 << bit
@@ -242,21 +220,6 @@ def test_a_description_that_was_changed_is_refused(saved: Path):
     saved.write_bytes(raw.replace(b"class 1", b"class 3"))
     with pytest.raises(WeightsError, match="is damaged: its description is not what was written"):
         describe_weights(saved)
-
-
-def test_tensors_of_other_weights_are_refused(tiny: Maker, saved: Path, tmp_path: Path):
-    """Tensors of the right shapes that the hashes are not of."""
-    save_weights(tiny(1), tmp_path / "other.safetensors")
-    about = json.loads((_metadata(saved))["about"])
-    save_file(load_file(tmp_path / "other.safetensors"), saved, {"about": json.dumps(about)})
-    with pytest.raises(WeightsError, match=r"is damaged: tensor \S+ is not what was written"):
-        load_weights(saved)
-
-
-def _metadata(path: Path) -> dict[str, str]:
-    with safe_open(path, framework="np") as file:
-        found: dict[str, str] = file.metadata()
-    return found
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
@@ -326,3 +289,14 @@ def test_what_is_damaged_is_not_sealed(saved: Path):
     with pytest.raises(WeightsError, match="not finite"):
         seal_weights(saved)
     assert saved.read_bytes() == before
+
+
+@pytest.mark.parametrize("preset", [preset for preset in PRESETS if preset != "two-scale"])
+def test_a_survey_refuses_a_control(preset: Preset, tmp_path: Path):
+    """The message names the file, the control in it, and how weights for a survey are made."""
+    path = tmp_path / "w.safetensors"
+    save_weights(make_any_weights(**PRESETS[preset]), path)
+    with pytest.raises(WeightsError, match=f"w.safetensors holds the control '{preset}'.*spectralzoom train DATASET"):
+        load_weights(path)
+    with pytest.raises(WeightsError, match="a survey needs weights of two scales"):
+        check_two_scale(describe_weights(path).config, path)

@@ -1,0 +1,184 @@
+"""The gain oracle, what placements are worth beside it, and the rows of other placements."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from models.evaluation.metrics import agreement, confusion, mean_iou
+from models.evaluation.placement import (
+    RANDOM_DRAWS,
+    Controls,
+    average_precision,
+    captured_gain,
+    gain_sums,
+    oracle_gain,
+    rank_correlation,
+    run_controls,
+    top_seats,
+)
+from models.reading.inference import Glance, glance_of_columns, segment
+from models.weights.files import Weights
+from tests.models.conftest import Maker, scene_columns
+
+
+def _two_classes(tiny: Maker, height: int = 24, width: int = 32):
+    weights = tiny(classes=2)
+    look, fine = scene_columns(weights, height, width)
+    seen = glance_of_columns(weights, look.columns, look.grid)
+    return weights, look.grid, seen, fine, np.random.default_rng(0).integers(0, 2, (height, width)).astype(np.uint8)
+
+
+def test_the_gain_is_the_loss_that_all_seats_take_away(tiny: Maker):
+    """With two classes a map's confidence gives its loss: the gain is the difference of the two maps' losses."""
+    weights, grid, seen, fine, labels = _two_classes(tiny)
+    valid = grid.valid_seats()
+
+    def loss(seats: np.ndarray) -> np.ndarray:
+        drawn = segment(weights, seen, fine[seats], seats)
+        right = np.where(drawn.classes == labels, drawn.confidence, 1 - drawn.confidence)
+        full = np.zeros(grid.padded_shape)
+        full[: grid.height, : grid.width] = -np.log(right.astype(np.float64))
+        rows, columns = grid.seat_shape
+        return full.reshape(rows, 8, columns, 8).mean(axis=(1, 3)).ravel()
+
+    expected = loss(np.empty(0, np.intp)) - loss(valid)
+    assert oracle_gain(weights, seen, fine, labels)[valid] == pytest.approx(expected[valid], abs=1e-4)
+
+
+def test_what_has_no_label_has_no_gain(tiny: Maker):
+    """A seat without a labelled pixel gains nothing, and one half labelled half as much at most."""
+    weights, grid, seen, fine, labels = _two_classes(tiny, 20, 30)
+    labels[:8, :8] = 255
+    gain = oracle_gain(weights, seen, fine, labels)
+    outside = np.setdiff1d(np.arange(len(gain)), grid.valid_seats())
+    assert gain[0] == 0
+    assert (gain[outside] == 0).all()
+    assert gain.any()
+    assert (np.abs(gain) <= 5).all()
+
+
+@given(st.lists(st.integers(-16, 24).map(lambda n: n / 8), min_size=1, max_size=20), st.integers(0, 20))
+def test_the_oracle_captures_all_of_its_own_gain(values: list[float], count: int):
+    """The seats with the most gain have a ratio of 1, where there is any to be had, and no others have more."""
+    gain, valid = np.array(values), np.arange(len(values))
+    chosen = np.flatnonzero(top_seats(gain, count))
+    own, best = gain_sums(gain, chosen, valid)
+    assert own == pytest.approx(best)
+    last, _ = gain_sums(gain, np.arange(len(chosen)), valid)
+    assert last <= best + 1e-9
+    assert captured_gain(own, best) in (None, pytest.approx(1))
+
+
+def test_precision_by_hand():
+    """Positives at ranks 1 and 3: (1/1 + 2/3) / 2; NaN scores come last; nothing positive has none."""
+    positive = np.array([True, False, True, False])
+    assert average_precision(np.array([9.0, 5, 3, 1]), positive) == pytest.approx(5 / 6)
+    assert average_precision(np.array([np.nan, 5, 3, 1]), positive) == pytest.approx((1 / 2 + 2 / 4) / 2)
+    assert average_precision(positive.astype(float), positive) == 1
+    assert np.isnan(average_precision(np.ones(4), ~(positive | True)))
+
+
+def test_ranks_agree_whatever_the_scale():
+    """1 for any rising function, -1 turned round, ties share a rank, and what is flat has none."""
+    gain = np.array([0.1, 0.4, 0.2, 0.9])
+    assert rank_correlation(np.exp(5 * gain), gain) == pytest.approx(1)
+    assert rank_correlation(-gain, gain) == pytest.approx(-1)
+    assert rank_correlation(np.array([1.0, 1, 2, 2]), np.array([1.0, 1, 2, 2])) == pytest.approx(1)
+    assert np.isnan(rank_correlation(np.ones(4), gain))
+
+
+def _scene(weights: Weights) -> tuple[Glance, np.ndarray, np.ndarray]:
+    look, fine = scene_columns(weights, 30, 45)
+    labels = np.random.default_rng(2).integers(0, 3, (30, 45)).astype(np.uint8)
+    labels[:3] = 255
+    return glance_of_columns(weights, look.columns, look.grid), fine, labels
+
+
+def _run(weights: Weights, share: float = 0.35, seed: int = 0) -> Controls:
+    return run_controls(weights, *_scene(weights), share=share, seed=seed)
+
+
+def test_every_row_counts_every_labelled_pixel(tiny: Maker):
+    """Each placement draws the whole scene, with as many seats as the share of the valid ones says."""
+    controls = _run(tiny())
+    rows = [controls.none, controls.every, *controls.policies.values(), *controls.random]
+    assert {int(row.sum()) for row in rows} == {27 * 45}
+    assert controls.seats == round(0.35 * 4 * 6)
+    assert list(controls.policies) == ["gain", "entropy", "sobel"]
+    assert len(controls.random) == RANDOM_DRAWS
+
+
+def test_the_ends_do_not_depend_on_the_share(tiny: Maker):
+    """A share of 0 is the row of no seat, a share of 1 the row of every seat, whatever the policy."""
+    weights = tiny()
+    none, every = _run(weights, 0.0), _run(weights, 1.0)
+    assert all((row == none.none).all() for row in [*none.policies.values(), *none.random])
+    for row in [*every.policies.values(), *every.random]:
+        assert np.abs(row - every.every).sum() <= 2  # a tie may fall either way
+    assert (none.every == every.every).all()
+
+
+def test_rows_are_those_of_the_survey(tiny: Maker):
+    """No seat and every seat are the maps that a survey draws with them."""
+    weights = tiny()
+    seen, fine, labels = _scene(weights)
+    seats = seen.grid.valid_seats()
+    drawn = segment(weights, seen, fine[seats], seats)
+    assert (_run(weights).every == confusion(labels, drawn.classes, 3)).all()
+
+
+def test_random_rows_follow_the_seed(tiny: Maker):
+    """Equal seeds draw equal placements, other seeds others, and the draws of one run differ."""
+    weights = tiny()
+    first, same, other = (np.array(_run(weights, seed=seed).random) for seed in (1, 1, 2))
+    assert (first == same).all()
+    assert (first != other).any()
+    assert (first[0] != first[1]).any()
+
+
+def test_rows_are_reported_as_they_start(tiny: Maker):
+    """A progress bar hears of each row by name."""
+    weights, said = tiny(), list[str]()
+    run_controls(weights, *_scene(weights), share=0.1, seed=0, policies=("entropy",), report=said.append)
+    assert said == ["none", "all", "entropy"] + ["random"] * RANDOM_DRAWS
+
+
+def _counts(right: int) -> np.ndarray:
+    return np.array([[right, 100 - right], [100 - right, right]])
+
+
+def test_figures_of_a_worked_case():
+    """Both means and the pixels' accuracy, the share of the gap, and mean and spread of the random placements."""
+    controls = Controls(
+        0.35, 10, _counts(60), _counts(90), {"entropy": _counts(80)}, [_counts(62), _counts(66), _counts(64)]
+    )
+    rows = controls.as_dict()
+    none, every, entropy = (mean_iou(_counts(right)) for right in (60, 90, 80))
+    closed = (entropy - none) / (every - none)
+    assert rows["entropy"] == {**agreement(_counts(80)), "spread": None, "gap_closed": closed}
+    draws = [mean_iou(_counts(right)) for right in (62, 66, 64)]
+    figures = {"miou": np.mean(draws), "miou_of_shown_classes": np.mean(draws), "overall_accuracy": 0.64}
+    closed = (np.mean(draws) - none) / (every - none)
+    assert rows["random"] == pytest.approx({**figures, "spread": np.std(draws, ddof=1), "gap_closed": closed})
+
+
+def test_one_draw_has_no_spread_and_a_small_gap_no_share():
+    """What cannot be said is None."""
+    rows = Controls(0.35, 10, _counts(60), _counts(60), {"sobel": _counts(61)}, [_counts(60)]).as_dict()
+    assert rows["random"] == {**agreement(_counts(60)), "spread": None, "gap_closed": None}
+    assert rows["sobel"] == {**agreement(_counts(61)), "spread": None, "gap_closed": None}
+
+
+def test_a_stray_class_does_not_move_the_gap():
+    """All rows are of one set of classes: a false class in one of the ends leaves the share of the gap as it is."""
+    stray, clean = np.zeros((3, 3), np.int64), np.zeros((3, 3), np.int64)
+    stray[:2, :2] = clean[:2, :2] = _counts(80)
+    stray[0, 1:] = [19, 1]  # a wrong pixel that shows what the labels lack
+    none, every = np.zeros((3, 3), np.int64), np.zeros((3, 3), np.int64)
+    none[:2, :2], every[:2, :2] = _counts(60), _counts(90)
+    shares = [Controls(0.35, 10, none, every, {"gain": one}, [none]).as_dict()["gain"] for one in (clean, stray)]
+    assert shares[0]["miou_of_shown_classes"] > shares[1]["miou_of_shown_classes"] + 0.2
+    assert shares[1]["gap_closed"] == pytest.approx(shares[0]["gap_closed"], abs=0.01)
