@@ -154,14 +154,6 @@ def test_both_definitions_agree_without_a_false_class(pairs: list[tuple[int, int
         assert old == new
 
 
-def test_one_class_alone_is_its_own_mean():
-    """Labels of one class: the mean is its IoU, however many classes the map shows."""
-    counts = confusion(np.zeros(8, int), np.array([0, 0, 0, 0, 0, 1, 2, 3]), 4)
-    assert mean_iou(counts) == 5 / 8
-    assert miou_of_shown_classes(counts) == 5 / 32
-    assert np.isnan(iou_per_class(counts)[1:]).all()
-
-
 @given(st.lists(PAIRS, min_size=1, max_size=4))
 def test_many_counts_at_once_give_the_mean_of_each(maps: list[list[tuple[int, int]]]):
     """Counts in a stack have the means that they have alone, NaN where nothing is labelled."""

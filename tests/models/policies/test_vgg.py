@@ -104,14 +104,6 @@ def test_a_moved_scene_has_moved_scores(saliency: VggSaliency):
     assert after[96:184, 64:152] == pytest.approx(before[80:168, 80:168], rel=1e-3, abs=1e-4 * before.max())
 
 
-def test_detail_is_found(saliency: VggSaliency):
-    """A textured part of a flat scene scores above the parts without any."""
-    columns = np.zeros((64, 96, 4), np.float32)
-    columns[16:32, 64:80] = drawn(2, 16, 16, 4)
-    scores = score_seats("vgg-static", look(columns), network=saliency).reshape(16, 24)
-    assert np.median(scores[4:8, 16:20]) > 2 * np.median(scores[:, :8])
-
-
 def test_the_score_is_the_greatest_on_the_scene():
     """A seat takes its greatest coarse pixel; what lies off the scene does not count, and a share is worth a share."""
     grid = SceneGrid(12, 16, 8, 2)
@@ -194,18 +186,6 @@ def test_channels_that_the_weights_do_not_have_are_refused(tiny: Maker):
         channels_of(tiny(), trained(5))
     with pytest.raises(WeightsError, match=r"a channel .* is at 1650 nm, the segmenter's weights are for 400-1000 nm"):
         channels_of(tiny(), trained(2, (500.0, 1650.0)))
-
-
-def test_a_trained_network_finds_detail_in_its_channels(tiny: Maker):
-    """The policy vgg-trained scores by all channels that enter, also what colours do not show."""
-    weights = tiny()
-    saliency = VggSaliency(trained(4), channels_of(weights, trained(4)))
-    columns = np.zeros((64, 96, 4), np.float32)
-    columns[16:32, 64:80] = drawn(2, 16, 16, 4)
-    scores = score_seats("vgg-trained", look(columns), network=saliency).reshape(16, 24)
-    assert np.median(scores[4:8, 16:20]) > 2 * np.median(scores[:, :8])
-    with pytest.raises(SettingsError, match="'vgg-trained' needs --vgg FILE"):
-        score_seats("vgg-trained", look(columns))
 
 
 def test_a_network_that_is_missing_is_asked_for(tmp_path, tiny: Maker):
@@ -406,3 +386,16 @@ def test_other_layouts_keep_or_get_their_names():
     other = {"blocks.0.weight": torch.zeros(2)}
     assert common_names(other, NARROW) is other
     assert common_names({"0.weight": torch.zeros(2)}, NARROW).keys() == {"0.weight"}
+
+
+@pytest.mark.parametrize("policy", ["vgg-static", "vgg-trained"])
+def test_detail_is_found(tiny: Maker, policy: str):
+    """A textured part of a flat scene scores above the parts without any, also in channels that colours do not show."""
+    weights, network = tiny(), trained(4) if policy == "vgg-trained" else narrow()
+    columns = np.zeros((64, 96, 4), np.float32)
+    columns[16:32, 64:80] = drawn(2, 16, 16, 4)
+    mixed = channels_of(weights, network) if policy == "vgg-trained" else colours_of(weights)
+    scores = score_seats(policy, look(columns), network=VggSaliency(network, mixed)).reshape(16, 24)
+    assert np.median(scores[4:8, 16:20]) > 2 * np.median(scores[:, :8])
+    with pytest.raises(SettingsError, match=f"'{policy}' needs --vgg FILE"):
+        score_seats(policy, look(columns))
