@@ -20,8 +20,6 @@ from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.noise import merged_noise, normal_deviates, photon_counts, rounded_counts
 from pipeline.simulator.effects.sensor import PRNU
 from pipeline.simulator.render import read_out
-from pipeline.simulator.effects.sensor import DARK_CURRENT, PRNU, dark_electrons
-from pipeline.simulator.readout import read_out
 from pipeline.simulator.rig_model import Detector, Rig
 
 LINES, SAMPLES, BANDS = 16, 640, 270

@@ -29,7 +29,6 @@ from pipeline.rectify.registration.overlaps import LEAST_OVERLAP_PX, BroadSweep,
 from pipeline.rectify.registration.seams import Registration, measure_windows, place_images, register_sweeps
 from pipeline.rectify.registration.shifts import pair_shift
 from pipeline.rectify.resample import resample
-from pipeline.rectify.resample import Kernel, resample
 from pipeline.simulator.effects.pointing import ACCURACY_PX, REPEATABILITY_PX, PointingErrors
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene

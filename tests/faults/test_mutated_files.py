@@ -12,7 +12,6 @@ from storage.readers.envi_cubes import LARGEST_HEADER, parse_envi_header
 from storage.readers.scan_files import open_cube_source
 from tests.faults.cube_files import FORMATS
 from tests.faults.mutated_files import try_files
-from tests.faults.mutated_files import FORMATS, try_files
 from tests.faults.mutated_headers import HAND_MADE, real_headers, try_headers
 
 PLAIN = HAND_MADE[0]

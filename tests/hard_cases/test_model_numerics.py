@@ -19,7 +19,6 @@ from torch import Tensor
 from models.evaluation.metrics import average_accuracy, confusion, iou_per_class, kappa, mean_iou, overall_accuracy
 from models.network.layers import Encoder, code_1d, code_2d
 from models.network.sizes import SegmenterConfig
-from models.network.segmenter import SegmenterConfig
 from models.network.spectral import Normalisation
 from models.policies.policies import pixel_entropy, score_seats
 from models.reading.inference import Glance, check_seats, glance, glance_of_columns, segment

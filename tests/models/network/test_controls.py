@@ -9,8 +9,6 @@ import torch
 
 from models.network.controls import DenseNetwork, build_network
 from models.network.layers import code_1d, cut, joined
-from models.network.controls import DenseNetwork, build_network, cut, joined
-from models.network.layers import code_1d
 from models.network.segmenter import Segmenter
 from models.network.sizes import PRESETS, Preset, SegmenterConfig
 from pipeline.errors import ShapeError

@@ -12,8 +12,6 @@ from torch import Tensor
 from models.network.controls import build_network
 from models.network.segmenter import Segmenter
 from models.network.sizes import PRESETS, Preset, SegmenterConfig
-from models.network.segmenter import Segmenter, SegmenterConfig
-from models.network.sizes import PRESETS, Preset
 from models.training import objective
 from models.training import train as training
 from models.training.examples import CropSampler
