@@ -142,12 +142,13 @@ def transient(rig: Rig, sweep: Sweep, numbers: NDArray[np.int64], variant: str =
         return _euler(mirror.damping, start, numbers, (period, held, sweep.step))
     time = numbers[:, None] * period + np.arange(sweep.step) * held
     impulse, rise = responses(time, mirror.damping)
-    place = start[0] * (1 - rise) + start[1] * impulse
+    place: Floats = start[0] * (1 - rise) + start[1] * impulse
     rate = -start[0] * impulse + start[1] * (1 - rise - 2 * mirror.damping * impulse)
     if held == 0:
         return place
     impulse, rise = responses(np.array([held]), mirror.damping)
-    return (place * (impulse + 2 * mirror.damping * rise) + rate * rise) / held
+    mean: Floats = (place * (impulse + 2 * mirror.damping * rise) + rate * rise) / held
+    return mean
 
 
 def responses(time: Floats, damping: float) -> tuple[Floats, Floats]:

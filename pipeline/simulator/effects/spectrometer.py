@@ -56,11 +56,9 @@ class Response(LightChange):
         wavelength = np.asarray(probe.wavelength_nm, np.float64)
         variance = missing_variance(rig.optics.fwhm_nm, probe.fwhm_nm, len(wavelength))
         if not variance.any():
-            known = probe.fwhm_nm is not None and np.isfinite(probe.fwhm_nm).any()
-            wide = f"the scene's bands are {rig.optics.fwhm_nm:g} nm wide already, or wider"
-            return Bound(
-                0.0, wide if known else "the width of the scene's bands is not known; they are taken as they are"
-            )
+            if probe.fwhm_nm is None or not np.isfinite(probe.fwhm_nm).any():
+                return Bound(0.0, "the width of the scene's bands is not known; they are taken as they are")
+            return Bound(0.0, f"the scene's bands are {rig.optics.fwhm_nm:g} nm wide already, or wider")
         near = np.abs(wavelength[:, None] - wavelength) <= REACH_SD * np.sqrt(variance)[:, None]
         curved = np.where(near, probe.spectral_curvature, 0).max(axis=1) * variance / 2
         steep = np.where(near, probe.spectral_slope, 0).max(axis=1) * np.sqrt(variance)
