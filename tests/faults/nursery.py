@@ -138,7 +138,8 @@ def serve(choices: Path) -> None:
         "flows.cli.main",
         "flows.publish.run_folder",
         "flows.publish.survey_command",
-        "flows.cli.archive_verbs",
+        "flows.cli.survey_verbs",
+        "flows.archive.commands",
         "matplotlib.backends.backend_agg",
         "scipy.optimize",
     ):
