@@ -219,7 +219,7 @@ def write_mosaic(
     if crew.shares_memory:
         made = OpenMosaic(opened, writer, LineCache(budget.cache), cut)
         run_blocks(
-            made.tile,
+            lambda tile: made.make(tile.rows, tile.columns, tile.reach),
             tiles,
             Crew(workers=budget.workers),
             keep=False,
@@ -254,7 +254,7 @@ class TileMaker:
 
     def __call__(self, place: tuple[slice, slice]) -> NDArray[np.float32] | None:
         """Make and write the tile of some rows and columns; gives what a thumbnail shows of it."""
-        return _opened(self).at(*place)
+        return _opened(self).make(*place)
 
 
 class OpenMosaic:
@@ -269,16 +269,9 @@ class OpenMosaic:
 
         self._reach = reach
 
-    def tile(self, tile: Tile) -> NDArray[np.float32] | None:
-        """Make and write a planned tile."""
-        return self._make(tile.rows, tile.columns, tile.reach)
-
-    def at(self, rows: slice, columns: slice) -> NDArray[np.float32] | None:
-        """Make and write the tile there; what sweeps show of the columns is found once for all rows."""
-        return self._make(rows, columns, self._reach(columns.start, columns.stop))
-
-    def _make(self, rows: slice, columns: slice, reach: Reaches) -> NDArray[np.float32] | None:
-        work = self._work
+    def make(self, rows: slice, columns: slice, reach: Reaches | None = None) -> NDArray[np.float32] | None:
+        """Make and write the tile there; what sweeps show of its columns is found once for all rows."""
+        work, reach = self._work, self._reach(columns.start, columns.stop) if reach is None else reach
         values, coverage = mosaic_tile(
             work.placed, work.camera, work.grid, rows, columns, kernel=work.kernel, cache=self._cache, reach=reach
         )

@@ -125,7 +125,11 @@ def _write_plain(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> 
         file.descriptions = image.bands
         file.update_tags(**image.tags)
         if image.legend is not None:
-            file.update_tags(1, **class_tags(image.legend))
+            names = image.legend.names
+            flags = {f"CLASS_{number}": name for number, name in enumerate(names)}
+            flags["flag_values"] = ", ".join(str(number) for number in range(len(names)))
+            flags["flag_meanings"] = " ".join("_".join(name.split()) for name in names)
+            file.update_tags(1, **flags)
             colours = enumerate(image.legend.colours.tolist())
             file.write_colormap(1, {number: (*colour, 255) for number, colour in colours})
         reached = 0
@@ -137,14 +141,6 @@ def _write_plain(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> 
             reached += planes.shape[1]
     if reached != y:
         raise ShapeError(f"{path.name}: {reached} of {y} rows were given")
-
-
-def class_tags(legend: ClassNames) -> dict[str, str]:
-    """Names of the classes as tags: ``CLASS_0`` and so on, and all of them as CF's ``flag_meanings``."""
-    meanings = " ".join("_".join(name.split()) for name in legend.names)
-    values = ", ".join(str(number) for number in range(len(legend.names)))
-    each = {f"CLASS_{number}": name for number, name in enumerate(legend.names)}
-    return {**each, "flag_values": values, "flag_meanings": meanings}
 
 
 def _differences(rasterio: Any, plain: Path, made: Path) -> list[str]:

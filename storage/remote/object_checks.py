@@ -164,8 +164,15 @@ def _problems(objects: Objects, there: Mapping[str, Listed], folder: Path, place
         return
     for name, entry in manifest["files"].items():
         problem = _object_problem(objects, there, f"{place}/{name}", entry)
-        if problem is not None:
-            yield f"{name} {problem}{_damage(objects, folder, place, name)}"
+        if problem is None:
+            continue
+        about = [f"{parent.as_posix()}/zarr.json" for parent in Path(name).parents if parent != Path()]
+        for one in (name, *about):  # which part of an array it is, and which of its chunks can be read
+            try:
+                objects.save(f"{place}/{one}", folder / one)
+            except FileNotFoundError:
+                (folder / one).unlink(missing_ok=True)
+        yield f"{name} {problem}{name_damage(folder, name)}"
     extra = {path.removeprefix(f"{place}/") for path in there if path.startswith(f"{place}/")} - set(manifest["files"])
     yield from (f"{name} is not in the manifest: take it out of the archive" for name in sorted(extra))
 
@@ -180,17 +187,6 @@ def _object_problem(objects: Objects, there: Mapping[str, Listed], name: str, en
     except FileNotFoundError:
         return "cannot be read: it is missing"
     return None if digest == entry["sha256"] else "has changed since it was published (its SHA-256 differs)"
-
-
-def _damage(objects: Objects, folder: Path, place: str, name: str) -> str:
-    """Which part of an array it is and which of its chunks can be read, from the object and the array's description."""
-    about = [f"{parent.as_posix()}/zarr.json" for parent in Path(name).parents if parent != Path()]
-    for one in (name, *about):
-        try:
-            objects.save(f"{place}/{one}", folder / one)
-        except FileNotFoundError:
-            (folder / one).unlink(missing_ok=True)
-    return name_damage(folder, name)
 
 
 def find_lost_runs(there: Iterable[str]) -> list[str]:
