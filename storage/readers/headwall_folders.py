@@ -136,9 +136,13 @@ def _source(
 
 def _line_facts(parts: Sequence[CubePart], lines: int, times: LineTimes | None) -> LineFacts:
     """Which lines a file holds whole; exposures by the frame indices, else by the headers."""
-    valid, exposure = np.zeros(lines, np.bool_), np.full(lines, np.nan)
+    valid = np.zeros(lines, np.bool_)
     for part in parts:
         valid[part.start : part.stop] = True
+    if times is None and not any(_EXPOSURE in part.cube.header.settings for part in parts):
+        return LineFacts(valid)
+    exposure = np.full(lines, np.nan)
+    for part in parts:
         try:
             exposure[part.start : part.stop] = float(part.cube.header.settings.get(_EXPOSURE, "nan"))
         except ValueError:

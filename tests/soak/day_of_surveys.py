@@ -257,7 +257,7 @@ def judged(
             refused >= len(struck["disk"]) == wanted["disk"],
             0.0,
         ),
-        Row("the archive", "verify_all, before and after gc", 2, "whole", whole, not first, 0.0),
+        Row("the archive", "verify, before and after gc", 2, "whole", whole, not first, 0.0),
         Row(
             "clearing up",
             "gc --keep-days 0",

@@ -230,7 +230,7 @@ def judged(
         ),
         Row(
             "the archive",
-            "verify_all",
+            "verify",
             1,
             "whole",
             f"{len(problems)} problems{': ' + problems[0] if problems else ''}",

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from flows.publish import survey_command
 from flows.survey import prefect_engine as engine
 from flows.survey.stages import accuracy as evaluation
 from flows.survey.survey import STAGES
@@ -110,7 +111,7 @@ def test_without_a_server_the_survey_runs_plain(
     def refuse(*given: Any) -> None:
         raise engine.EngineUnavailable("the Prefect server did not start (no port)")
 
-    monkeypatch.setattr(engine, "survey_with_prefect", refuse)
+    monkeypatch.setattr(survey_command, "survey_with_prefect", refuse)
     console = io.StringIO()
     found = survey_png(tmp_path, Console(file=console, width=200), engine="prefect").receipt
     assert "did not start (no port); going on with --engine plain" in console.getvalue()
