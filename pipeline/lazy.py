@@ -1,10 +1,12 @@
-"""A value that is made when it is first asked for, and then kept."""
+"""What is there only once it is asked for: a value that is made, a module that is imported."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from importlib import import_module
 from threading import Lock
-from typing import Generic, TypeVar
+from types import ModuleType
+from typing import Any, Generic, TypeVar
 
 Value = TypeVar("Value")
 
@@ -38,3 +40,23 @@ class Once(Generic[Value]):
                 self._made.append(self._make())
                 self._make = None  # what it was made from may go
             return self._made[0]
+
+
+class DeferredModule(ModuleType):
+    """Stands for a module at the head of a file; the module is imported when a name of it is first used."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(import_module(self.__name__), name)
+
+
+def deferred(name: str) -> Any:
+    """A package that takes long to load, or is an extra, for a file that most commands load and few make use of.
+
+    Written beside the import for type checkers::
+
+        if TYPE_CHECKING:
+            import torch
+        else:
+            torch = deferred("torch")
+    """
+    return DeferredModule(name)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from flows.tradeoff.entries import Level, Setting, Tradeoff, register
@@ -62,17 +63,14 @@ def law_of_numbers(electrons: float, rig: Rig) -> Floats:
     """Give how probable each number of the converter is where so many electrons are expected, (DN,): Poisson counts,
     normal read noise, rounding, both ends of the converter. The read noise must not be 0.
     """
-    from scipy.special import ndtr  # a second to load, for those who trade noise alone
-    from scipy.stats import poisson
-
     camera = rig.camera
     reach = 9 * np.sqrt(electrons) + 30
     counts = np.arange(max(0, int(electrons - reach)), int(electrons + reach) + 1)
     edges = (np.arange(camera.full_scale_dn) + 0.5 - camera.dark_dn) * camera.electrons_per_dn
-    weight = poisson.pmf(counts, electrons)
+    weight = scipy.stats.poisson.pmf(counts, electrons)
     below = np.zeros(len(edges))
     for some in np.array_split(np.arange(len(counts)), -(-len(counts) // 256)):
-        below += weight[some] @ ndtr((edges - counts[some, None]) / camera.read_noise_e)
+        below += weight[some] @ scipy.special.ndtr((edges - counts[some, None]) / camera.read_noise_e)
     law: Floats = np.diff(below, prepend=0.0, append=float(weight.sum()))
     return np.maximum(law, 0.0)  # differences of sums that round
 
@@ -110,14 +108,12 @@ def _bound(state: Counted, variant: Setting, _raw: Raw) -> float:
 
 def _chi_square(state: Counted, _variant: Setting, raw: Raw) -> float:
     """How probable a chi-square as large is where the law holds, at the worst level."""
-    from scipy.stats import chi2  # slow to load
-
     found = []
     for seen, law in zip(state.counts(raw), state.law, strict=True):
         usual = np.flatnonzero(law * state.draws >= LEAST_EXPECTED)
         starts = np.concatenate([[0], usual[1:]])
         counted, wanted = np.add.reduceat(seen, starts), np.add.reduceat(law * state.draws, starts)
-        found.append(float(chi2.sf(((counted - wanted) ** 2 / wanted).sum(), len(usual) - 1)))
+        found.append(float(scipy.stats.chi2.sf(((counted - wanted) ** 2 / wanted).sum(), len(usual) - 1)))
     return min(found)
 
 

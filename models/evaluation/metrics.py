@@ -16,6 +16,7 @@ the image is a border, and so is that of what has no label.
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
@@ -174,13 +175,11 @@ def boundary_counts(
 
 def near_border(region: NDArray[np.bool_], width: int) -> NDArray[np.bool_]:
     """Pixels of a (y, x) region within ``width`` px of what is not the region; the image ends where the array does."""
-    from scipy.ndimage import minimum_filter1d
-
     if not region.any():
         return region
     inner = region.astype(np.uint8)
     for axis in (0, 1):
-        inner = minimum_filter1d(inner, 2 * width + 1, axis=axis, mode="constant", cval=0)
+        inner = scipy.ndimage.minimum_filter1d(inner, 2 * width + 1, axis=axis, mode="constant", cval=0)
     border: NDArray[np.bool_] = region & (inner == 0)
     return border
 

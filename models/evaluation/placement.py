@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from models.evaluation.metrics import agreement, confusion, gap_closed, mean_iou
@@ -18,7 +19,13 @@ from models.policies.policies import score_seats
 from models.reading.inference import Glance, captured, origin_of, readings_of, segment
 from models.weights.files import Weights
 from pipeline.geometry.grid import UNLABELLED
+from pipeline.lazy import deferred
 from pipeline.planning.selection import frame_seats
+
+if TYPE_CHECKING:
+    import torch
+else:
+    torch = deferred("torch")
 
 Values = NDArray[np.floating]
 RANDOM_DRAWS = 5
@@ -38,8 +45,6 @@ def oracle_gain(
     ``fine`` (seat, p, p, column) are normalised columns of every seat of the padded grid, ``labels`` (y, x) class
     indices of the scene's own size, 255 unlabelled.
     """
-    import torch
-
     grid, p = seen.grid, seen.grid.patch
     full = np.full(grid.padded_shape, UNLABELLED, np.uint8)
     full[: grid.height, : grid.width] = labels
@@ -62,12 +67,10 @@ def oracle_gain(
 
 def _losses(logits: NDArray[np.float32], truth: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Cross-entropy of each pixel, (seat, class, y, x) and (seat, y, x) -> (seat, y, x); 0 where unlabelled."""
-    from scipy.special import logsumexp
-
     labelled = truth != UNLABELLED
     index = np.where(labelled, truth, 0).astype(np.intp)[:, None]
     exact = logits.astype(np.float64)
-    loss = logsumexp(exact, axis=1) - np.take_along_axis(exact, index, axis=1)[:, 0]
+    loss = scipy.special.logsumexp(exact, axis=1) - np.take_along_axis(exact, index, axis=1)[:, 0]
     return np.where(labelled, loss, 0.0)
 
 
@@ -104,11 +107,9 @@ def top_seats(gain: Values, count: int) -> NDArray[np.bool_]:
 
 def rank_correlation(score: Values, gain: Values) -> float:
     """Spearman's correlation, equal values sharing their mean rank; NaN where either is flat."""
-    from scipy.stats import rankdata
-
     if len(score) < 2:
         return float("nan")
-    first, second = (rankdata(values) - (len(values) + 1) / 2 for values in (score, gain))
+    first, second = (scipy.stats.rankdata(values) - (len(values) + 1) / 2 for values in (score, gain))
     spread = float(np.sqrt((first**2).sum() * (second**2).sum()))
     return float((first * second).sum() / spread) if spread > 0 else float("nan")
 

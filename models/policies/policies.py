@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import Any, Literal, get_args
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from models.network.self_attention import attention_of_seats
@@ -164,10 +165,8 @@ def score_seats(
 
 def pixel_entropy(probability: NDArray[np.floating]) -> NDArray[np.float64]:
     """Entropy over the last axis [nat]; a probability of 0 adds 0."""
-    from scipy.special import xlogy
-
     exact = probability.astype(np.float64)
-    entropy: NDArray[np.float64] = -xlogy(exact, exact).sum(axis=-1)
+    entropy: NDArray[np.float64] = -scipy.special.xlogy(exact, exact).sum(axis=-1)
     return entropy
 
 
@@ -179,10 +178,8 @@ def _margin(seen: Glance) -> NDArray[np.float64]:
 
 
 def _edges(seen: Glance) -> NDArray[np.float64]:
-    from scipy.ndimage import sobel
-
     brightness = seen.columns.astype(np.float64).mean(axis=-1)
-    down, across = (sobel(brightness, axis=axis, mode="nearest") for axis in (0, 1))
+    down, across = (scipy.ndimage.sobel(brightness, axis=axis, mode="nearest") for axis in (0, 1))
     edges: NDArray[np.float64] = np.hypot(down, across)
     return edges
 

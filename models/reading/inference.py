@@ -17,12 +17,16 @@ from models.network.spectral import all_alive, dead_pixels, fill_dead, patches_o
 from models.weights.files import AnyWeights, Weights
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
+from pipeline.lazy import deferred
 from pipeline.readings import beyond_range
 
 if TYPE_CHECKING:
+    import torch
     from torch import Tensor
 
     from models.network.segmenter import CoarseReading, Segmenter
+else:
+    torch = deferred("torch")
 
 Precision = Literal["float32", "bfloat16"]
 PATCHES_A_PACK = 256  # scenes are read together up to so many patches; one with more is read alone
@@ -157,8 +161,6 @@ def read_glance(weights: Weights, look: CoarseLook, *, precision: Precision = "f
 
 def glance_batch(weights: Weights, looks: Sequence[CoarseLook], *, precision: Precision = "float32") -> list[Glance]:
     """Read coarse looks of any sizes, each alone, their patches packed; as ``read_glance`` one by one, but faster."""
-    import torch
-
     seen: list[Glance] = []
     with torch.inference_mode(), _computing_in(precision):
         for part in packs([_patches_in(look) for look in looks]):
@@ -211,8 +213,6 @@ def segment_batch(
     precision: Precision = "float32",
 ) -> list[DrawnMap]:
     """Draw the maps of scenes of any sizes and numbers of seats together, as ``segment`` one by one, but faster."""
-    import torch
-
     scenes = []
     for look, own, given in zip(seen, patches, seats, strict=True):
         numbers = np.asarray(given, np.int64)
@@ -227,8 +227,6 @@ def _draw_pack(
     weights: Weights, pack: Sequence[tuple[CoarseLook, NDArray[np.floating], NDArray[np.int64]]], precision: Precision
 ) -> Iterator[DrawnMap]:
     """Maps of scenes that are read together."""
-    import torch
-
     looks = [look for look, _, _ in pack]
     readings = readings_of(weights, looks, precision=precision)
     padded = [draw_coarse(reading.logits.float(), look.grid) for reading, look in zip(readings, looks, strict=True)]
@@ -284,8 +282,6 @@ def _patches_in(look: CoarseLook) -> int:
 
 @contextmanager
 def _computing_in(precision: Precision) -> Iterator[None]:
-    import torch
-
     if precision == "float32":
         yield
         return
@@ -309,8 +305,6 @@ def readings_of(
 
 
 def _read_coarse(weights: Weights, looks: Sequence[CoarseLook]) -> list[CoarseReading]:
-    import torch
-
     images = [torch.from_numpy(look.columns).permute(2, 0, 1)[None] for look in looks]
     living = [None if look.living is None else torch.from_numpy(look.living) for look in looks]
     return weights.segmenter.eval().read_coarse_packed(images, [origin_of(look) for look in looks], living)
@@ -329,22 +323,18 @@ def packs(counts: Sequence[int], most: int = PATCHES_A_PACK) -> list[slice]:
 
 def origin_of(look: CoarseLook) -> Tensor | None:
     """Seat of the field in which a look begins, (1, 2); None at the field's own corner."""
-    import torch
-
     return torch.tensor([look.origin]) if any(look.origin) else None
 
 
 def draw_coarse(logits: Tensor, grid: SceneGrid) -> DrawnMap:
     """Bring coarse logits up to the padded fine grid and decide, in strips of rows."""
-    import torch
-    import torch.nn.functional as F  # noqa: N812 - its usual name
-
     y, x = grid.padded_shape
     drawn = DrawnMap(np.empty((y, x), np.uint8), np.empty((y, x), np.float32))
     cell = grid.patch
-    padded = F.pad(logits, (0, 0, 1, 1), mode="replicate").contiguous(memory_format=torch.channels_last)
+    padded = torch.nn.functional.pad(logits, (0, 0, 1, 1), mode="replicate")
+    padded = padded.contiguous(memory_format=torch.channels_last)
     for top in range(0, y // grid.factor, cell):
-        strip = F.interpolate(
+        strip = torch.nn.functional.interpolate(
             padded[:, :, top : top + cell + 2], scale_factor=grid.factor, mode="bilinear", align_corners=False
         )[0, :, grid.factor : -grid.factor]
         confidence, classes = decide(strip, dim=0)
@@ -355,7 +345,5 @@ def draw_coarse(logits: Tensor, grid: SceneGrid) -> DrawnMap:
 
 def decide(logits: Tensor, dim: int) -> tuple[Tensor, Tensor]:
     """The greatest probability and its class, uint8; NaN and 255 where a logit is not finite: that is no class."""
-    import torch
-
     confidence, classes = logits.softmax(dim=dim).max(dim=dim)
     return confidence, torch.where(confidence.isnan(), UNLABELLED, classes).to(torch.uint8)

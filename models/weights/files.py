@@ -23,13 +23,17 @@ from models.weights.sealed_files import (
     write_sealed,
 )
 from pipeline.errors import WeightsError
+from pipeline.lazy import deferred
 from pipeline.readings import readings_alone
 
 if TYPE_CHECKING:
+    import torch
     from torch import Tensor
 
     from models.network.controls import Network
     from models.network.segmenter import Segmenter
+else:
+    torch = deferred("torch")
 
 NORMALISATION = ("centre", "spread", "whitening")
 FORMAT, UNSEALED = "spectralzoom-weights/2", "spectralzoom-weights/1"  # the earlier one has no hashes
@@ -103,8 +107,6 @@ def save_weights(weights: AnyWeights, path: Path) -> None:
 
     Raises WeightsError where the disk refuses.
     """
-    import torch
-
     tensors = dict(weights.network.state_dict())
     for name in NORMALISATION:
         tensors[f"normalisation.{name}"] = torch.from_numpy(getattr(weights.normalisation, name).copy())
@@ -196,8 +198,6 @@ def _read(path: Path, described: Description) -> AnyWeights:
 
 
 def _network(config: SegmenterConfig, device: str) -> Network:
-    import torch
-
     from models.network.controls import build_network  # loads torch
 
     with torch.device(device):
@@ -288,8 +288,6 @@ def misfit(config: SegmenterConfig, claimed: Mapping[str, Any]) -> str:
 
 def unusable(tensors: Mapping[str, Tensor]) -> str:
     """Which tensor holds numbers that nothing can be computed with, in words; nothing where none does."""
-    import torch
-
     for name, value in tensors.items():
         if value.is_floating_point() and not bool(torch.isfinite(value).all()):
             count = int((~torch.isfinite(value)).sum())

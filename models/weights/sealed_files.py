@@ -18,9 +18,13 @@ from typing import TYPE_CHECKING, Any
 from safetensors import SafetensorError, safe_open
 
 from pipeline.errors import WeightsError
+from pipeline.lazy import deferred
 
 if TYPE_CHECKING:
+    import torch
     from torch import Tensor
+else:
+    torch = deferred("torch")
 
 ABOUT = "about"  # the text's name in the file
 TENSORS, SEAL = "tensors", "seal"  # entries of the description: hashes of the tensors by name, and its own
@@ -72,8 +76,6 @@ def changed_tensor(about: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> s
 
 def hash_of(tensor: Tensor) -> str:
     """SHA-256 of a tensor's kind, shape and numbers, in hexadecimal digits."""
-    import torch
-
     digest = hashlib.sha256(f"{tensor.dtype} {tuple(tensor.shape)}\n".encode())
     digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
     return digest.hexdigest()

@@ -17,11 +17,17 @@ from numpy.typing import ArrayLike, NDArray
 from pipeline.errors import PoseError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.view import LEAST_SINK, ROWS_AT_ONCE, GroundView, RigPose, pixel_places
+from pipeline.lazy import deferred
 from pipeline.rectify.resample import resample
 
 if TYPE_CHECKING:  # half a second to import, for maps alone
+    import odc.geo.geobox as odc_geobox
+    import pyproj
     from odc.geo.geobox import GeoBox
-    from pyproj import CRS, Transformer
+    from pyproj import CRS
+else:
+    odc_geobox = deferred("odc.geo.geobox")
+    pyproj = deferred("pyproj")
 
 Floats = NDArray[np.float64]
 
@@ -47,19 +53,16 @@ def default_epsg(pose: RigPose) -> int:
     return (32600 if pose.lat_deg >= 0 else 32700) + zone
 
 
-def map_crs(pose: RigPose, epsg: int | None = None) -> CRS:
+def map_crs(pose: RigPose, epsg: int | None = None) -> pyproj.CRS:
     """Give the projected CRS of a map around the rig: the one asked for, or that of ``default_epsg``.
 
     Raises PoseError: no such code, not a projected CRS in metres, or the rig stands outside the area it is made for.
     """
-    from pyproj import CRS
-    from pyproj.exceptions import CRSError
-
     code = default_epsg(pose) if epsg is None else epsg
     hint = f"leave epsg out for EPSG:{default_epsg(pose)}"
     try:
-        crs = CRS.from_epsg(code)
-    except CRSError:
+        crs = pyproj.CRS.from_epsg(code)
+    except pyproj.exceptions.CRSError:
         raise PoseError(f"there is no EPSG:{code}; give the code of a projected CRS in metres, or {hint}") from None
     if not crs.is_projected or any(axis.unit_conversion_factor != 1 for axis in crs.axis_info[:2]):
         raise PoseError(f"EPSG:{code} ({crs.name}) is no projected CRS in metres; {hint}")
@@ -124,21 +127,17 @@ class MapFrame:
         return np.stack([np.cos(lat) * np.sin(away), north, up], axis=-1)
 
     @cached_property
-    def _around_foot(self) -> Transformer:
-        from pyproj import Transformer
-
+    def _around_foot(self) -> pyproj.Transformer:
         pose = self.view.pose
-        return Transformer.from_pipeline(
+        return pyproj.Transformer.from_pipeline(
             "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84"
             f" +step +proj=topocentric +ellps=WGS84 +lon_0={float(pose.lon_deg)!r} +lat_0={float(pose.lat_deg)!r}"
             f" +h_0={float(pose.elevation_m)!r}"
         )
 
     @cached_property
-    def _on_map(self) -> Transformer:
-        from pyproj import Transformer
-
-        return Transformer.from_crs(WGS84, self.crs, always_xy=True)
+    def _on_map(self) -> pyproj.Transformer:
+        return pyproj.Transformer.from_crs(WGS84, self.crs, always_xy=True)
 
 
 def _stacked(parts: tuple[ArrayLike, ...]) -> Floats:
@@ -224,8 +223,6 @@ def ground_grid(
     more
         pixels than the scene.
     """
-    from odc.geo.geobox import GeoBox
-
     frame = MapFrame(view, map_crs(view.pose, epsg))
     if not view.count_ground(scene_shape):
         raise PoseError(
@@ -243,7 +240,7 @@ def ground_grid(
             f"at resolution_m = {step:g} the map would have more than {MOST_GROWTH} times the scene's {scene_shape} "
             f"pixels; use {1.1 * finest:.2g} or more (the median pixel of the scene sees {median:.2g} m)"
         )
-    geobox = GeoBox.from_bbox((left, bottom, right, top), crs=frame.crs, resolution=step)
+    geobox = odc_geobox.GeoBox.from_bbox((left, bottom, right, top), crs=frame.crs, resolution=step)
     return GroundGrid(frame, scene_shape, geobox, least)
 
 

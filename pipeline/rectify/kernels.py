@@ -13,8 +13,12 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.lazy import deferred
+
 if TYPE_CHECKING:  # a second to import: the functions that use it do so, and a plan of a survey never needs it
     import torch
+else:
+    torch = deferred("torch")
 
 Kernel = Literal["catmull-rom", "bilinear", "nearest"]
 Rows: TypeAlias = NDArray[np.intp]
@@ -61,8 +65,6 @@ class Windows:
 
     def joint_weight(self) -> torch.Tensor:
         """(n, tap * tap) products of the weights along both axes, lines first."""
-        import torch
-
         down, across = _spread(self.taps)
         along_lines, along_samples = (torch.from_numpy(part) for part in self.weight)
         # Products with zeros and ones are exact, in whatever order they are summed, and much faster than broadcasting
@@ -71,8 +73,6 @@ class Windows:
 
     def flat_index(self, shape: tuple[int, int]) -> torch.Tensor:
         """(n, tap * tap) rows of a (line * sample) table of this shape, for windows that lie inside."""
-        import torch
-
         lines, samples = shape
         kind = np.int32 if lines * samples < 2**31 else np.int64  # half the bytes
         first = (self.corner[0] * samples + self.corner[1]).astype(kind)
@@ -128,8 +128,6 @@ def weighted_rows(
 
     Each sum runs over its taps in order, whatever the other points are.
     """
-    import torch
-
     count, taps = index.shape
     size = max(BAG_VALUES // max(table.shape[1], 1), 64)
     starts = torch.arange(0, min(size, count) * taps, taps, dtype=index.dtype)
@@ -147,8 +145,6 @@ def outer_index(row: NDArray[np.int64], column: NDArray[np.int64], columns: int)
 
 def tensor_rows(array: NDArray[np.float32]) -> torch.Tensor:
     """View (row, column) float32 as a tensor; read-only memory is fine, for nothing here writes to it."""
-    import torch
-
     return torch.from_numpy(array if array.flags.writeable else np.asarray(_Unlocked(array)))
 
 
@@ -174,7 +170,5 @@ def _catmull_rom(t: NDArray[np.float32], weight: NDArray[np.float32]) -> None:
 @cache
 def _spread(taps: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Matrices (tap, tap * tap) of zeros and ones that repeat weights for every tap of the other axis."""
-    import torch
-
     one, row = np.eye(taps, dtype=np.float32), np.ones((1, taps), np.float32)
     return torch.from_numpy(np.kron(one, row)), torch.from_numpy(np.kron(row, one))

@@ -11,10 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
+from pipeline.lazy import deferred
 from pipeline.rectify.kernels import Kernel, Rows, Windows, outer_index, taps_of, tensor_rows, weighted_rows, windows
 
 if TYPE_CHECKING:
     import torch
+else:
+    torch = deferred("torch")
 
 Values: TypeAlias = NDArray[np.float32] | NDArray[np.uint16]
 
@@ -52,8 +55,6 @@ class Damage:
         ``total`` (n,) is the weight on usable samples; unusable elements have entered the sums as 0. Tells of each
         point whether it has a value in any band.
         """
-        import torch
-
         share = np.empty((len(at), len(self.bands)), np.float32)
         weighted_rows(self.usable, torch.from_numpy(self.kind[index.numpy()]), weight, share)
         point, column = _places(np.abs(share - total[:, None]) > ROUNDING)  # few: the rest is divided as samples are
@@ -104,8 +105,6 @@ class LineTable:
         self, placed: Windows, out: NDArray[np.float32], share: NDArray[np.float32], at: Rows | None = None
     ) -> None:
         """Points (the block's ``at``, or all) whose windows lie on usable samples altogether."""
-        import torch
-
         index, weight = placed.flat_index(self.shape), placed.joint_weight()
         weighted_rows(self.terms, index, weight, out, at)
         share[... if at is None else at] = 1
@@ -117,8 +116,6 @@ class LineTable:
 
     def _read_partial(self, placed: Windows, out: NDArray[np.float32], share: NDArray[np.float32], at: Rows) -> None:
         """Points that miss taps: NaN and 0 where they fail, else what is there, renormalised."""
-        import torch
-
         out[at], share[at] = np.nan, 0
         near = np.flatnonzero(placed.touches(self.shape))
         flat, joint = self._usable_taps(placed.chosen(near))
@@ -150,8 +147,6 @@ class LineTable:
 
 def table_for(values: Values, valid: NDArray[np.bool_], kernel: Kernel) -> LineTable:
     """Make lines (line, sample, band), valid by sample or by element, ready for one kernel."""
-    import torch
-
     taps = taps_of(kernel)
     lines, samples, bands = values.shape
     rows: NDArray[Any] = np.ascontiguousarray(values).reshape(lines * samples, bands)
@@ -174,8 +169,6 @@ def _apart(
 
     Those are 0 in the rows given back, for sums; NaN for a kernel of one tap, which copies.
     """
-    import torch
-
     complete: NDArray[np.bool_] = np.all(valid, axis=2)
     lacking = np.flatnonzero(~complete)
     missing = ~valid.reshape(rows.shape)[lacking]
@@ -235,8 +228,6 @@ def gather(
     Integers are pixel centres; outside, the edge pixel is repeated. (n, component) float32: a point's result does not
     depend on the other points of the call.
     """
-    import torch
-
     rows, columns, components = planes.shape
     table = tensor_rows(np.ascontiguousarray(planes, np.float32).reshape(rows * columns, components))
     out = np.empty((len(y), components), np.float32)

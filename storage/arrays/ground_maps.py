@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import IncompleteStoreError, PoseError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
+from pipeline.lazy import deferred
 from storage.arrays.class_maps import ClassNames, class_flags, legend_of
 from storage.arrays.layout import (
     SHARD_COLUMNS,
@@ -33,8 +34,11 @@ from storage.arrays.layout import (
 )
 
 if TYPE_CHECKING:
+    import odc.geo.xr as odc_geo_xr
     from odc.geo.crs import CRS
     from odc.geo.geobox import GeoBox
+else:
+    odc_geo_xr = deferred("odc.geo.xr")
 
 
 GRID_MAPPING = "spatial_ref"
@@ -77,8 +81,6 @@ def map_attributes(geobox: GeoBox) -> dict[str, Any]:
 
 def write_map_coordinates(group: zarr.Group, geobox: GeoBox) -> None:
     """Store ``x``, ``y`` and the grid mapping ``spatial_ref`` of a map, as CF wants them."""
-    from odc.geo.xr import xr_crs_coord
-
     for name in ("x", "y"):
         about = {
             "standard_name": f"projection_{name}_coordinate",
@@ -87,7 +89,7 @@ def write_map_coordinates(group: zarr.Group, geobox: GeoBox) -> None:
             "axis": name.upper(),
         }
         write_small(group, name, (name,), np.asarray(geobox.coordinates[name].values, np.float64), about)
-    mapping = xr_crs_coord(_crs_of(geobox), transform=geobox.transform)
+    mapping = odc_geo_xr.xr_crs_coord(_crs_of(geobox), transform=geobox.transform)
     write_small(group, GRID_MAPPING, (), np.asarray(mapping.values, np.int32), dict(mapping.attrs))
 
 

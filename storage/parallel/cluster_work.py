@@ -21,10 +21,16 @@ from importlib.metadata import PackageNotFoundError, version
 from multiprocessing import resource_tracker
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 from pipeline.errors import SettingsError, WorkerError
+from pipeline.lazy import deferred
+
+if TYPE_CHECKING:
+    import dask.distributed as dask_distributed
+else:
+    dask_distributed = deferred("dask.distributed")
 
 ANSWER_S = 5.0  # a scheduler that is there answers at once
 LOOK_S, MOST_WAIT_S = 0.02, 60.0  # how often, and how long at most, blocks are waited for that nobody wants any more
@@ -106,9 +112,7 @@ class ProcessTeam:
 
     def _wait(self, futures: list[Any]) -> Iterable[Any]:
         """Those that have ended, none where all go on: a team without workers never ends one, and is refused."""
-        from dask.distributed import wait  # half a second, for crews of processes alone
-
-        waited: Callable[..., Any] = wait
+        waited: Callable[..., Any] = dask_distributed.wait
         try:
             with self._client.as_current():
                 done: Iterable[Any] = waited(futures, timeout=ANSWER_S, return_when="FIRST_COMPLETED").done
@@ -131,11 +135,9 @@ class ProcessTeam:
         return WorkerError(f"{self._name}: the scheduler is gone; the same command goes on once it is there again")
 
     def _result(self, future: Any) -> Any:
-        from dask.distributed import KilledWorker
-
         try:
             return future.result()
-        except KilledWorker as error:
+        except dask_distributed.KilledWorker as error:
             raise WorkerError(
                 f"{self._name}: workers died {error.args[-1] if error.args else 'several'} times in the same block; "
                 "were they out of memory? use fewer --workers, or --scheduler threads"
@@ -261,7 +263,6 @@ def _seen(folder: Path) -> str:
 def start(workers: int) -> ProcessTeam:
     """Start a cluster of one-thread processes on this machine (WorkerError: they do not start)."""
     import dask  # half a second, for crews of processes alone
-    from dask.distributed import Client, LocalCluster
 
     name = f"{workers} worker processes"
     with ExitStack() as closing:
@@ -272,7 +273,7 @@ def start(workers: int) -> ProcessTeam:
         try:
             with _termination_held(), _interrupts_held():
                 cluster = closing.enter_context(
-                    LocalCluster(  # type: ignore[no-untyped-call]
+                    dask_distributed.LocalCluster(  # type: ignore[no-untyped-call]
                         n_workers=workers,
                         threads_per_worker=1,
                         memory_limit=0,
@@ -281,7 +282,7 @@ def start(workers: int) -> ProcessTeam:
                         scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},
                     )
                 )
-            client = closing.enter_context(Client(cluster, set_as_default=False))  # type: ignore[no-untyped-call]
+            client = closing.enter_context(dask_distributed.Client(cluster, set_as_default=False))  # type: ignore[no-untyped-call]
         except (OSError, RuntimeError, TimeoutError) as error:
             raise WorkerError(f"{name} do not start: {error}; use --scheduler threads") from error
         return ProcessTeam(client, name, closing.pop_all())
@@ -290,13 +291,11 @@ def start(workers: int) -> ProcessTeam:
 
 def connect(scheduler: str) -> ProcessTeam:
     """Find the scheduler at an address (SettingsError: none answers there)."""
-    from dask.distributed import Client
-
     with ExitStack() as closing:
         closing.enter_context(_quiet_logs())
         try:
             client = closing.enter_context(
-                Client(scheduler, timeout=ANSWER_S, set_as_default=False)  # type: ignore[no-untyped-call]
+                dask_distributed.Client(scheduler, timeout=ANSWER_S, set_as_default=False)  # type: ignore[no-untyped-call]
             )
         except (OSError, TimeoutError, ValueError) as error:
             raise SettingsError(

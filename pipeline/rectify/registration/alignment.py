@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError, ShapeError
@@ -143,14 +144,12 @@ def _half(lines: int) -> float:
 
 def _robust(system: Floats, measured: Floats, error: Floats) -> Floats:
     """Least squares with soft L1 loss; weak priors settle what the windows leave open."""
-    from scipy.optimize import least_squares
-
     width = system.shape[1]
     prior = np.diag(np.tile([1 / OFFSET_PRIOR_PX] * 2 + [1 / DRIFT_PRIOR_PX] * 2, width // 4))
     whole = np.vstack([system / error[:, None], prior])
     wanted = np.concatenate([measured / error, np.zeros(width)])
     start, *_ = np.linalg.lstsq(whole, wanted, rcond=None)
-    solved = least_squares(
+    solved = scipy.optimize.least_squares(
         lambda x: whole @ x - wanted, start, jac=lambda x: whole, loss="soft_l1", f_scale=OUTLIER_ERRORS, method="trf"
     )
     answer: Floats = solved.x

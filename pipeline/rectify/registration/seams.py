@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError
@@ -216,8 +217,6 @@ def _compare_with_mosaic(
     image: PlacedImage, grid: SceneGrid, mosaic: NDArray[np.floating], reach_px: float
 ) -> PairShift:
     """Compare a sweep with the mosaic under it, at the scene's pixels that it may have seen."""
-    from scipy.ndimage import convolve1d
-
     places, shown = image.edges.reshape(-1, 2), []
     for axis, size in enumerate(field_px(grid, image.broad.sweep.along)):
         low, high = (float(end) + (size - 1) / 2 for end in (places[:, axis].min(), places[:, axis].max()))
@@ -231,7 +230,7 @@ def _compare_with_mosaic(
         mean = np.concatenate([[0.5], np.ones(grid.factor - 1), [0.5]]) / grid.factor
     seen = image.seen_at(along_px, scan_px).astype(np.float64)
     for axis in (0, 1):  # a coarse pixel is a mean over factor x factor; what is not seen spreads by as much
-        seen = convolve1d(seen, mean, axis=axis, mode="constant", cval=np.nan)
+        seen = scipy.ndimage.convolve1d(seen, mean, axis=axis, mode="constant", cval=np.nan)
     scan, along = np.meshgrid(scan_px, along_px, indexing="ij")
     y, x = (scan, along) if image.broad.sweep.along == "x" else (along, scan)
     rows, columns = (

@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+import scipy
+import skimage
 from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError, ShapeError
@@ -165,19 +167,17 @@ def _correlate(first: Floats, second: Floats, reach: int) -> tuple[Floats, Float
 
     Shifts with too little in common, or without variance there, get a correlation of -1.
     """
-    from scipy.fft import irfft2, next_fast_len, rfft2
-
-    size = [next_fast_len(n + min(reach, n), real=True) for n in first.shape]
+    size = [scipy.fft.next_fast_len(n + min(reach, n), real=True) for n in first.shape]
     spectra = []
     for image in (first, second):
         seen = np.isfinite(image)
         values = np.where(seen, image, 0.0)
-        spectra.append([rfft2(plane, size) for plane in (seen.astype(np.float64), values, values * values)])
+        spectra.append([scipy.fft.rfft2(plane, size) for plane in (seen.astype(np.float64), values, values * values)])
     lags = np.arange(-reach, reach + 1)
     inside = np.abs(lags)[:, None] < first.shape[0], np.abs(lags)[None, :] < first.shape[1]
 
     def at_shifts(one: int, other: int) -> Floats:
-        product = irfft2(spectra[0][one] * np.conj(spectra[1][other]), size)
+        product = scipy.fft.irfft2(spectra[0][one] * np.conj(spectra[1][other]), size)
         picked: Floats = product[np.ix_(lags % size[0], lags % size[1])] * (inside[0] & inside[1])
         return picked
 
@@ -195,25 +195,23 @@ def _correlate(first: Floats, second: Floats, reach: int) -> tuple[Floats, Float
 
 def _candidates(correlation: Floats) -> Iterator[NDArray[np.intp]]:
     """Integer shifts (2,) of the highest peaks, best first, none within another's lobe."""
-    from scipy.ndimage import maximum_filter
-
     reach = correlation.shape[0] // 2
     # The window is as wide as a lobe: noise on a broad peak makes no second one.
-    peaks = np.argwhere((correlation == maximum_filter(correlation, 2 * int(LOBE_PX) + 1)) & (correlation > -1))
+    peaks = np.argwhere(
+        (correlation == scipy.ndimage.maximum_filter(correlation, 2 * int(LOBE_PX) + 1)) & (correlation > -1)
+    )
     ranked = peaks[np.argsort(-correlation[tuple(peaks.T)], kind="stable")] - reach
     yield from ranked[: RIVALS + 1]
 
 
 def _refine(first: Floats, second: Floats, integer: NDArray[np.intp]) -> _Fit | None:
     """Least squares around an integer shift; None where too little is common or it does not settle near by."""
-    from scipy.ndimage import minimum_filter
-
     for _ in range(REALIGNMENTS):
         moves = list(zip(first.shape, integer.tolist(), strict=True))
         one = first[tuple(slice(max(move, 0), max(size + min(move, 0), 0)) for size, move in moves)]
         other = second[tuple(slice(max(-move, 0), max(size + min(-move, 0), 0)) for size, move in moves)]
         both = np.isfinite(one) & np.isfinite(other)
-        kept = minimum_filter(both, 2 * BORDER_PX + 1, mode="constant", cval=False)
+        kept = scipy.ndimage.minimum_filter(both, 2 * BORDER_PX + 1, mode="constant", cval=False)
         if kept.sum() < LEAST_SIDE_PX**2 / 4:
             return None
         one, other = (np.where(both, image - image[both].mean(), 0.0) for image in (one, other))
@@ -228,10 +226,8 @@ def _refine(first: Floats, second: Floats, integer: NDArray[np.intp]) -> _Fit | 
 
 def _phase_shift(one: Floats, other: Floats) -> Floats:
     """Shift by phase correlation under a Hann window [2], not normalised: noise has all phases alike."""
-    from skimage.registration import phase_cross_correlation
-
     window = np.outer(*(np.hanning(size + 2)[1:-1] for size in one.shape))
-    shift, *_ = phase_cross_correlation(  # type: ignore[no-untyped-call]
+    shift, *_ = skimage.registration.phase_cross_correlation(  # type: ignore[no-untyped-call]
         one * window, other * window, normalization=None, upsample_factor=UPSAMPLE
     )
     near: Floats = np.clip(shift, -REALIGN_PX, REALIGN_PX)
@@ -280,10 +276,8 @@ def _slopes(image: Floats, kept: NDArray[np.bool_]) -> Floats:
 
 def _smoothed(image: Floats) -> Floats:
     """Damp what is too fine to interpolate, and noise."""
-    from scipy.ndimage import convolve1d
-
     for axis in (0, 1):
-        image = convolve1d(image, SMOOTHING, axis=axis, mode="nearest")
+        image = scipy.ndimage.convolve1d(image, SMOOTHING, axis=axis, mode="nearest")
     return image
 
 

@@ -8,6 +8,7 @@ from functools import cache
 from types import MappingProxyType
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from pipeline.simulator.effects.effect import OFF, Blur, Bound, Merged
@@ -84,9 +85,7 @@ class Diffraction(Blur):
 
 def airy_energy(v: float) -> float:
     """Give the share of the light of an Airy pattern within v = pi D theta / lambda (Rayleigh): 1 - J0^2 - J1^2."""
-    from scipy.special import j0, j1
-
-    return float(1 - j0(v) ** 2 - j1(v) ** 2)
+    return float(1 - scipy.special.j0(v) ** 2 - scipy.special.j1(v) ** 2)
 
 
 def airy_variance(v: float) -> float:
@@ -94,11 +93,11 @@ def airy_variance(v: float) -> float:
 
     The integral of t J1(t)^2, which is v^2 (J0^2 + J1^2) / 2 - v J0 J1, over the energy; towards 0 it is v^2 / 4.
     """
-    from scipy.special import j0, j1
-
     if v < 1e-2:
         return v * v / 4
-    inside = v * v / 2 * (j0(v) ** 2 + j1(v) ** 2) - v * j0(v) * j1(v)
+    inside = v * v / 2 * (scipy.special.j0(v) ** 2 + scipy.special.j1(v) ** 2) - v * scipy.special.j0(
+        v
+    ) * scipy.special.j1(v)
     return float(inside) / airy_energy(v)
 
 
@@ -108,13 +107,11 @@ def airy_gaussians() -> tuple[Floats, Floats]:
 
     By least squares on what the pupil passes: within 0.004 of it up to 0.6 of its cut-off. For bounds, not for light.
     """
-    from scipy.optimize import nnls
-
     size, u = np.geomspace(0.1, 160.0, 24), np.concatenate([np.geomspace(1e-3, 0.02, 30), np.linspace(0.03, 1.5, 150)])
     weight = 1 / (1 + (u / 0.5) ** 4)
     passed = np.exp(-2 * (np.pi * np.outer(u, size)) ** 2)
     system = np.concatenate([passed * weight[:, None], np.full((1, len(size)), 1e3)])
-    share = nnls(system, np.append(pupil_contrast(u) * weight, 1e3))[0]
+    share = scipy.optimize.nnls(system, np.append(pupil_contrast(u) * weight, 1e3))[0]
     held = share > 0
     return share[held] / share.sum(), size[held]
 

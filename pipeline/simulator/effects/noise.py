@@ -10,6 +10,7 @@ import math
 from functools import lru_cache
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
@@ -154,8 +155,6 @@ def _series_quantile(mean: Floats, z: Floats) -> Floats:
     [1] Giles, "Algorithm 955: approximation of the inverse Poisson cumulative distribution function", ACM Trans.
            Math. Softw. 42, 2016. doi:10.1145/2699466
     """
-    from scipy.special import gammaincc, ndtr
-
     root, square = np.sqrt(mean), z * z
     x = mean + root * z
     x += 1 / 3 + square / 6
@@ -166,16 +165,14 @@ def _series_quantile(mean: Floats, z: Floats) -> Floats:
     counts = np.floor(x)
     if unsure.size:
         step = np.maximum(whole[unsure], 1)
-        counts[unsure] = step - (ndtr(z[unsure]) <= gammaincc(step, mean[unsure]))
+        counts[unsure] = step - (scipy.special.ndtr(z[unsure]) <= scipy.special.gammaincc(step, mean[unsure]))
     return counts
 
 
 def _summed_quantile(mean: Floats, z: Floats) -> Floats:
     """Poisson quantile at Phi(z) for small means: how many of the sums of probabilities lie below."""
-    from scipy.special import ndtr
-
     counts = np.zeros_like(mean)
-    asked = ndtr(z)
+    asked = scipy.special.ndtr(z)
     chance = np.exp(-mean)
     summed = chance.copy()
     for k in range(1, int(mean.max() + 12 * np.sqrt(mean.max()) + 20)):

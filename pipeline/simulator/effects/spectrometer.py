@@ -6,14 +6,21 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
+from pipeline.lazy import deferred
 from pipeline.simulator.effects.effect import Bound, LightChange, SweepBlock
 from pipeline.simulator.effects.probe import Probe, difference_rates, rising_gaps, rising_runs
 from pipeline.simulator.rig_model import Rig
+
+if TYPE_CHECKING:
+    import torch
+else:
+    torch = deferred("torch")
 
 Floats = NDArray[np.float64]
 Light = NDArray[np.float32]
@@ -120,11 +127,11 @@ def _heat_kernel(wavelength_nm: Floats, variance: Floats) -> Floats:
     bands = len(wavelength_nm)
     if bands < 3:
         return np.eye(bands)
-    from scipy.linalg import eigh_tridiagonal
-
     gaps = np.diff(wavelength_nm)
     root = np.sqrt((gaps[:-1] + gaps[1:]) / 2)
-    rate, mode = eigh_tridiagonal(-(1 / gaps[:-1] + 1 / gaps[1:]) / root**2, 1 / gaps[1:-1] / root[:-1] / root[1:])
+    rate, mode = scipy.linalg.eigh_tridiagonal(
+        -(1 / gaps[:-1] + 1 / gaps[1:]) / root**2, 1 / gaps[1:-1] / root[:-1] / root[1:]
+    )
     grown = np.exp(np.minimum(rate, 0) * variance[1:-1, None] / 2) * (mode / root[:, None])
     inner = grown @ (mode * root[:, None]).T
     place = (wavelength_nm - wavelength_nm[0]) / (wavelength_nm[-1] - wavelength_nm[0])
@@ -196,8 +203,6 @@ def wavelength_shift(samples: int, smile_nm: float) -> Floats:
 
 
 def _mix_bands(light: Light, made: Light, first: int, weights: Light) -> None:
-    import torch
-
     bands, (from_light, into, shares) = light.shape[-1], map(torch.from_numpy, (light, made, weights))
     torch.mul(from_light, shares[-first], out=into)
     for tap, share in enumerate(shares, start=first):

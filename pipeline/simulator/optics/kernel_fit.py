@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from pipeline.simulator.optics.rays import pupil_contrast
@@ -195,13 +196,11 @@ def _wanted(moments: Floats, own: Floats) -> Transfer:
 
 def _shares(passed: Transfer, wanted: Transfer) -> Floats:
     """Shares (kernel, band) by least squares, none below 0 and of sum 1, by what kernels and bands pass of waves."""
-    from scipy.optimize import nnls  # takes its time to import
-
     count, bands = passed.shape[1], wanted.shape[1]
     system = np.concatenate([passed.real, passed.imag, np.full((1, count), _SUM)])
     right = np.concatenate([wanted.real, wanted.imag, np.full((1, bands), _SUM)])
     basis, triangle = np.linalg.qr(system)
-    shares: Floats = np.stack([nnls(triangle, one)[0] for one in (basis.T @ right).T], axis=1)
+    shares: Floats = np.stack([scipy.optimize.nnls(triangle, one)[0] for one in (basis.T @ right).T], axis=1)
     shares /= shares.sum(axis=0)
     return shares
 

@@ -10,15 +10,22 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.lazy import deferred
 from pipeline.rectify.kernels import tensor_rows
 from pipeline.simulator.optics.kernel_fit import Footprint
 from pipeline.simulator.optics.rays import RayViews
 from pipeline.simulator.optics.tap_sums import Gatherer, ScenePixels
 from pipeline.simulator.scenes.scene import RasterScene, Scene
+
+if TYPE_CHECKING:
+    import torch
+else:
+    torch = deferred("torch")
 
 Floats = NDArray[np.float64]
 Light = NDArray[np.float32]
@@ -50,8 +57,6 @@ class _Bands:
 
     def write(self, parts: Light, light: Light) -> None:
         """Write light (n, band) of the first samples of components (kernel, some times `MIXED`, component)."""
-        import torch
-
         if self.own_planes:
             np.einsum("knb,kb->nb", parts[:, : len(light)], self.mixing, out=light)
             return

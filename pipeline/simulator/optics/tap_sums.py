@@ -15,11 +15,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.lazy import deferred
 from pipeline.simulator.optics.kernel_fit import Footprint, Moments, fold
 from pipeline.simulator.optics.rays import RayViews
 
 if TYPE_CHECKING:  # a second to import: the functions that use it do so, and a plan of a survey never needs it
     import torch
+else:
+    torch = deferred("torch")
 
 Floats = NDArray[np.float64]
 Light = NDArray[np.float32]
@@ -113,8 +116,6 @@ class Gatherer:
         They are sums over the parts. ``views`` are in px of the pixels, ``numbers`` (kernel,) where in ``out`` kernels
         belong: one after the other, if it is None. A sample's light does not depend on the others.
         """
-        import torch
-
         along, scan = np.rint(views.along), np.rint(views.scan)
         index = self._window(pixels, along, scan)
         shape = shape_of(self.footprint, views)
@@ -131,8 +132,6 @@ class Gatherer:
 
     def _window(self, pixels: ScenePixels, along: Floats, scan: Floats) -> torch.Tensor:
         """Rows of the pixels' table, (n, tap); outside of the scene its edge is repeated."""
-        import torch
-
         kind = np.int32 if pixels.shape[0] * pixels.shape[1] < 2**31 else np.int64
         rows, columns = pixels.shape
         step, size = ((columns, 1), (rows, columns)) if pixels.along_y else ((1, columns), (columns, rows))
@@ -156,8 +155,6 @@ class Gatherer:
 
 def _joint(turn: Light, run: Light) -> Light:
     """Sum of products (across * along, n) over the parts of weights (across, part, n) and (along, part, n)."""
-    import torch
-
     joint = np.multiply(turn[:, None, 0], run[None, :, 0])
     total, across, along = (torch.from_numpy(one) for one in (joint, turn, run))
     for number in range(1, turn.shape[1]):
@@ -309,8 +306,6 @@ class TapTable:
 
     def read(self, off: Weights, scale_row: NDArray[np.intp]) -> Weights:
         """Give the weights (tap, kernel, part, n) of positions (kernel, part, n) ``off`` px beside their pixel."""
-        import torch
-
         row = (off + np.float32(self.left - self.first)) * np.float32(PER_PX)
         np.clip(row, 0, self.rows - 2, out=row)
         index = row.astype(np.intp)

@@ -12,12 +12,19 @@ package ``pvlib``, under a clear sky at sea level. Times are seconds since the s
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError
+from pipeline.lazy import deferred
 from pipeline.simulator.rig_model import Sky
+
+if TYPE_CHECKING:
+    import pvlib
+else:
+    pvlib = deferred("pvlib")
 
 Floats = NDArray[np.float64]
 KNOT_S = 10.0  # light is straight between such times: right to 2e-6 of that of a high sun
@@ -85,32 +92,26 @@ def _table(latitude: float, longitude: float, hour: int) -> Floats:
 
 
 def _elevation_deg(latitude: float, longitude: float, moments: Floats) -> Floats:
-    from pvlib.spa import solar_position  # with pandas a second of imports: only for who asks for the time of day
-
     at_ground = {"elev": 0.0, "pressure": 1013.25, "temp": 12.0, "delta_t": 69.0, "atmos_refract": 0.5667}
-    found = solar_position(np.asarray(moments, np.float64), latitude, longitude, **at_ground)
+    found = pvlib.spa.solar_position(np.asarray(moments, np.float64), latitude, longitude, **at_ground)
     return 90.0 - np.asarray(found[0], np.float64)  # of the zenith angle with refraction
 
 
 def clear_sky(zenith_deg: Floats | float, airmass: Floats | float, day: Floats | float) -> tuple[Floats, Floats]:
     """Give SPECTRL2's wavelengths [nm] and its light on level ground (wavelength, sun) [W/m^2/nm]: one air for all."""
-    from pvlib.spectrum import spectrl2  # half a second of pandas: only for whoever asks for daylight
-
     turned = {"apparent_zenith": zenith_deg, "aoi": zenith_deg, "surface_tilt": 0.0, "relative_airmass": airmass}
     air = {"surface_pressure": 101325.0, "precipitable_water": 1.5, "ozone": 0.31, "aerosol_turbidity_500nm": 0.1}
-    sky = spectrl2(**turned, **air, ground_albedo=0.2, dayofyear=day)  # Pa, cm, atm cm
+    sky = pvlib.spectrum.spectrl2(**turned, **air, ground_albedo=0.2, dayofyear=day)  # Pa, cm, atm cm
     return np.asarray(sky["wavelength"], np.float64), np.asarray(sky["poa_global"], np.float64)
 
 
 def _light_of(elevation_deg: Floats, moments: Floats) -> Floats:
     """Light on level ground for heights of the sun, (time, wavelength of the model); 0 at the horizon and below."""
-    from pvlib.atmosphere import get_relative_airmass
-
     zenith = 90.0 - np.maximum(elevation_deg, 0.0)
     moment = np.asarray(moments * 1e6, "datetime64[us]")
     start_of_year = moment.astype("datetime64[Y]").astype("datetime64[us]")
     day = (moment - start_of_year).astype(np.float64) / (1e6 * _DAY_S) + 1  # with parts: nothing jumps at midnight
-    light = clear_sky(zenith, get_relative_airmass(zenith, "kastenyoung1989"), day)[1]
+    light = clear_sky(zenith, pvlib.atmosphere.get_relative_airmass(zenith, "kastenyoung1989"), day)[1]
     return np.where(elevation_deg[:, None] > 0, np.maximum(light.T, 0.0), 0.0)
 
 

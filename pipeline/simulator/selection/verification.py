@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from pipeline.errors import BoundError, ShapeError
@@ -218,8 +219,6 @@ def contrast_about(block: SweepBlock, render: Render) -> Floats:
 
     The scene is looked at by middle rays, a px and half a px apart: pixels may lie between those of one look.
     """
-    from scipy.ndimage import maximum_filter1d
-
     sweep = block.sweep
     held = replace(sweep, step=1, lines=sweep.lines * sweep.step)
     ends = block.lines.start * sweep.step - REACH_PX, block.lines.stop * sweep.step + REACH_PX
@@ -229,7 +228,7 @@ def contrast_about(block: SweepBlock, render: Render) -> Floats:
     looks = [render(replace(wide, sweep=_beside(held, *way)), MIDDLE_RAYS) for way in _HALVES]
     seen = np.concatenate(looks)
     ends_e = seen.max(axis=0), -seen.min(axis=0)
-    most, least = (maximum_filter1d(one, 2 * REACH_PX + 1, axis=0, mode="nearest") for one in ends_e)
+    most, least = (scipy.ndimage.maximum_filter1d(one, 2 * REACH_PX + 1, axis=0, mode="nearest") for one in ends_e)
     return np.asarray((most + least).astype(np.float64)[None])
 
 

@@ -18,13 +18,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import WavelengthError
 from pipeline.geometry.camera import LineCamera
+from pipeline.lazy import deferred
 from pipeline.simulator.scenes.daylight import clear_sky
+
+if TYPE_CHECKING:
+    import prosail
+else:
+    prosail = deferred("prosail")
 
 Spectrum = NDArray[np.float64]
 
@@ -168,12 +175,11 @@ def band_response(wavelength_nm: Spectrum, fwhm_nm: Spectrum) -> NDArray[np.floa
 @lru_cache(maxsize=1)
 def _known_spectra() -> dict[str, Spectrum]:
     """Reflectance of each of ``MATERIALS`` on the 1 nm grid from 400 to 1030 nm; what no model gives is a law here."""
-    from prosail import run_prosail, spectral_lib  # numba: a second to import
 
     def stand(one: Canopy) -> Spectrum:
         leaf, blades = (one.n, one.cab, one.car, one.cbrown, one.cw, one.cm), (one.lai, one.lidfa)
         light = (_SUN_ZENITH_DEG, 0.0, 0.0)  # seen straight from above
-        seen = run_prosail(
+        seen = prosail.run_prosail(
             *leaf, *blades, 0.05, *light, ant=one.ant, prospect_version="D", rsoil=1.0, psoil=one.dry_soil
         )
         return np.asarray(seen[: len(GRID_NM)], dtype=np.float64)
@@ -186,7 +192,9 @@ def _known_spectra() -> dict[str, Spectrum]:
     for name, other in _TWINS.items():
         known[name] = known[other] * (1 + (RIPE_CONTRAST if name.endswith("ripe") else 1.0) * (factor - 1))
     iron = 1 - 0.5 / (1 + np.exp((GRID_NM - 545) / 40))  # grey soil to brown loam: 0.5 in the violet, 1 beyond 700 nm
-    dry, wet = (iron * soil[: len(GRID_NM)] for soil in (spectral_lib.soil.rsoil1, spectral_lib.soil.rsoil2))
+    dry, wet = (
+        iron * soil[: len(GRID_NM)] for soil in (prosail.spectral_lib.soil.rsoil1, prosail.spectral_lib.soil.rsoil2)
+    )
     hump = 0.020 * np.exp(-(((GRID_NM - 555) / 70) ** 2)) + 0.008 * np.exp(-(((GRID_NM - 705) / 18) ** 2))
     straw = 0.08 + 0.42 / (1 + np.exp(-(GRID_NM - 620) / 90))  # bleached cereal straw: 0.10 at 400 nm to 0.50
     petals = 0.05 + 0.47 / (1 + np.exp(-(GRID_NM - 512) / 9))  # of mustard: they absorb below 510 nm
