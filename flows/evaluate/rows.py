@@ -29,7 +29,7 @@ from models.evaluation.placement import (
     top_seats,
 )
 from models.network.cost import MultiplyAdds, control_multiply_adds, multiply_adds
-from models.policies.policies import score_seats
+from models.policies.policies import score_multiply_adds, score_seats
 from models.reading.control_maps import draw_with_control
 from models.reading.inference import Glance, segment
 from models.weights.files import AnyWeights, Weights
@@ -140,7 +140,8 @@ def captured_px(look: Sight, seats: Seats) -> NDArray[np.bool_]:
 def cost_of_seats(look: Look, weights: Weights, seats: Seats, policy: str) -> dict[str, Any]:
     """Samples with those of the coarse pass, their bytes, and multiply-adds (`none` and `all`: the map alone)."""
     known = {"none": None, "all": None, ORACLE: "random"}.get(policy, policy)  # the oracle scores by labels
-    adds = multiply_adds(weights.config, look.seen.grid, len(seats), look.bands, known)
+    score = 0 if known is None else score_multiply_adds(known, weights.config, look.seen.grid)
+    adds = multiply_adds(weights.config, look.seen.grid, len(seats), look.bands, score=score)
     return _cost_of(look, float(np.prod(look.seen.grid.coarse_shape)) + fine_samples(look, seats), adds)
 
 
@@ -257,7 +258,7 @@ def _control_cost(sight: Sight, weights: AnyWeights, design: str, seats: Seats) 
         samples = float(-(-grid.height // 2) * -(-grid.width // 2))
     adds = control_multiply_adds(config, grid, len(seats), sight.bands)
     if design == BUYS_SEATS:
-        adds = replace(adds, score=adds.score + multiply_adds(config, grid, 0, sight.bands, POLICY).score)
+        adds = replace(adds, score=adds.score + score_multiply_adds(POLICY, config, grid))
     return _cost_of(sight, samples, adds)
 
 

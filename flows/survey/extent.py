@@ -14,7 +14,7 @@ from flows.survey.run import SurveyRun
 from flows.survey.stage import Unit
 from models.network.cost import MultiplyAdds, multiply_adds
 from models.network.sizes import SegmenterConfig
-from models.policies.policies import IMAGE_POLICIES, NETWORK_POLICIES, SEEING_POLICIES
+from models.policies.policies import IMAGE_POLICIES, NETWORK_POLICIES, SEEING_POLICIES, score_multiply_adds
 from models.reading.regions import Region, plan_regions, whole_field
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
@@ -81,7 +81,7 @@ class Extent:
             case "operations of the map":
                 return self._map_operations()
             case "operations of a glance":  # of reading the coarse patches of the whole field alone
-                return float(multiply_adds(self.config, whole_field(self.grid).grid, 0, self.bands, None).total)
+                return float(multiply_adds(self.config, whole_field(self.grid).grid, 0, self.bands).total)
             case "surveys":  # what is the same for every field
                 return 1
 
@@ -100,7 +100,7 @@ class Extent:
         for region in plan_regions(self.grid, SHARD):
             read = region.grid
             seats = round(min(self._fine_pixels / pixels, 1.0) * read.height * read.width / read.patch**2)
-            total += multiply_adds(self.config, read, seats, self.bands, None).total
+            total += multiply_adds(self.config, read, seats, self.bands).total
         return float(total)
 
 
@@ -129,4 +129,6 @@ def work_of_map(run: SurveyRun, seats: NDArray[np.integer]) -> MultiplyAdds:
 def _of_region(run: SurveyRun, region: Region, seats: int, policy: str | None) -> MultiplyAdds:
     channels = 3 if run.vgg is None else run.vgg.channels
     bands = len(run.scene.wavelength_nm)
-    return multiply_adds(run.described.config, region.grid, seats, bands, policy, channels=channels)
+    config = run.described.config
+    score = 0 if policy is None else score_multiply_adds(policy, config, region.grid, channels=channels)
+    return multiply_adds(config, region.grid, seats, bands, score=score)

@@ -5,14 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 
-from models.network.sizes import (
-    BOTTOM,
-    SCORER_WIDTH,
-    SegmenterConfig,
-    level_widths,
-    saliency_multiply_adds,
-    scorer_inputs,
-)
+from models.network.sizes import BOTTOM, SegmenterConfig, level_widths
 from pipeline.geometry.grid import SceneGrid
 
 
@@ -21,7 +14,7 @@ class MultiplyAdds:
     """Multiply-adds of one survey's segmentation. Norms, activations, softmax and interpolation count as 0."""
 
     glance: int  # the coarse pass read alone, its part of the map with it
-    score: int  # the policy
+    score: int  # the policy (`models.policies.policies.score_multiply_adds`)
     encode: int  # fine patches to tokens, and the transformer over these (a control's: over all that it reads)
     decode: int  # the map at captured seats (a control's: all of it)
 
@@ -31,19 +24,10 @@ class MultiplyAdds:
         return self.glance + self.score + self.encode + self.decode
 
 
-SCORE_PER_PIXEL = {"entropy": 2, "margin": 4, "sobel": 19, "saliency": 75, "spectral-residual": 120} | dict.fromkeys(
-    ("random", "stratified", "centre", "uniform", "mask"), 0
-)  # per coarse pixel; entropy also per class
-AVERAGED = {"sobel": 1, "saliency": 2, "spectral-residual": 1}  # how often these go through all columns
+def multiply_adds(config: SegmenterConfig, grid: SceneGrid, seats: int, bands: int, *, score: int = 0) -> MultiplyAdds:
+    """Count a survey with ``seats`` fine patches of ``bands`` bands, whose policy took ``score``.
 
-
-def multiply_adds(
-    config: SegmenterConfig, grid: SceneGrid, seats: int, bands: int, policy: str | None, *, channels: int = 3
-) -> MultiplyAdds:
-    """Count a survey with ``seats`` fine patches of ``bands`` bands; ``policy=None`` counts no score.
-
-    ``channels`` are those that VGG19 reads, for the policies through it. The glance is the reading of the coarse pass,
-    counted once: fine patches read what is kept of it.
+    The glance is the reading of the coarse pass, counted once: fine patches read what is kept of it.
     """
     p, s = config.patch, config.factor
     rows, columns = (size // (p * s) for size in grid.padded_shape)
@@ -55,7 +39,6 @@ def multiply_adds(
     encode = seats * (basis + _stem(config, wide)) + _transformer(config, seats * side, cells * side)
     under = (p // s + 2) ** 2 * narrow * wide
     decode = seats * (_head(config, wide) + under + pixels * (11 * wide**2 + wide * config.classes))
-    score = 0 if policy is None else _score(config, policy, (rows * p, columns * p), channels)
     return MultiplyAdds(glance, score, encode, decode)
 
 
@@ -77,22 +60,6 @@ def control_multiply_adds(config: SegmenterConfig, grid: SceneGrid, seats: int, 
     encode += _transformer(config, patches * config.token_side**2, 0)
     last = p * p * (9 * config.width**2 + config.width * config.classes)
     return MultiplyAdds(0, 0, encode, patches * (_head(config, config.width) + last))
-
-
-def _score(config: SegmenterConfig, policy: str, coarse: tuple[int, int], channels: int) -> int:
-    """The policy over (y, x) coarse pixels; VGG19 reads some more around them."""
-    pixels = coarse[0] * coarse[1]
-    if policy in ("vgg-static", "vgg-trained"):
-        return saliency_multiply_adds(coarse, config.columns, channels)
-    if policy == "self-attention":  # the weights of one layer once more, and their sum over heads and queries
-        tokens = pixels // config.patch**2 * config.token_side**2
-        return tokens**2 * (config.dim + config.heads)
-    if policy == "gain":  # entropy and pooling per coarse pixel, then the network per seat
-        inputs, seats = scorer_inputs(config), pixels // (config.patch // config.factor) ** 2
-        per_seat = SCORER_WIDTH * (inputs + 9 + SCORER_WIDTH + 1) + 1
-        return pixels * (2 + config.classes + inputs) + seats * per_seat
-    per_pixel = SCORE_PER_PIXEL[policy] + (config.classes if policy == "entropy" else 0)
-    return (per_pixel + AVERAGED.get(policy, 0) * config.columns) * pixels
 
 
 def _levels(config: SegmenterConfig, width: int) -> list[tuple[int, int]]:

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from models.network.self_attention import attention_of_seats
+from models.network.sizes import SCORER_WIDTH, SegmenterConfig, saliency_multiply_adds, scorer_inputs
 from models.policies.spacing import centre_scores, random_scores, stratified_scores, uniform_scores
 from models.reading.inference import CoarseLook, Glance
 from pipeline.errors import SettingsError, ShapeError
@@ -148,11 +149,11 @@ def score_seats(
     elif policy == "mask":
         scores = _mask_scores(seen, mask)
     elif policy in _PIXEL_SCORES:
-        scores = _seat_means(_PIXEL_SCORES[policy](seen), seen)
+        scores = _seat_means(_PIXEL_SCORES[policy].of(seen), seen)
     elif policy in _IMAGE_SCORES:
         y, x = seen.grid.coarse_shape
         pixels = np.zeros(seen.columns.shape[:2])  # beyond the scene nothing stands out
-        pixels[:y, :x] = _IMAGE_SCORES[policy](seen.columns[:y, :x])
+        pixels[:y, :x] = _IMAGE_SCORES[policy].of(seen.columns[:y, :x])
         scores = _seat_means(pixels, seen)
     elif policy in NETWORK_POLICIES:
         scores = _network_scores(policy, seen, network)
@@ -161,6 +162,25 @@ def score_seats(
     share = seen.grid.valid_share()
     worth: Scores = np.where(share > 0, scores, 0.0) * share
     return worth.ravel()
+
+
+def score_multiply_adds(policy: str, config: SegmenterConfig, grid: SceneGrid, *, channels: int = 3) -> int:
+    """Multiply-adds of scoring every seat of a grid; ``channels`` are those that VGG19 reads, which reads some more."""
+    coarse = grid.padded_shape[0] // config.factor, grid.padded_shape[1] // config.factor
+    pixels = coarse[0] * coarse[1]
+    if policy in NETWORK_POLICIES:
+        return saliency_multiply_adds(coarse, config.columns, channels)
+    if policy == "self-attention":  # the weights of one layer once more, and their sum over heads and queries
+        tokens = pixels // config.patch**2 * config.token_side**2
+        return tokens**2 * (config.dim + config.heads)
+    if policy == "gain":  # entropy and pooling per coarse pixel, then the network per seat
+        inputs, seats = scorer_inputs(config), pixels // (config.patch // config.factor) ** 2
+        per_seat = SCORER_WIDTH * (inputs + 9 + SCORER_WIDTH + 1) + 1
+        return pixels * (2 + config.classes + inputs) + seats * per_seat
+    score = (_PIXEL_SCORES | _IMAGE_SCORES).get(policy)
+    if score is None:  # by place, or given
+        return 0
+    return (score.adds + score.per_class * config.classes + score.per_column * config.columns) * pixels
 
 
 def pixel_entropy(probability: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -184,13 +204,24 @@ def _edges(seen: Glance) -> NDArray[np.float64]:
     return edges
 
 
-ImageScore = Callable[[NDArray[np.floating]], NDArray[np.float64]]
-_PIXEL_SCORES: dict[str, Callable[[Glance], NDArray[np.float64]]] = {
-    "entropy": lambda seen: pixel_entropy(seen.probability),
-    "margin": _margin,
-    "sobel": _edges,
+class PixelScore(NamedTuple):
+    """A score of coarse pixels, and the multiply-adds that it takes of each."""
+
+    of: Callable[[Any], Pixels]
+    adds: int
+    per_column: int = 0
+    per_class: int = 0
+
+
+_PIXEL_SCORES = {  # of the glance
+    "entropy": PixelScore(lambda seen: pixel_entropy(seen.probability), 2, per_class=1),
+    "margin": PixelScore(_margin, 4),
+    "sobel": PixelScore(_edges, 19, per_column=1),
 }
-_IMAGE_SCORES: dict[str, ImageScore] = {"saliency": fine_grained, "spectral-residual": spectral_residual}
+_IMAGE_SCORES = {  # of the coarse image, (y, x, column)
+    "saliency": PixelScore(fine_grained, 75, per_column=2),
+    "spectral-residual": PixelScore(spectral_residual, 120, per_column=1),
+}
 _PLACE_SCORES: dict[str, Callable[[SceneGrid, int], Scores]] = {
     "random": random_scores,
     "stratified": stratified_scores,

@@ -20,7 +20,7 @@ from models.network.process import keep_freed_memory, one_thread
 from models.network.segmenter import Segmenter
 from models.network.sizes import SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
-from models.policies.policies import score_seats
+from models.policies.policies import score_multiply_adds, score_seats
 from models.reading.inference import (
     CoarseLook,
     DrawnMap,
@@ -249,11 +249,12 @@ def _shares() -> list[Row]:
     calls["35% in bfloat16"] = partial(_adaptive, weights, every, seats_of[0.35], "bfloat16")
     calls["all in bfloat16"] = lambda: segment(weights, every.look, every.patches, every.seats, precision="bfloat16")
     clocks = time_in_turn(calls, ROUNDS)
-    full = multiply_adds(weights.config, FRAME, len(every.seats), 2, None).total
+    full = multiply_adds(weights.config, FRAME, len(every.seats), 2).total
     found = []
     for share, goal in COST_GOALS.items():
         cost = ratio(clocks, f"{share:.0%}", "all")
-        macs = multiply_adds(weights.config, FRAME, seats_of[share], 2, "gain").total / full
+        score = score_multiply_adds("gain", weights.config, FRAME)
+        macs = multiply_adds(weights.config, FRAME, seats_of[share], 2, score=score).total / full
         found.append(
             Row(
                 f"CPU at {share:.0%} of the seats over every seat, frame of {FRAME.width} x {FRAME.height} px",

@@ -16,6 +16,7 @@ from flows.survey.run import SurveyRun
 from flows.survey.stage import Unit
 from models.network.cost import multiply_adds
 from models.network.sizes import SegmenterConfig
+from models.policies.policies import score_multiply_adds
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel, Sweep
@@ -113,7 +114,8 @@ def _run(side: int, policy: str) -> SurveyRun:
 def test_a_policy_that_asks_the_glance_reads_the_coarse_look_once_more(policy: str, looks: int) -> None:
     """The map reads it anyway, from what is stored; scores of the glance read it before that."""
     run = _run(256, policy)
-    done, closed = work_done(run, np.array([3, 8])), multiply_adds(CONFIG, run.grid, 2, BANDS, policy)
+    score = score_multiply_adds(policy, CONFIG, run.grid)
+    done, closed = work_done(run, np.array([3, 8])), multiply_adds(CONFIG, run.grid, 2, BANDS, score=score)
     assert done.glance == looks * closed.glance
     assert (done.score, done.encode, done.decode) == (closed.score, closed.encode, closed.decode)
 

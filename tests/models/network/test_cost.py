@@ -11,6 +11,7 @@ from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 from models.network.cost import multiply_adds
 from models.network.segmenter import Segmenter
 from models.network.sizes import SegmenterConfig
+from models.policies.policies import score_multiply_adds
 from pipeline.geometry.grid import SceneGrid
 
 
@@ -31,14 +32,14 @@ def test_closed_form_equals_the_counter(patch: int, factor: int, seats: int, ker
     )
     with torch.inference_mode(), counter:
         model(coarse, torch.zeros(1, seats, 6, patch, patch), torch.arange(seats)[None])
-    assert multiply_adds(config, grid, seats, 0, None).total == counter.get_total_flops() / 2
+    assert multiply_adds(config, grid, seats, 0).total == counter.get_total_flops() / 2
 
 
 def test_more_seats_cost_more() -> None:
-    """Glance and score do not depend on the seats; encode and decode grow with them."""
+    """The glance does not depend on the seats; encode and decode grow with them."""
     config, grid = SegmenterConfig(classes=5), SceneGrid(256, 256, 16, 4)
-    few, many = (multiply_adds(config, grid, seats, 270, "entropy") for seats in (1, 20))
-    assert (few.glance, few.score) == (many.glance, many.score)
+    few, many = (multiply_adds(config, grid, seats, 270) for seats in (1, 20))
+    assert few.glance == many.glance
     assert few.encode < many.encode
     assert few.decode < many.decode
 
@@ -51,7 +52,7 @@ def test_received_attention_costs_one_layer_of_weights(patch: int) -> None:
     queries = torch.zeros(config.heads, tokens, config.dim // config.heads, device="meta")
     with FlopCounterMode(display=False) as counter:
         _ = queries @ queries.transpose(1, 2)
-    added = multiply_adds(config, grid, 3, 270, "self-attention").score
+    added = score_multiply_adds("self-attention", config, grid)
     assert added == counter.get_total_flops() / 2 + config.heads * tokens**2
 
 
@@ -59,5 +60,5 @@ def test_received_attention_costs_one_layer_of_weights(patch: int) -> None:
 def test_policies_of_the_image_go_through_all_columns(policy: str, times: int) -> None:
     """Each column more adds one multiply-add a coarse pixel for every pass over them."""
     grid = SceneGrid(256, 256, 16, 4)
-    few, many = (multiply_adds(SegmenterConfig(5, columns), grid, 1, 270, policy).score for columns in (2, 24))
+    few, many = (score_multiply_adds(policy, SegmenterConfig(5, columns), grid) for columns in (2, 24))
     assert many - few == times * 22 * 64 * 64
