@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
 from flows.publish.receipt import Receipt, check_receipt
-from flows.survey.stages.ground import coarse_colours
+from flows.survey.stages.maps import coarse_colours
 from pipeline.errors import IncompleteStoreError, SettingsError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
 from storage.archive.archive import Archive

@@ -11,8 +11,18 @@ import numpy as np
 from rich.console import Console
 
 from flows.evaluate.costs import Prices
-from flows.evaluate.frames import Candidate, Jobs, Show, open_candidates, open_frames, scene_of, sort_frames
-from flows.evaluate.request import COST, EvaluateRequest, checked_request
+from flows.evaluate.frames import (
+    COST,
+    Candidate,
+    EvaluateRequest,
+    Jobs,
+    Show,
+    checked_request,
+    open_candidates,
+    open_frames,
+    scene_of,
+    sort_frames,
+)
 from flows.evaluate.rows import design_of, known_or_none, open_controls
 from flows.evaluate.series import REFERENCE, Record, seeds_of
 from flows.evaluate.summary import summarise, summarise_equal_time, summarise_rig

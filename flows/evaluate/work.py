@@ -13,8 +13,19 @@ from pathlib import Path
 from typing import Any
 
 from flows.evaluate.costs import capture_seconds, time_frame
-from flows.evaluate.frames import Candidate, Job, Jobs, Look, Show, Sight, look_at, scene_of, sight_of
-from flows.evaluate.request import COST, EvaluateRequest
+from flows.evaluate.frames import (
+    COST,
+    Candidate,
+    EvaluateRequest,
+    Job,
+    Jobs,
+    Look,
+    Show,
+    Sight,
+    look_at,
+    scene_of,
+    sight_of,
+)
 from flows.evaluate.rig_plans import BUDGETS, judge_equal_time, judge_rig
 from flows.evaluate.rows import (
     Bought,

@@ -25,11 +25,9 @@ from flows.survey.run import SurveyRun, now
 from flows.survey.stages.accuracy import load_accuracy
 from flows.survey.stages.attention import load_orientation, load_plan
 from flows.survey.stages.capture import captured
-from flows.survey.stages.class_map import strange_pixels
 from flows.survey.stages.effects import load_manifest
-from flows.survey.stages.ground import STORE
-from flows.survey.stages.placement import SEATS_AT_ONCE, line_facts, seen_shares
-from flows.survey.stages.registration import load_registration
+from flows.survey.stages.maps import STORE, strange_pixels
+from flows.survey.stages.placement import SEATS_AT_ONCE, line_facts, load_registration, seen_shares
 from flows.survey.survey import Products, StageRunner
 from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.grid import UNLABELLED

@@ -17,9 +17,8 @@ from prefect.concurrency.sync import concurrency
 from prefect.context import FlowRunContext
 from prefect.states import Cancelled, Completed, Failed
 
-from flows.schedule.due_runs import Outcome, run_due
+from flows.schedule.due_runs import Outcome, ScheduleNews, run_due, send_notice, together
 from flows.schedule.field_schedule import FieldSchedule, read_moment
-from flows.schedule.notices import ScheduleNews, send_notice, together
 from flows.schedule.served import ServedField, ServeRequest, read_served, served_archive, served_field, served_weights
 from flows.schedule.times import WallClock
 from flows.schedule.watcher import LIMIT, REPROCESS_LOCK, SKIPPED
@@ -71,11 +70,11 @@ def _run(one: ServedField, schedule: FieldSchedule, moment: datetime, request: S
 
 
 def _survey(one: ServedField, due: datetime, request: ServeRequest) -> Path:
-    from flows.publish import prefect_artifacts, survey_command  # torch, once the run is noted as begun
+    from flows.publish import survey_command  # torch, once the run is noted as begun
 
     published = survey_command.run_survey(one.settings_of(due, request.timetable), on_stderr())
     with suppress(Exception):  # a server that is gone: the archive has it all
-        prefect_artifacts.publish_artifacts(published, one.name, one.settings.out)
+        survey_command.publish_artifacts(published, one.name, one.settings.out)
     return published.folder
 
 

@@ -16,9 +16,8 @@ from rich.console import Console
 from rich.markup import escape
 
 from flows.cli.app import stderr
-from flows.schedule.due_runs import Outcome, Survey, Tell, run_all
+from flows.schedule.due_runs import Outcome, ScheduleNews, Survey, Tell, notice_address, run_all, send_notice, together
 from flows.schedule.field_schedule import FieldSchedule
-from flows.schedule.notices import ScheduleNews, notice_address, send_notice, together
 from flows.schedule.rig_lock import RigLock, hold_place
 from flows.schedule.served import ServedField, ServeRequest, load_field
 from flows.schedule.server import serve_prefect

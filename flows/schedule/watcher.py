@@ -14,9 +14,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from flows.schedule.due_runs import Tell
+from flows.schedule.due_runs import ScheduleNews, Tell, send_notice, together
 from flows.schedule.field_schedule import FieldSchedule, moment_words, read_moment
-from flows.schedule.notices import ScheduleNews, send_notice, together
 from flows.schedule.rig_lock import RigLock
 from flows.schedule.served import ServedField, ServeRequest
 from flows.schedule.times import Timetable

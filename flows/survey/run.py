@@ -15,8 +15,16 @@ from numpy.typing import NDArray
 
 from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
 from flows.survey.capture_plan import CapturePlan, check_memory, plan_capture
-from flows.survey.scene import check_labels, check_mask, farm_refusal, judged_labels, open_scene
-from flows.survey.sources import FieldSource, field_source, for_rig
+from flows.survey.scene import (
+    FieldSource,
+    check_labels,
+    check_mask,
+    farm_refusal,
+    field_source,
+    for_rig,
+    judged_labels,
+    open_scene,
+)
 from models.policies.vgg_file import VggFile
 from models.weights.files import (
     Description,

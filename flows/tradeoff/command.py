@@ -27,9 +27,7 @@ from rich.table import Table
 
 import flows.tradeoff.farm
 import flows.tradeoff.rectify
-import flows.tradeoff.simulate
-import flows.tradeoff.simulate_light
-import flows.tradeoff.simulate_noise  # noqa: F401 - each registers its entries
+import flows.tradeoff.simulate  # noqa: F401 - each registers its entries
 from flows.publish.panels import INK, MUTED
 from flows.terminal.figures import format_seconds
 from flows.tradeoff.entries import Point, Result, cheapest_within, find_tradeoffs, measure_tradeoff, registered

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from flows.survey.run import SurveyRun
 from flows.survey.stage import Product, Wanted, stage
-from flows.survey.stages.class_map import glance_at, patch_columns
 from flows.survey.stages.effects import source_with
-from flows.survey.stages.registration import load_registration
+from flows.survey.stages.maps import glance_at, patch_columns
+from flows.survey.stages.placement import load_registration
 from models.evaluation.metrics import (
     agreement,
     average_accuracy,
