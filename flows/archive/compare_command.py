@@ -72,9 +72,7 @@ def compare(archive: ArchiveName, old: str, new: str, *, out: OutFolder = None, 
 def find_run(catalogue: Catalogue, text: str) -> Run:
     """A run by its id; ``latest`` is the newest that left a map, ``previous`` the one before it of the same field.
 
-    Raises
-    ------
-    ArchiveError : there is none.
+    Raises ArchiveError: there is none.
     """
     mapped = [run for run in catalogue.runs if "class_map" in run.products]
     if text not in ("latest", "previous"):

@@ -46,9 +46,7 @@ class ExportedRun:
     def store(self, product: str) -> StageRef | None:
         """The store behind a product, None where the run has no such product.
 
-        Raises
-        ------
-        IncompleteStoreError : the archive does not have it any more, or a file of it is missing or cut short.
+        Raises IncompleteStoreError: the archive does not have it any more, or a file of it is missing or cut short.
         """
         uri = self.receipt["products"].get(product)
         if uri is None:
@@ -82,10 +80,7 @@ class ExportedRun:
 def open_exported(archive: Archive, name: str | None) -> ExportedRun:
     """Open a run by its name or address, the latest without one.
 
-    Raises
-    ------
-    SettingsError : there is no such run, or none at all.
-    IncompleteStoreError : its receipt cannot be read.
+    Raises SettingsError: there is no such run, or none at all; IncompleteStoreError: its receipt cannot be read.
     """
     runs = archive.runs()
     if not runs:

@@ -90,9 +90,8 @@ class Forecast:
 def forecast(settings: Settings) -> Forecast:
     """Tell of every stage what a survey of these settings would do. Writes nothing.
 
-    Raises
-    ------
-    PipelineError : what the survey itself would refuse at its start, but for a scene that this machine cannot hold.
+    Raises PipelineError: what the survey itself would refuse at its start, but for a scene that this machine cannot
+    hold.
     """
     with tempfile.TemporaryDirectory(prefix="spectralzoom-plan-") as empty:
         archive = Archive(Path(empty), writes=False)  # where there is none yet

@@ -115,12 +115,9 @@ def run_reprocess(
     """Survey again what was asked for; progress on ``console``, the summary on stdout and in a file.
 
     Fields whose newest run is already as it would become are skipped: the same command goes on after an interruption.
-    The file is there before the first field is begun, and its ``finished`` is null until all have been.
-
-    Raises
-    ------
-    SettingsError : a date or stage that is none, no field is called so, or ``out`` lies in the archive.
-    ArchiveError : the archive cannot be read or written, or there is no room for the summary.
+    The file is there before the first field is begun, and its ``finished`` is null until all have been. Raises
+    SettingsError: a date or stage that is none, no field is called so, or ``out`` lies in the archive; ArchiveError:
+    the archive cannot be read or written, or there is no room for the summary.
     """
     opened = open_archive(request.archive, create=False, write=not request.dry_run)
     folder = opened.around if request.out is None else check_outside(request.out, opened.root)
@@ -274,12 +271,9 @@ def run_judge(
 ) -> Receipt:
     """Judge a run's map and add its accuracy to the run; gives its receipt, as it is where it has what is asked for.
 
-    ``name`` may be `latest` or `previous`; what is None is as the survey was asked for.
-
-    Raises
-    ------
-    ArchiveError : there is no such run, it is damaged, or lacks what is needed.
-    SceneError, WeightsError : scene, labels or weights are not those of the run, or there are no labels.
+    ``name`` may be `latest` or `previous`; what is None is as the survey was asked for. Raises ArchiveError: there is
+    no such run, it is damaged, or lacks what is needed; SceneError, WeightsError: scene, labels or weights are not
+    those of the run, or there are no labels.
     """
     opened = open_archive(archive, create=False)
     catalogue = Catalogue.read(opened.root)

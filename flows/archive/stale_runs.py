@@ -78,10 +78,7 @@ def asked_again(run: Run, out: str | Path, weights: Path | None) -> Settings:
     """The settings of a run for another survey into the archive ``out``, with other weights if they are given.
 
     A farm is asked for by the law that the run was drawn by: it is the same land, or none where the law was removed.
-
-    Raises
-    ------
-    SettingsError, BudgetError : the run's settings cannot be read, or are not of this version.
+    Raises SettingsError, BudgetError: the run's settings cannot be read, or are not of this version.
     """
     if not run.settings:
         raise SettingsError(f"the settings of {run.uri} cannot be read ({run.problem}); survey this field by hand")

@@ -55,10 +55,8 @@ def run_evaluate(request: EvaluateRequest, console: Console, *, as_json: bool = 
 def evaluate_weights(request: EvaluateRequest, show: Show = lambda what, done, words: None) -> dict[str, Any]:
     """Judge weights on every frame of a data set that they were not trained on.
 
-    Raises
-    ------
-    SettingsError : shares, policies, weights or controls that cannot be.
-    SceneError : no frame is left, one that was asked for by name has no weights left, or one has no labels.
+    Raises SettingsError: shares, policies, weights or controls that cannot be; SceneError: no frame is left, one that
+    was asked for by name has no weights left, or one has no labels.
     """
     request = checked_request(request)
     keep_freed_memory()

@@ -205,9 +205,7 @@ def capture_seconds(
 def plan_seconds(look: Look, camera: LineCamera, cost: CostModel, seats: NDArray[np.integer]) -> tuple[float, float]:
     """Seconds of the coarse pass and these seats by runs of lines (or the full scan), and of a full scan alone.
 
-    Raises
-    ------
-    PoseError : the field is beyond the mirror's range.
+    Raises PoseError: the field is beyond the mirror's range.
     """
     grid = look.seen.grid
     along, _, full_s = cheapest_full(grid, camera, cost)

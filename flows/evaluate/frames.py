@@ -62,9 +62,7 @@ class EvaluateRequest:
 def checked_request(request: EvaluateRequest) -> EvaluateRequest:
     """Put shares in order and drop what is there anyway.
 
-    Raises
-    ------
-    SettingsError : a number out of its range, or a policy that cannot be judged; names the flag.
+    Raises SettingsError: a number out of its range, or a policy that cannot be judged; names the flag.
     """
     for share in request.shares:
         if not 0 <= share <= 1:
@@ -166,10 +164,8 @@ class Look(Sight):
 def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
     """Describe the weights; none of their tensors is read yet.
 
-    Raises
-    ------
-    SettingsError : none given, or weights that are not seeds of one another: other sizes or classes.
-    WeightsError : a file that cannot be read.
+    Raises SettingsError: none given, or weights that are not seeds of one another: other sizes or classes;
+    WeightsError: a file that cannot be read.
     """
     if not paths:
         raise SettingsError("evaluate needs --weights FILE; train some with: spectralzoom train DATASET -o FILE")
@@ -202,10 +198,7 @@ def open_frames(
 ) -> TrainingData:
     """Name the frames to judge on; ``train`` of what comes holds them all, whoever was trained on them.
 
-    Raises
-    ------
-    SettingsError : a choice that does not go with the data set.
-    SceneError : no scene, or a name that it has not.
+    Raises SettingsError: a choice that does not go with the data set; SceneError: no scene, or a name that it has not.
     """
     built_in = dataset in FARM_NAMES
     data = open_training_data(dataset, 0, 1 if built_in else scenes, camera, **choices)
@@ -286,11 +279,9 @@ def sort_frames(
 ) -> Jobs:
     """Look at every frame for who was trained on it.
 
-    Raises
-    ------
-    SceneError : no frame or no labelled pixel is left, a frame that was asked for by name has no weights left, a
-        control has no frame left, or a frame that cannot be judged.
-    SettingsError : files that were trained on different pixels of one frame.
+    Raises SceneError: no frame or no labelled pixel is left, a frame that was asked for by name has no weights left, a
+    control has no frame left, or a frame that cannot be judged; SettingsError: files that were trained on different
+    pixels of one frame.
     """
     jobs, labelled = Jobs([], []), False
     chosen = any(request.choices.get(what) is not None for what in ("bands", "wavelengths"))

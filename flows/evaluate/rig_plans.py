@@ -174,9 +174,7 @@ def _judged(look: Look, weights: Weights, seats: Seats) -> dict[str, Any]:
 def camera_of_equal_time(look: Look, camera: LineCamera, cost: CostModel, seats: Seats) -> LineCamera:
     """Give the camera whose exposure lets coarse pass and seats take the seconds of a full scan with ``camera``.
 
-    Raises
-    ------
-    PoseError : the field is beyond the mirror's range.
+    Raises PoseError: the field is beyond the mirror's range.
     """
     exposed = camera
     for _ in range(ROUNDS):

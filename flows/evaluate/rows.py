@@ -172,11 +172,8 @@ POLICY = "sobel"  # of the paper's network
 def open_controls(paths: tuple[Path, ...], weights: list[Candidate]) -> list[Candidate]:
     """Describe the controls; none of their tensors is read yet.
 
-    Raises
-    ------
-    SettingsError : weights of two scales, of other classes or another camera than the weights they stand beside, two
-        files of one design that differ in sizes, or one file twice.
-    WeightsError : a file that cannot be read.
+    Raises SettingsError: weights of two scales, of other classes or another camera than the weights they stand beside,
+    two files of one design that differ in sizes, or one file twice; WeightsError: a file that cannot be read.
     """
     found = [Candidate.of(path) for path in paths]
     first: dict[str, Candidate] = {}

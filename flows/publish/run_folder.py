@@ -105,10 +105,7 @@ def add_accuracy(run: SurveyRun, draft: RunDraft, products: Products, stage: Sta
 def load_receipt(folder: Path) -> Receipt:
     """Read the receipt of a published run.
 
-    Raises
-    ------
-    IncompleteStoreError : it is not as it was published.
-    ShapeError : it lacks what a receipt has.
+    Raises IncompleteStoreError: it is not as it was published; ShapeError: it lacks what a receipt has.
     """
     found = read_run(folder, {})
     if found.problem is not None:

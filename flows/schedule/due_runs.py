@@ -51,11 +51,8 @@ def run_due(
     """Run one due survey, or skip it where the rig is not free in time, and note how it ended.
 
     A process that dies in it, and an operator's interruption, leave a beginning without an end: the next process that
-    looks resumes the run or notes that it failed.
-
-    Raises
-    ------
-    ArchiveError : the ledger cannot be written; `FieldSchedule.reap` accounts for the run later.
+    looks resumes the run or notes that it failed. Raises ArchiveError: the ledger cannot be written;
+    `FieldSchedule.reap` accounts for the run later.
     """
     latest = schedule.timetable.latest_start(due, schedule.late)
     resumed = due in schedule.state().open
@@ -240,10 +237,7 @@ def notice_address(given: str | None) -> str | None:
     """Where notices go: an address, or one in the file that was given, or in SPECTRALZOOM_NOTIFY; None without any.
 
     What stands on a command line can be read in the process list: an address that holds a token belongs in a file.
-
-    Raises
-    ------
-    SettingsError : it is no address that can be posted to, or there is no such file.
+    Raises SettingsError: it is no address that can be posted to, or there is no such file.
     """
     named = os.environ.get(NAMED_BY) or None
     if given is None:

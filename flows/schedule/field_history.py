@@ -52,12 +52,7 @@ class FieldHistory:
 
 
 def read_histories(archive: Archive, field: str | None = None) -> list[FieldHistory]:
-    """The histories of all fields by name, or of one.
-
-    Raises
-    ------
-    ArchiveError : no field is called so.
-    """
+    """The histories of all fields by name, or of one. Raises ArchiveError: no field is called so."""
     catalogue = Catalogue.read(archive.root)
     kept = {ledger.field: ledger for ledger in ledgers(archive.root)}
     names = sorted({*kept, *(called(run) for run in catalogue.runs)})

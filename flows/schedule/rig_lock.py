@@ -48,10 +48,8 @@ class RigLock:
     def take(self, words: str = "") -> bool:
         """Try to take it, without waiting; ``words`` tell others who holds it.
 
-        Raises
-        ------
-        RigError : it cannot be had at all, held or not; the rig is not to be used then.
-        ArchiveError : a link is in the place of its file.
+        Raises RigError: it cannot be had at all, held or not; the rig is not to be used then; ArchiveError: a link is
+        in the place of its file.
         """
         if not self.held:
             self._release = hold_place(self.place, f"{words or 'a survey'} (process {os.getpid()})")
@@ -103,9 +101,7 @@ def rig_lock(settings: Settings, archive: Path) -> RigLock:
 def hold_place(place: Path | str, words: str) -> Callable[[], None] | None:
     """Hold a name in the kernel, or a file, until what is returned is called; None where another holds it.
 
-    Raises
-    ------
-    RigError : it cannot be held by anybody here. ArchiveError : a link is in the place of a file.
+    Raises RigError: it cannot be held by anybody here; ArchiveError: a link is in the place of a file.
     """
     try:
         if isinstance(place, str):
@@ -144,9 +140,7 @@ def _bind(held: ExitStack, name: str) -> None:
 def rig_to_oneself(settings: Settings, words: str) -> Iterator[None]:
     """Hold the rig while the block runs; the simulated one needs no holding.
 
-    Raises
-    ------
-    RigError : another survey holds it.
+    Raises RigError: another survey holds it.
     """
     if _port(settings) is None:
         yield

@@ -110,9 +110,7 @@ def _tell(words: str) -> None:
 def load_fields(files: Sequence[Path], out: str | None = None) -> list[ServedField]:
     """Read the settings of every field, in turn, and see whether they can be surveyed; nothing is captured.
 
-    Raises
-    ------
-    PipelineError : there are none, two are called the same, or the first that cannot be surveyed, named.
+    Raises PipelineError: there are none, two are called the same, or the first that cannot be surveyed, named.
     """
     if not files:
         raise SettingsError("no fields: give the settings file of one or more, such as serve north.toml --every 30m")
@@ -134,10 +132,7 @@ def load_fields(files: Sequence[Path], out: str | None = None) -> list[ServedFie
 def alone_on(fields: Sequence[ServedField]) -> Iterator[None]:
     """Keep another serve off the archives and the rigs of these fields while the block runs.
 
-    Raises
-    ------
-    ArchiveError : another serves one of the archives.
-    RigError : another serves one of the rigs.
+    Raises ArchiveError: another serves one of the archives; RigError: another serves one of the rigs.
     """
     roots: Mapping[Path, str] = {one.archive: str(one.settings.out) for one in fields}
     rigs = {one.lock().of_servers(): one.settings.rig.port for one in fields if one.settings.source == "rig"}
@@ -187,9 +182,7 @@ def serve_plain(
 ) -> None:
     """Serve schedules until ``until``, or until interrupted; then they are closed, and what began is resumed later.
 
-    Raises
-    ------
-    PipelineError : a ledger cannot be written at the start; what was opened until then is closed.
+    Raises PipelineError: a ledger cannot be written at the start; what was opened until then is closed.
     """
     watch, news = clock or SystemWallClock(), ScheduleNews(schedules, lambda name, error: tell(f"{name}: {error}"))
     with ExitStack() as opened:

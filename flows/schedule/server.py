@@ -65,11 +65,7 @@ def server_for(home: Path, port: int) -> Iterator[LocalServer | None]:
 
     None where PREFECT_API_URL names one, which is left as it is. One of our own wants a password: what the variable
     PREFECT_SERVER_API_AUTH_STRING says, or one that is kept in ``home`` for this user. Nothing outside this machine is
-    asked.
-
-    Raises
-    ------
-    SettingsError : the port is taken, the server did not start, or the one that is named does not answer.
+    asked. Raises SettingsError: the port is taken, the server did not start, or the one that is named does not answer.
     """
     if named := os.environ.get("PREFECT_API_URL"):
         _check_answers(named)
@@ -158,9 +154,7 @@ def _check_free(port: int) -> None:
 def serve_prefect(request: ServeRequest, tell: Tell) -> None:
     """Serve until interrupted.
 
-    Raises
-    ------
-    PipelineError : no server, or a ledger cannot be written at the start; what was opened until then is closed.
+    Raises PipelineError: no server, or a ledger cannot be written at the start; what was opened until then is closed.
     """
     schedules, home = request.schedules(), request.fields[0].archive / ".prefect"
     log = home / "surveys.log"

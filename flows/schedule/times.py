@@ -90,9 +90,7 @@ class Timetable:
 def parse_timetable(cron: str | None, every: str | None, timezone: str | None = None) -> Timetable:
     """Check what was given of a schedule.
 
-    Raises
-    ------
-    SettingsError : not exactly one of both is given, or it, or the time zone, is none.
+    Raises SettingsError: not exactly one of both is given, or it, or the time zone, is none.
     """
     if (cron is None) == (every is None):
         got = "neither" if cron is None else "both"

@@ -123,11 +123,8 @@ def load_settings(path: str | Path | None = None, flags: Mapping[str, object] | 
     """Read the TOML file (None: defaults and flags alone), lay the flags over it and check the whole.
 
     Relative paths in the file start at its folder, those of flags at the current one. Flags are keys as in the file,
-    ``camera.exposure_ms`` for one in a table; None means not given.
-
-    Raises
-    ------
-    SettingsError, BudgetError : the first key that cannot be used, with its place and what it should be.
+    ``camera.exposure_ms`` for one in a table; None means not given. Raises SettingsError, BudgetError: the first key
+    that cannot be used, with its place and what it should be.
     """
     try:
         table = {} if path is None else anchor_paths(read_toml(Path(path)), Path(path).parent)
@@ -206,9 +203,7 @@ def _hint(full: str, known: Mapping[str, Declared], prefix: str) -> str:
 def of_this_version(stored: Mapping[str, Any]) -> dict[str, Any]:
     """Give what a receipt says of settings that there are: keys of before are left out, in tables too.
 
-    Raises
-    ------
-    SettingsError : the survey had two rounds of detail, of which this version would make but one.
+    Raises SettingsError: the survey had two rounds of detail, of which this version would make but one.
     """
     if stored.get("rounds", 1) != 1:
         raise SettingsError(

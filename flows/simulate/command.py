@@ -62,12 +62,9 @@ def run_simulate(
 ) -> dict[str, Any]:
     """Scan a scene into an archive, with progress on ``console``; give the record that --json prints.
 
-    With a ``picture`` (PNG) the scan is held against one with everything on.
-
-    Raises
-    ------
-    BoundError : what would be left out changes the worst part of the scene by more than its bound says.
-    SettingsError, SceneError, ArchiveError : what was asked for cannot be.
+    With a ``picture`` (PNG) the scan is held against one with everything on. Raises BoundError: what would be left out
+    changes the worst part of the scene by more than its bound says; SettingsError, SceneError, ArchiveError: what was
+    asked for cannot be.
     """
     if picture is not None:
         _check_picture(picture)

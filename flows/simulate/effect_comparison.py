@@ -132,9 +132,7 @@ def compare_with_everything(
 ) -> Comparison:
     """Take lines of a scan with the effects chosen and with everything on, exact; ``say`` is told how many, and why.
 
-    Raises
-    ------
-    BoundError : expected light differs by more than the bound of the decision; names the place.
+    Raises BoundError: expected light differs by more than the bound of the decision; names the place.
     """
     clock = sweep_starts(sweeps, run.camera, run.settings.cost)
     chosen = source_with(run.simulated, effects, clock)

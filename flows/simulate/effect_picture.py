@@ -53,12 +53,7 @@ class Words:
 
 
 def draw_comparison(path: str | Path, found: Comparison, words: Words) -> None:
-    """Draw the three panels as a PNG, 1600 px wide.
-
-    Raises
-    ------
-    OSError : the file cannot be written.
-    """
+    """Draw the three panels as a PNG, 1600 px wide. Raises OSError: the file cannot be written."""
     with mpl.rc_context(_STYLE):
         figure = _compose(found, words)
         FigureCanvasAgg(figure)

@@ -45,9 +45,7 @@ class EmulateRequest:
     def check(self) -> None:
         """Refuse what cannot be, before minutes are spent on the scene.
 
-        Raises
-        ------
-        SettingsError : a fault, a speed or a file that cannot be.
+        Raises SettingsError: a fault, a speed or a file that cannot be.
         """
         read_faults(self.faults)
         FastClock(self.speed)
@@ -60,9 +58,7 @@ class EmulateRequest:
 def emulated_settings(path: Path | None, flags: Mapping[str, object]) -> Settings:
     """Read the settings of what is emulated; a built-in scene is small where nothing says how large.
 
-    Raises
-    ------
-    SettingsError : a key or a flag cannot be used.
+    Raises SettingsError: a key or a flag cannot be used.
     """
     wanted = load_settings(path, flags)
     small = wanted.scene in BUILT_IN_SCENES and wanted.size is None
@@ -74,9 +70,7 @@ def run_emulate(
 ) -> int:
     """Emulate a rig until Ctrl-C, a SIGTERM or ``ended``; how to connect goes to stdout, its state to ``console``.
 
-    Raises
-    ------
-    PipelineError : what was asked for cannot be.
+    Raises PipelineError: what was asked for cannot be.
     """
     request.check()
     mirror_faults, camera_faults = read_faults(request.faults)
@@ -181,9 +175,7 @@ def _ending(event: threading.Event) -> Iterator[threading.Event]:
 def emulated_source(settings: Settings) -> tuple[SimulatedSource, tuple[str, ...]]:
     """Give the scene through the simulated rig, and what was assumed of it. Nothing is kept.
 
-    Raises
-    ------
-    PipelineError : the scene or the effects cannot be used.
+    Raises PipelineError: the scene or the effects cannot be used.
     """
     with tempfile.TemporaryDirectory(prefix="spectralzoom-") as folder:
         apart = replace(settings, source="sim", out=str(Path(folder) / "effects"))

@@ -39,13 +39,9 @@ def plan_capture(settings: Settings, grid: SceneGrid) -> CapturePlan:
     """Lay out coarse and full sweeps; where the mirror may look beside the plan, with overlaps and margins.
 
     Either pass overlaps by what its own registration needs. Its map lies as the sweep that is held does, which another
-    may lie beside by twice the mirror's error: so much earlier sweeps begin, and later they end.
-
-    Raises
-    ------
-    SettingsError : the mirror may be so far off that overlaps take whole lines.
-    BudgetError : the budget does not pay for the coarse pass.
-    PoseError : the field is beyond the mirror's range.
+    may lie beside by twice the mirror's error: so much earlier sweeps begin, and later they end. Raises SettingsError:
+    the mirror may be so far off that overlaps take whole lines; BudgetError: the budget does not pay for the coarse
+    pass; PoseError: the field is beyond the mirror's range.
     """
     camera, cost = settings.camera, settings.cost
     along, coarse, full = lay_out_sweeps(settings, grid)
@@ -58,10 +54,8 @@ def plan_capture(settings: Settings, grid: SceneGrid) -> CapturePlan:
 def lay_out_sweeps(settings: Settings, grid: SceneGrid) -> tuple[Axis, list[Sweep], list[Sweep]]:
     """Give the axis that lines lie along, the coarse sweeps, and those of the full scan.
 
-    Raises
-    ------
-    SettingsError : the mirror may be so far off that overlaps take whole lines.
-    PoseError : the field is beyond the mirror's range.
+    Raises SettingsError: the mirror may be so far off that overlaps take whole lines; PoseError: the field is beyond
+    the mirror's range.
     """
     camera, cost, apart = settings.camera, settings.cost, 2 * settings.pointing_px
     coarse_overlap = _overlap(settings, grid.factor)
@@ -89,9 +83,7 @@ def _overlap(settings: Settings, step: int) -> float:
 def check_memory(settings: Settings, source: SimulatedSource, grid: SceneGrid, plan: CapturePlan) -> None:
     """Refuse a memory in which no tile of the mosaic can be made, before anything is captured.
 
-    Raises
-    ------
-    SettingsError : not even one tile at a time fits; names the least that does.
+    Raises SettingsError: not even one tile at a time fits; names the least that does.
     """
     pixels = PixelGrid.of_scene(grid, grid.factor)
     placed = [place(_PlannedSweep(source, sweep), settings.camera) for sweep in plan.coarse]

@@ -45,11 +45,8 @@ def survey_with_prefect(runner: StageRunner, finish: Callable[[Step, Products], 
     """Run the survey as a Prefect flow on an ephemeral server, or on the one that PREFECT_API_URL names.
 
     ``finish`` is called in the flow once the map is drawn, with what runs a stage as a task; what it gives is given.
-
-    Raises
-    ------
-    EngineUnavailable : the server did not start; nothing of the survey has run.
-    PipelineError : from a stage, as with the plain engine.
+    Raises EngineUnavailable: the server did not start; nothing of the survey has run; PipelineError: from a stage, as
+    with the plain engine.
     """
     if inside_flow():
         step = _task_step(runner)

@@ -130,11 +130,8 @@ class SurveyRun(CaptureRun):
 def open_run(settings: Settings, *, planning: bool = False) -> SurveyRun:
     """Open everything that a survey needs; the archive last, so that bad input leaves no trace of itself.
 
-    With ``planning`` a scene that this machine cannot hold is no error: ``refused`` of the run says so.
-
-    Raises
-    ------
-    PipelineError : the first thing that cannot be used; see `pipeline.errors` for the kinds.
+    With ``planning`` a scene that this machine cannot hold is no error: ``refused`` of the run says so. Raises
+    PipelineError: the first thing that cannot be used; see `pipeline.errors` for the kinds.
     """
     settings = for_rig(settings)
     path = weights_path(settings)
@@ -205,9 +202,7 @@ def _vgg_file(settings: Settings) -> VggFile | None:
 def weights_path(settings: Settings) -> Path:
     """Where the weights of a survey lie: those that come with the house for its own scenes.
 
-    Raises
-    ------
-    SettingsError : none were given for a scene of one's own.
+    Raises SettingsError: none were given for a scene of one's own.
     """
     if settings.weights is not None:
         return Path(settings.weights)

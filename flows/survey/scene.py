@@ -36,10 +36,8 @@ SAME_HOUR = 0.5  # by which true solar time is at most off mean solar time, and 
 def open_scene(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
     """Open the settings' scene, and say what was assumed of it.
 
-    Raises
-    ------
-    SceneError, WavelengthError : the file cannot be used.
-    SettingsError : what was given does not go with a built-in scene.
+    Raises SceneError, WavelengthError: the file cannot be used; SettingsError: what was given does not go with a
+    built-in scene.
     """
     if settings.scene == RIG_FIELD:
         return _field_before_rig(settings), ()
@@ -58,12 +56,7 @@ def open_scene(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
 
 
 def _field_before_rig(settings: Settings) -> RasterScene:
-    """Give a field of which only size and bands are known.
-
-    Raises
-    ------
-    SettingsError : they are not given.
-    """
+    """Give a field of which only size and bands are known. Raises SettingsError: they are not given."""
     for name, value in {"size": settings.size, "wavelengths": settings.wavelengths}.items():
         if value is None:
             raise SettingsError(

@@ -188,9 +188,7 @@ def find_tradeoffs(stage: str) -> tuple[Tradeoff[Any, Any], ...]:
 def measure_tradeoff(tradeoff: Tradeoff[State, Output], *, repeats: int = 5, seed: int = 0) -> Result:
     """Run every setting ``repeats`` times in turn, on one thread, after one run of each that warms up and is judged.
 
-    Raises
-    ------
-    SettingsError : ``repeats`` is below 1.
+    Raises SettingsError: ``repeats`` is below 1.
     """
     if repeats < 1:
         raise SettingsError(f"repeats must be at least 1, got {repeats}")

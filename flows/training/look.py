@@ -60,11 +60,8 @@ def observe_scene(
 ) -> Observation:
     """Look at a labelled scene, and project what was seen onto the basis; the noise follows from ``rng``.
 
-    A built-in farm is surveyed with every line there is, by a seed that ``rng`` draws.
-
-    Raises
-    ------
-    SceneError : the scene has no labels, or a pixel that no line reached.
+    A built-in farm is surveyed with every line there is, by a seed that ``rng`` draws. Raises SceneError: the scene has
+    no labels, or a pixel that no line reached.
     """
     if law_of_key(scene.key) is None:
         return observe(scene, camera, grid, basis, rng)

@@ -64,10 +64,8 @@ Report = Callable[[str, float, str], None]  # what is done, how far 0..1, a figu
 def train_weights(request: TrainRequest, report: Report = lambda what, done, figure: None) -> dict[str, Any]:
     """Train, validate and save; give the record that stands in the file.
 
-    Raises
-    ------
-    SceneError : no labels, one class only, or scenes whose bands or classes differ.
-    SettingsError : a folder to write to that does not exist, a folder in the place of a file, or sizes that do not fit.
+    Raises SceneError: no labels, one class only, or scenes whose bands or classes differ; SettingsError: a folder to
+    write to that does not exist, a folder in the place of a file, or sizes that do not fit.
     """
     checkpoint = request.out.with_name(request.out.name + ".checkpoint")
     _check_places(request.out, checkpoint)
@@ -226,10 +224,8 @@ Split = dict[str, Any]
 def open_start(init: Path | None, tokens: Mapping[str, Any], preset: Preset) -> StartFile | None:
     """Open the file to begin from; None without one.
 
-    Raises
-    ------
-    SettingsError : no such file, tokens of other sizes than ``tokens`` and the usual ones, or another network.
-    WeightsError : a file of no kind that is known.
+    Raises SettingsError: no such file, tokens of other sizes than ``tokens`` and the usual ones, or another network;
+    WeightsError: a file of no kind that is known.
     """
     if init is None:
         return None

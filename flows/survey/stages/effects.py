@@ -41,12 +41,8 @@ DRAFT, VERIFIED = 0.3, 1.0
 def choose_effects(run: CaptureRun) -> Wanted:
     """Decide for scene and rig which effects to simulate, and check it on the worst lines of the scene.
 
-    Where a rig takes the lines there is nothing to decide.
-
-    Raises
-    ------
-    BoundError : what would be left out changes light by more than its bound says.
-    SceneError : the scene holds a number that is not finite.
+    Where a rig takes the lines there is nothing to decide. Raises BoundError: what would be left out changes light by
+    more than its bound says; SceneError: the scene holds a number that is not finite.
     """
     tolerance, asked = run.settings.tol, run.settings.effects
 
@@ -87,9 +83,7 @@ def load_manifest(effects: StageRef) -> dict[str, Any]:
 def chosen_effects(effects: StageRef) -> dict[Effect, str]:
     """Read the effects that are on with their variants, in the order of the chain.
 
-    Raises
-    ------
-    IncompleteStoreError : the store names an effect that this version does not know.
+    Raises IncompleteStoreError: the store names an effect that this version does not know.
     """
     chosen: dict[Effect, str] = {}
     for row in load_manifest(effects)["effects"]:
