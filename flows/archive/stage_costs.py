@@ -119,12 +119,14 @@ class PastCosts:
     def _extent_then(self, record: Store) -> Extent:
         """How much a survey was, as far as a store and those that it rests on tell by their parameters."""
         below = self._below(record)
-        captures = {_is_fine(store): store for store in below if store.ref.stage == "capture"}
-        passes = [store for store in below if store.ref.stage == "capture" and _is_fine(store)]
+        captures = {_is_fine(store): store for store in below if store.ref.stage == _stored_by("capture_coarse")}
+        passes = [store for store in below if store.ref.stage == _stored_by("capture_fine") and _is_fine(store)]
         own = self._extent
-        if record.ref.stage == "effects":  # looks at a few places of a scene, whatever its size
+        if record.ref.stage == _stored_by("choose_effects"):  # looks at a few places of a scene, whatever its size
             return own
-        if record.ref.stage == "locate":  # is of a path, and of no field: its own grid is that of coarse pixels
+        if record.ref.stage == _stored_by(
+            "locate"
+        ):  # is of a path, and of no field: its own grid is that of coarse pixels
             height, width = record.params["grid"]["shape"]
             factor = own.grid.factor
             return replace(own, grid=SceneGrid(height * factor, width * factor, own.grid.patch, factor))
@@ -160,6 +162,10 @@ def scaled_cost(works: Sequence[float], took: Sequence[float], wanted: float) ->
         start = min(max(took[0] - slope * works[0], 0.0), max(took) / 2)
         start = start if start < took[0] else 0.0
     return start + (took[0] - start) * wanted / works[0]
+
+
+def _stored_by(stage: str) -> str:
+    return STAGES[stage].product.name
 
 
 def _is_fine(capture: Store) -> bool:

@@ -28,7 +28,7 @@ from flows.survey.stages.capture import captured
 from flows.survey.stages.effects import load_manifest
 from flows.survey.stages.maps import STORE, strange_pixels
 from flows.survey.stages.placement import SEATS_AT_ONCE, line_facts, load_registration, seen_shares
-from flows.survey.survey import Products, StageRunner
+from flows.survey.survey import STAGES, Products, StageRunner
 from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.geometry.scan import Sweep
@@ -46,21 +46,6 @@ from storage.arrays.ground_maps import load_ground_map, open_image
 from storage.arrays.mosaics import load_attention, open_patches
 from storage.arrays.quicklooks import choose_bands
 
-IN_STORES = {  # products of a receipt: the stage that leaves them, and where in its store
-    "effects": ("choose_effects", "/effects.json"),
-    "raw_coarse": ("capture_coarse", ""),
-    "lookup": ("locate", "/lookup.zarr"),
-    "mosaic": ("rectify", "/mosaic.zarr"),
-    "attention": ("attend", "/attention.zarr"),
-    "plan": ("attend", "/plan.json"),
-    "raw_fine": ("capture_fine", ""),
-    "patches": ("cut_patches", "/patches.zarr"),
-    "class_map": ("draw_map", "/class_map.zarr"),
-    "coarse_pointing": ("register_coarse", "/registration.json"),
-    "fine_pointing": ("register_fine", "/registration.json"),
-    "ground_map": ("ground", "/ground_map.zarr"),
-    "accuracy": ("evaluate", "/accuracy.json"),
-}
 LIBRARIES = ("spectralzoom", "numpy", "torch", "zarr", "xarray", "prefect")
 
 
@@ -95,7 +80,7 @@ def add_accuracy(run: SurveyRun, draft: RunDraft, products: Products, stage: Sta
         before,
         load_accuracy(products.of("evaluate")),
         stage,
-        _address("accuracy", products.of("evaluate")),
+        STAGES["evaluate"].addresses(products.of("evaluate"))["accuracy"],
         settings={name: asked[name] for name in names},
         judged=now(),
     )
@@ -135,8 +120,9 @@ def make_receipt(runner: StageRunner, products: Products, plan: FinePlan, starte
     simulation = None if not run.source.simulates else load_manifest(products.of("choose_effects"))
     if accuracy is not None and "segment_wall_s" in accuracy:
         savings["segment_wall_s"] = accuracy.pop("segment_wall_s")
-    there = {name: products.get(stage) for name, (stage, _) in IN_STORES.items()}
-    stores = {name: _address(name, ref) for name, ref in there.items() if ref is not None}
+    stores: dict[str, str] = {}
+    for name, ref in products.items():
+        stores |= {} if ref is None else STAGES[name].addresses(ref)
     unjudged: AccuracyIs = "pending" if run.settings.accuracy else "left out"
     accuracy_is = "judged" if accuracy is not None else unjudged if run.scene.labelled else "without labels"
     versions = {"python": platform.python_version()}
@@ -162,10 +148,6 @@ def make_receipt(runner: StageRunner, products: Products, plan: FinePlan, starte
 def asked_settings(run: SurveyRun) -> dict[str, object]:
     """The settings, so that they can be asked for from anywhere, and what was assumed beside them."""
     return {**anchor_paths(run.settings.to_dict(), Path.cwd()), "notes": list(run.notes)}
-
-
-def _address(name: str, ref: StageRef) -> str:
-    return f"{ref.uri}{IN_STORES[name][1]}"
 
 
 def _savings(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, Any]:

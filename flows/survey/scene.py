@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
@@ -148,7 +149,14 @@ def check_labels(scene: RasterScene, weights: Description) -> tuple[str, ...]:
     missing = [name for name in scene.class_names if name not in weights.class_names]
     if missing:
         known = ", ".join(weights.class_names)
-        raise SceneError(f"the labels have the class {missing[0]!r}, the weights know {known}; use weights for these")
+        told = "use weights for these"
+        if (found := re.fullmatch(r"class_(\d+)|colour_([0-9a-f]{6})", missing[0])) is not None:  # nobody named it
+            value = found[1] or list(bytes.fromhex(found[2]))
+            told += (
+                ", or say which class each value of the label file is, in a table [classes] of the scene.toml beside "
+                f"the scene's file: {weights.class_names[0]} = {value}"
+            )
+        raise SceneError(f"the labels have the class {missing[0]!r}, the weights know {known}; {told}")
     law, learnt = law_of_key(scene.key), law_of_key(str(weights.record.get("data")))
     if None not in (law, learnt) and law != learnt:
         return (f"the weights were trained on {learnt}, the scene is of {law}: expect a poorer map",)

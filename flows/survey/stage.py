@@ -73,6 +73,7 @@ class Stage:
     inputs: int | None  # of its stores, where another stage has the same product
     retries: int  # by Prefect, where a device or a disk failed
     judges: bool  # no part of the survey and of its cost: runs once the map is published
+    named: Mapping[str, str]  # what receipts call what it stores -> the file in its store, "" for the store as a whole
 
     def __call__(self, *args: Any) -> Wanted | None:
         """What the stage wants stored, for a run and the stores that it is made of."""
@@ -83,6 +84,10 @@ class Stage:
         wanted = self.wants(*args)
         assert wanted is not None, self.name
         return wanted
+
+    def addresses(self, ref: StageRef) -> dict[str, str]:
+        """Where the products of its store lie, by the names that receipts give them."""
+        return {name: f"{ref.uri}/{file}".rstrip("/") for name, file in self.named.items()}
 
     def key(self, wanted: Wanted) -> str:
         """The address of what is wanted: a hash of the version, the parameters and the inputs' keys."""
@@ -117,11 +122,16 @@ def stage(
     inputs: int | None = None,
     retries: int = 0,
     judges: bool = False,
+    named: Mapping[str, str] | None = None,
 ) -> Callable[[Callable[..., Wanted | None]], Stage]:
-    """Make a function a stage; see `Stage` for what is said of it. Its module lies in `flows.survey.stages`."""
+    """Make a function a stage; see `Stage` for what is said of it. Its module lies in `flows.survey.stages`.
+
+    Receipts and `explain` know its store by the stage's own name where ``named`` gives no others.
+    """
 
     def record(wants: Callable[..., Wanted | None]) -> Stage:
-        return Stage(name, title, product, wants, of, unit, size, after, inputs, retries, judges)
+        called = {name: ""} if named is None else named
+        return Stage(name, title, product, wants, of, unit, size, after, inputs, retries, judges, called)
 
     return record
 

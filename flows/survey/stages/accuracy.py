@@ -61,6 +61,7 @@ RECORD = "accuracy.json"
     unit="operations of a glance",
     size="surveys",
     judges=True,
+    named={"accuracy": RECORD},
 )
 def evaluate(
     run: SurveyRun, mosaic: StageRef, patches: StageRef, class_map: StageRef, effects: StageRef, *pointing: StageRef

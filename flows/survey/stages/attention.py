@@ -24,7 +24,14 @@ from storage.arrays.mosaics import Attention, load_attention, mosaic_brightness,
 ATTENTION = Product("attend", version=7, by_weights=True)
 
 
-@stage("attend", "attention and plan", ATTENTION, of=("rectify",), unit="pixels")
+@stage(
+    "attend",
+    "attention and plan",
+    ATTENTION,
+    of=("rectify",),
+    unit="pixels",
+    named={"attention": "attention.zarr", "plan": "plan.json"},
+)
 def attend(run: SurveyRun, mosaic: StageRef) -> Wanted:
     """Score every seat by the coarse mosaic, and plan the sweeps that show the most score in the time left."""
     settings = run.settings
@@ -103,6 +110,7 @@ FILE = "orientation.json"
     of=("rectify", "attend"),
     after=("draw_map",),
     unit="pixels",
+    named={"turned": FILE},
 )
 def compare_turned(run: SurveyRun, mosaic: StageRef, attention: StageRef) -> Wanted:
     """Plan the scores with lines along the other axis, and find which way crop rows run."""

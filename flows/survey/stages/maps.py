@@ -27,7 +27,15 @@ CLASS_MAP = Product("segment", version=5, by_weights=True)
 STRANGE = "strange.json"  # beside a map, where values were no readings
 
 
-@stage("draw_map", "class map", CLASS_MAP, of=("rectify", "cut_patches"), unit="operations of the map", size="pixels")
+@stage(
+    "draw_map",
+    "class map",
+    CLASS_MAP,
+    of=("rectify", "cut_patches"),
+    unit="operations of the map",
+    size="pixels",
+    named={"class_map": "class_map.zarr"},
+)
 def draw_map(run: SurveyRun, mosaic: StageRef, patches: StageRef) -> Wanted:
     """Read coarse and fine patches together and draw the class map, one region of the field after the other.
 
@@ -73,7 +81,15 @@ GROUND = Product("ground", version=2)
 STORE = "ground_map.zarr"
 
 
-@stage("ground", "map on the ground", GROUND, of=("draw_map", "rectify"), after=("compare_turned",), unit="pixels")
+@stage(
+    "ground",
+    "map on the ground",
+    GROUND,
+    of=("draw_map", "rectify"),
+    after=("compare_turned",),
+    unit="pixels",
+    named={"ground_map": STORE},
+)
 def ground(run: SurveyRun, class_map: StageRef, mosaic: StageRef) -> Wanted | None:
     """Draw the class map and the coarse picture on the ground; nothing where the settings have no pose."""
     grid = survey_grid(run)

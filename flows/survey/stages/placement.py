@@ -51,7 +51,13 @@ def record_of(registration: StageRef | None) -> Path | None:
 
 
 @stage(
-    "register_coarse", "seams of the coarse sweeps", POINTING, of=("capture_coarse",), inputs=1, unit="coarse values"
+    "register_coarse",
+    "seams of the coarse sweeps",
+    POINTING,
+    of=("capture_coarse",),
+    inputs=1,
+    unit="coarse values",
+    named={"coarse_pointing": RECORD},
 )
 def register_coarse(run: SurveyRun, raw: StageRef) -> Wanted | None:
     """Find pointing and light of the coarse sweeps from what neighbours show twice."""
@@ -112,7 +118,13 @@ def _window_record(seen: SeamWindow, names: Sequence[str]) -> dict[str, Any]:
 
 
 @stage(
-    "register_fine", "fine sweeps on the mosaic", POINTING, of=("capture_fine", "rectify"), inputs=2, unit="fine values"
+    "register_fine",
+    "fine sweeps on the mosaic",
+    POINTING,
+    of=("capture_fine", "rectify"),
+    inputs=2,
+    unit="fine values",
+    named={"fine_pointing": RECORD},
 )
 def register_fine(run: SurveyRun, raw: StageRef, mosaic: StageRef) -> Wanted | None:
     """Find where each fine sweep lies on the coarse mosaic, which itself may be off by as much."""
@@ -153,7 +165,14 @@ SEATS_AT_ONCE = 64
 CACHE_SHARE = 8  # raw lines kept for the next patches may take this part of the memory
 
 
-@stage("locate", "lookup", LOOKUP, of=("capture_coarse", "register_coarse"), unit="coarse pixels")
+@stage(
+    "locate",
+    "lookup",
+    LOOKUP,
+    of=("capture_coarse", "register_coarse"),
+    unit="coarse pixels",
+    named={"lookup": "lookup.zarr"},
+)
 def locate(run: SurveyRun, raw: StageRef, *registration: StageRef) -> Wanted:
     """Look up where each coarse pixel was seen: a table that every survey along the same path shares."""
     grid = PixelGrid.of_scene(run.grid, run.grid.factor)
@@ -184,7 +203,14 @@ def locate(run: SurveyRun, raw: StageRef, *registration: StageRef) -> Wanted:
     return Wanted(build, params)  # keyed by the paths, not by what was seen along them
 
 
-@stage("rectify", "mosaic", MOSAIC, of=("capture_coarse", "locate", "register_coarse"), unit="mosaic values")
+@stage(
+    "rectify",
+    "mosaic",
+    MOSAIC,
+    of=("capture_coarse", "locate", "register_coarse"),
+    unit="mosaic values",
+    named={"mosaic": "mosaic.zarr"},
+)
 def rectify(run: SurveyRun, raw: StageRef, lookup: StageRef, *registration: StageRef) -> Wanted:
     """Bring the coarse sweeps onto the scene grid and blend them into one mosaic, tile by tile."""
 
@@ -216,7 +242,14 @@ def rectify(run: SurveyRun, raw: StageRef, lookup: StageRef, *registration: Stag
     return Wanted(build, params, [raw, lookup, *registration])
 
 
-@stage("cut_patches", "fine patches", PATCHES, of=("attend", "capture_fine", "register_fine"), unit="patch values")
+@stage(
+    "cut_patches",
+    "fine patches",
+    PATCHES,
+    of=("attend", "capture_fine", "register_fine"),
+    unit="patch values",
+    named={"patches": "patches.zarr"},
+)
 def cut_patches(run: SurveyRun, attention: StageRef, raw: StageRef, *registration: StageRef) -> Wanted:
     """Bring every chosen seat onto the scene grid, one patch a seat; NaN where a mirror off the plan did not look."""
 
