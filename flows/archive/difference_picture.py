@@ -34,7 +34,6 @@ class MapPair:
     pairs: Sequence[tuple[int, int, int]]  # class of A, class of B, pixels: the largest first
 
     def name(self, number: int) -> str:
-        """A class's name as people read it."""
         return self.names[number].replace("_", " ") if number < len(self.names) else "no class"
 
 

@@ -140,7 +140,6 @@ def _export_images(export: Export, console: Console) -> None:
 
 
 def _export_cubes(export: Export, console: Console) -> None:
-    """The coarse mosaic and the raw sweeps as ENVI files, a block of lines at a time."""
     run = export.run
     mosaic = open_image(run.path("mosaic"), "values")
     rows, columns, bands = mosaic.shape
@@ -174,7 +173,6 @@ class Export:
 
     @property
     def folder(self) -> Path:
-        """Where the run's files go."""
         return self.out / self.run.id
 
     @property

@@ -40,7 +40,6 @@ class ExportedRun:
 
     @property
     def id(self) -> str:
-        """The run's name in the archive."""
         return self.folder.name
 
     def store(self, product: str) -> StageRef | None:
@@ -67,7 +66,6 @@ class ExportedRun:
         return self.archive.locate(self.receipt["products"][product])
 
     def sweeps(self) -> list[Path]:
-        """Stores of the raw sweeps, coarse ones first."""
         refs = [self.store(product) for product in ("raw_coarse", "raw_fine", "raw_again")]  # the last of earlier runs
         return [path for ref in refs if ref is not None for path in sorted(ref.path.glob("*.zarr"))]
 
@@ -134,7 +132,6 @@ def map_layers(run: ExportedRun) -> list[Layer]:
 
 
 def _tags(run: ExportedRun, product: str, place: Place) -> dict[str, str]:
-    """What a file says of where it comes from and where it lies."""
     return {
         "TIFFTAG_SOFTWARE": f"spectralzoom {run.receipt['versions'].get('spectralzoom', 'of unknown version')}",
         "run": run.id,

@@ -116,7 +116,6 @@ class Planner:
         self._costs = PastCosts(self.catalogue, self.run)
 
     def __call__(self, stage: str, /, *inputs: StageRef) -> StageRef | None:
-        """Forecast one of ``STAGES`` by its name."""
         ref: StageRef | None = None
         try:
             wanted = STAGES[stage](self.run, *inputs)
@@ -173,7 +172,6 @@ def _in_words(changes: Sequence[Change], stage: str) -> str:
 
 
 def _shown(value: object) -> str:
-    """A value as a person writes it: lists with commas, nothing as none."""
     parts = value if isinstance(value, list) else [value]
     return ", ".join("none" if part is None else str(part) for part in parts) or "none"
 

@@ -163,7 +163,6 @@ def run_reprocess(
 
 
 def _chosen(catalogue: Catalogue, request: ReprocessRequest, out: str) -> list[Generation]:
-    """Newest runs of the fields that were asked for."""
 
     def remakes(one: Generation) -> bool:
         try:

@@ -44,7 +44,6 @@ class PastCosts:
         self._fine_lines = lines
 
     def stored(self, stage: str) -> list[Store]:
-        """Whole stores of a stage, newest first."""
         asked = STAGES[stage]
         found = [
             store
@@ -94,7 +93,6 @@ class PastCosts:
         return seconds, round(size), f"{address} times {times:.3g}, by {unit}{rest}"
 
     def _known(self, records: Sequence[Store], unit: Unit) -> list[tuple[str, Cost, Extent]]:
-        """The first record that tells how much work it was, and the first of those that were much more or less."""
         known: list[tuple[str, Cost, Extent]] = []
         for record in records[:MOST_RECORDS]:
             try:

@@ -75,7 +75,6 @@ def evaluate_weights(request: EvaluateRequest, show: Show = lambda what, done, w
 
 
 def _files(candidates: Sequence[Candidate], controls: Sequence[Candidate], jobs: Jobs) -> dict[str, Any]:
-    """What was judged, and on which frames."""
     names = [job.name for job in jobs.frames] + jobs.left_out
 
     def told(one: Candidate, number: int, *, control: bool) -> Record:

@@ -103,7 +103,6 @@ class Candidate:
 
     @property
     def camera(self) -> LineCamera:
-        """The camera that training looked through."""
         known = self.described.record.get("camera")
         try:
             return LineCamera(**known) if isinstance(known, dict) else LineCamera()
@@ -261,7 +260,6 @@ class Jobs:
     left_out: list[str]
 
     def covered(self, number: int, *, control: bool = False) -> list[str]:
-        """Frames that one of the weights, or one of the controls, is judged on."""
         return [job.name for job in self.frames if number in (job.controls if control else job.weights)]
 
 

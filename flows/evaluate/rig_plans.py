@@ -72,7 +72,6 @@ def judge_rig(
 
 
 def _plans(look: Look, camera: LineCamera, cost: CostModel, along: Axis, seed: int) -> list[tuple[str, int, Spend]]:
-    """Every way to spend seconds, with its name and draw."""
     grid = look.seen.grid
     options = [line_blocks(grid, camera, cost, along, rows) for rows in WIDTHS]
 
@@ -86,7 +85,6 @@ def _plans(look: Look, camera: LineCamera, cost: CostModel, along: Axis, seed: i
         return spend
 
     def without_a_model(draw: int | None) -> Spend:
-        """Blocks of lines evenly spread, or placed by a draw."""
 
         def spend(seconds: float) -> tuple[Seats, float, int]:
             if draw is None:
@@ -141,7 +139,6 @@ def judge_equal_time(
 def _longer_plans(
     trial: Trial, scene: RasterScene, look: Look, weights: Weights, camera: LineCamera, cost: CostModel, full_s: float
 ) -> list[dict[str, Any]]:
-    """Plans of lines: at each budget the exposure grows by its inverse, and lines fill the full scan's seconds."""
     grid = look.seen.grid
     along = cheapest_full(grid, camera, cost)[0]
     coarse = coarse_sweeps(grid, camera, along)

@@ -145,7 +145,6 @@ def cost_of_seats(look: Look, weights: Weights, seats: Seats, policy: str) -> di
 
 
 def _cost_of(look: Sight, samples: float, adds: MultiplyAdds) -> dict[str, Any]:
-    """Samples, their bytes before compression, and multiply-adds, also told apart by what they are for."""
     return {
         "samples": samples,
         "bytes": samples * look.bands * BYTES_PER_SAMPLE,

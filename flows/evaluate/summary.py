@@ -85,7 +85,6 @@ def summarise(
 
 
 def _rows(runs: Runs, trial: Record, controls: Runs, designs: Sequence[str]) -> dict[Key, Row]:
-    """Every row: none, policies, pooled ones and the oracle at every share, controls, all."""
     names, seeds = frame_names(runs), by_seed(runs)
     pooled = (policy + POOLED_MARK for policy in pooled_policies(trial["policies"]))
     every = [(policy, share) for policy in (*trial["policies"], *pooled, ORACLE) for share in trial["shares"]]

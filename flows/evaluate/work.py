@@ -181,7 +181,6 @@ class Work:
             self._done += UNITS[task.kind]
 
     def _words(self, task: Task, left: float) -> str:
-        """Frame, file where there are several, and about how long the rest will take."""
         files = self._files(task.kind)
         named = task.name if len(files) == 1 else f"{task.name}, {files[task.index].path.name}"
         what = {"frame": "", "control": "control, "}.get(task.kind, f"{task.kind}, ")
@@ -259,7 +258,6 @@ class Work:
         return self._last[2]
 
     def loaded(self, index: int) -> Weights:
-        """Weights of a candidate, read once."""
         weights = self._load(self.candidates[index])
         assert isinstance(weights, Weights)  # open_candidates
         return weights

@@ -273,7 +273,6 @@ def _show(axes: Axes, image: NDArray[np.float32], *, interpolation: str = "antia
 
 
 def _frame(axes: Axes, shape: tuple[int, ...]) -> None:
-    """No ticks, limits on the scene's own pixels."""
     axes.set(xticks=[], yticks=[], xlim=(-0.5, shape[1] - 0.5), ylim=(shape[0] - 0.5, -0.5))
 
 
@@ -287,7 +286,6 @@ def _caption(axes: Axes, title: str, words: str) -> None:
 
 
 def _heat_key(axes: Axes, image: AxesImage, ends: tuple[str, str] = ("low", "high")) -> None:
-    """A small colour bar inside the panel's lower right corner."""
     wide, tall = panel_inches(axes)
     length = min(1.1, 0.3 * wide)
     box = axes.inset_axes((1 - (length + 0.5) / wide, 0.14 / tall, length / wide, 0.12 / tall))

@@ -272,7 +272,6 @@ def _check_accuracy(accuracy: Mapping[str, Any]) -> None:
 
 
 def _need(part: object, names: Iterable[str], place: str) -> None:
-    """Raise unless ``part`` is a mapping with all ``names``."""
     if not isinstance(part, Mapping):
         raise ShapeError(f"{place} must be a table with named fields, got {type(part).__name__}")
     for name in names:

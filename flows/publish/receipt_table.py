@@ -89,7 +89,6 @@ def print_table(receipt: Receipt, console: Console) -> None:
 
 
 def _table(title: str, *columns: str) -> Table:
-    """A table whose first column is text and whose others are figures."""
     table = Table(title=title, title_justify="left", title_style="bold", header_style="dim", box=SIMPLE_HEAD)
     for number, column in enumerate(columns):
         table.add_column(column, justify="left" if number == 0 else "right", no_wrap=number > 0)

@@ -34,7 +34,6 @@ class Outcome:
     error: BaseException | None = None
 
     def words(self) -> str:
-        """In one line."""
         told = self.ending or "was not begun here"
         more = f": {self.reason}" if self.reason else f": {self.run}" if self.run else ""
         return f"{self.field}, due {self.due:%Y-%m-%d %H:%M:%S} UTC, {told}{more}"
@@ -171,7 +170,6 @@ class ScheduleNews:
         self.fresh()
 
     def fresh(self) -> list[Outcome]:
-        """How due runs ended since the last time, field after field."""
         return [outcome for name, schedule in self.schedules.items() for outcome in self._of(name, schedule)]
 
     def _of(self, name: str, schedule: FieldSchedule) -> list[Outcome]:

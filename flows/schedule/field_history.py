@@ -31,7 +31,6 @@ class FieldHistory:
 
     @property
     def counts(self) -> dict[str, int]:
-        """How many due runs were done, skipped and failed."""
         found = dict.fromkeys(ENDINGS, 0)
         for event in self.events:
             if event["event"] == "passed":
@@ -41,7 +40,6 @@ class FieldHistory:
         return found
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for --json."""
         return {
             "field": self.field,
             "archive": self.archive,

@@ -111,11 +111,9 @@ class FieldSchedule:
 
     @property
     def field(self) -> str:
-        """The field's name."""
         return self.ledger.field
 
     def state(self) -> ScheduleState:
-        """What the ledger says by now."""
         return read_state(self.ledger.lines())
 
     def open(self, first: datetime | None = None) -> None:

@@ -260,7 +260,6 @@ def _days(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _inline(svg: str) -> Markup:
-    """A drawing as it stands within a page: without namespaces, its own size and style, and names of its parts."""
     root = ElementTree.fromstring(svg)
     for part in root.iter():
         part.tag = part.tag.partition("}")[2]

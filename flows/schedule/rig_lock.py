@@ -42,7 +42,6 @@ class RigLock:
 
     @property
     def held(self) -> bool:
-        """Whether it is held by this object."""
         return self._release is not None
 
     def take(self, words: str = "") -> bool:
@@ -56,7 +55,6 @@ class RigLock:
         return self.held
 
     def wait(self, until: datetime, clock: WallClock, words: str = "") -> bool:
-        """Take it, waiting until a moment at most."""
         while not self.take(words):
             if clock.now() >= until:
                 return False
@@ -75,7 +73,6 @@ class RigLock:
             release()
 
     def holder(self) -> str:
-        """Who holds it, as far as is known."""
         with suppress(OSError, UnicodeDecodeError, IndexError):
             if isinstance(self.place, Path):
                 return self.place.read_text().strip() or "another process"

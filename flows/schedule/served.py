@@ -40,15 +40,12 @@ class ServedField:
 
     @property
     def archive(self) -> Path:
-        """Folder of the archive, or of its working copy."""
         return open_archive(self.settings.out).root
 
     def schedule(self, timetable: Timetable, late: float, clock: WallClock | None = None) -> FieldSchedule:
-        """The field's schedule and ledger."""
         return FieldSchedule(Ledger(self.archive, self.name), timetable, late, clock or SystemWallClock())
 
     def lock(self) -> RigLock:
-        """The lock of the rig that looks at it."""
         return rig_lock(self.settings, self.archive)
 
     def settings_of(self, due: datetime, timetable: Timetable) -> Settings:
@@ -91,12 +88,10 @@ class ServeRequest:
 
     @property
     def headline(self) -> str:
-        """What is served, and how that is ended."""
         names = ", ".join(one.name for one in self.fields)
         return f"serving {names}, {self.timetable.words()}; stop with Ctrl-C, the same command goes on"
 
     def schedules(self) -> dict[str, FieldSchedule]:
-        """The schedule of every field, by its name."""
         return {one.name: one.schedule(self.timetable, self.late) for one in self.fields}
 
 

@@ -108,7 +108,6 @@ class FlowRuns:
                 client.set_flow_run_state(run.id, Cancelled(name=SKIPPED, message=why))
 
     def _waiting(self, client: Any) -> dict[datetime, list[Any]]:
-        """Flow runs of the field that have not begun, by the due times that they were made for."""
         from prefect.client.schemas.filters import DeploymentFilter, DeploymentFilterName
 
         named = DeploymentFilter(name=DeploymentFilterName(any_=[self.name]))
@@ -297,7 +296,6 @@ class Watcher:
 
 
 def _ahead(timetable: Timetable, now: datetime) -> list[datetime]:
-    """The next due times: those of the next minute, and a few more for people to see."""
     coming = islice(timetable.due_after(now), MOST_AHEAD)
     return [due for number, due in enumerate(coming) if number < LEAST_AHEAD or due - now <= AHEAD]
 

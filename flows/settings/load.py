@@ -37,18 +37,15 @@ class Declared:
 
     @property
     def told(self) -> dict[str, Any]:
-        """Unit, source, example, and what a refusal adds."""
         told: dict[str, Any] = self.item.metadata["json_schema_extra"]
         return told
 
     @property
     def choices(self) -> tuple[str, ...]:
-        """The words that there are; none where it is no choice."""
         return get_args(self.kind) if get_origin(self.kind) is Literal else ()
 
     @property
     def listed(self) -> str:
-        """Its choices in one line; some hold commas themselves."""
         return ("  " if any("," in word for word in self.choices) else ", ").join(self.choices)
 
     @property
@@ -160,7 +157,6 @@ def parse_settings(table: Mapping[str, object], origin: Mapping[str, str] | None
 def _check_table(
     table: Mapping[str, object], declared: Mapping[str, Declared], prefix: str, origin: Mapping[str, str]
 ) -> dict[str, Any]:
-    """Every key of one table by its declaration; an unknown one is refused with the nearest that exists."""
     checked: dict[str, Any] = {}
     for key, value in table.items():
         full = prefix + key

@@ -53,7 +53,6 @@ class _Maker:
         return ref
 
     def watching(self, name: str) -> CaptureRun:
-        """The run, whose reports are of this stage."""
         return replace(self.run, report=lambda done: self.progress.show(name, done))
 
 

@@ -85,11 +85,9 @@ class Comparison:
 
     @property
     def ratio(self) -> float:
-        """How many times less processor time the effects chosen take."""
         return self.exact_cpu_s / self.cpu_s if self.cpu_s else float("nan")
 
     def record(self) -> dict[str, Any]:
-        """Give the figures as plain values."""
         figures = {name: getattr(self, name) for name in self.__dataclass_fields__ if name not in ("view", "place")}
         return {**figures, "ratio": self.ratio, "place": asdict(self.place)}
 
@@ -198,7 +196,6 @@ class _Ways:
     bound: float
 
     def take(self, sweep: Sweep, lines: range) -> _Both:
-        """Render some lines both ways."""
         light, shown, raw, exact_s = _taken(self.exact, self.exact.block(sweep, lines))
         block = self.chosen.block(sweep, lines)
         _, other, other_raw, chosen_s = _taken(self.chosen, block)
@@ -216,7 +213,6 @@ class _Ways:
         return unit_at(both.exact, self.exact.rig, self.unit, sweep.binning)
 
     def add(self, sweep: Sweep, lines: range, sums: _ChangeSums) -> None:
-        """Take some lines both ways and add up how they differ."""
         both = self.take(sweep, lines)
         change = self.change(both, sweep)
         sums.exact_cpu_s += both.exact_cpu_s
@@ -275,7 +271,6 @@ def _compared(
 
 
 def _view(run: CaptureRun, ways: _Ways, sweep: Sweep, place: ViewPlace) -> View:
-    """Take the lines about a place once more and keep what a picture shows of them."""
     binning, camera = sweep.binning, run.camera
     lines = _about(place.line, VIEW_PX // sweep.step, sweep.lines)
     samples = _about(place.sample // binning, VIEW_PX // binning, camera.samples // binning)

@@ -95,7 +95,6 @@ def _compose(found: Comparison, words: Words) -> Figure:
 
 
 def _draw_lines(axes: Axes, image: NDArray[np.float32], view: View) -> None:
-    """Three bands of raw lines, one scale for both panels."""
     tones = stretch(image) if view.bands.startswith("grey") else develop(image, view.exact)
     axes.imshow(tones, interpolation="nearest", aspect="auto", extent=_extent(view))
     axes.set(xticks=[], yticks=[])
@@ -144,7 +143,6 @@ def _caption(axes: Axes, title: str, words: str) -> None:
 
 
 def _draw_key(figure: Figure, axes: Axes, image: AxesImage, found: Comparison) -> None:
-    """The colour bar below the difference, from minus to plus the tolerance."""
     box = axes.get_position()
     height = figure.get_figheight()
     place = figure.add_axes((box.x0, box.y0 - 0.3 / height, box.width, 0.16 / height))
@@ -159,7 +157,6 @@ def _draw_key(figure: Figure, axes: Axes, image: AxesImage, found: Comparison) -
 
 
 def _draw_foot(figure: Figure, found: Comparison, page: float) -> None:
-    """What was left out, what becomes of the raw numbers, and where the view is."""
     view = found.view
     lines, samples = view.lines, view.samples
     shown = (

@@ -113,7 +113,6 @@ def _tell(request: EmulateRequest, served: ServedRig, console: Console, *, as_js
 
 
 def _rig_table(served: ServedRig, rig: SurveyRig) -> dict[str, object]:
-    """How to reach it, and how the mirror is mounted, where that is not straight."""
     panel = served.rig.camera.view.source.scene.panel
     mounted = ("mirror_axes", "mirror_clocking_deg", "mirror_offset_x", "mirror_offset_y")
     return {
@@ -160,7 +159,6 @@ def _state(rig: EmulatedRig) -> str:
 
 @contextmanager
 def _ending(event: threading.Event) -> Iterator[threading.Event]:
-    """Set an event at Ctrl-C and SIGTERM, instead of breaking off."""
     if threading.current_thread() is not threading.main_thread():
         yield event
         return

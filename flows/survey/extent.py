@@ -60,7 +60,6 @@ class Extent:
         return replace(self, fine_lines=lines, fine_runs=ceil(lines / run_lines))
 
     def work(self, unit: Unit) -> float:
-        """Amount of one unit; 0 where it is not known."""
         height, width = self.grid.coarse_shape
         coarse, fine = self.coarse_lines * self.camera.samples, (self.fine_lines or 0) * self.camera.samples
         match unit:
@@ -92,7 +91,6 @@ class Extent:
         return (self.fine_lines or 0) * min(self.camera.samples, across)
 
     def _map_operations(self) -> float:
-        """Multiply-adds of reading coarse and fine patches together, region by region, seats spread evenly."""
         if self.fine_lines is None:
             return 0.0
         pixels = self.grid.height * self.grid.width

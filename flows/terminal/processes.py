@@ -207,18 +207,15 @@ class KeptProcess:
         return True
 
     def runs(self) -> bool:
-        """Whether it was started and has not ended."""
         if self._process is not None and self._process.poll() is not None:
             self._forget()
         return self._process is not None
 
     def restart(self) -> None:
-        """End it and start it again; processes that it has started go on by themselves."""
         self.stop()
         self.keep_up()
 
     def stop(self) -> None:
-        """End it."""
         if self._process is not None and self.runs():
             self._process.terminate()
             try:

@@ -25,7 +25,6 @@ class Terminal(Console):
     """A console on which control characters and marks of direction stand as escapes."""
 
     def render_str(self, text: str, **choices: Any) -> Text:
-        """Text of a string, before it is measured."""
         return super().render_str(visible(text), **choices)
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:

@@ -68,7 +68,6 @@ def _row(point: Point) -> list[str]:
 
 
 def _short(seconds: float) -> str:
-    """A time with three figures in the unit that suits it."""
     for size, unit in ((1e-3, "ms"), (1e-6, "µs"), (1e-9, "ns")):
         if size <= seconds < 1:
             return f"{seconds / size:.3g} {unit}"
@@ -238,7 +237,6 @@ def _draw_levels(axes: Axes, result: Result, places: Sequence[tuple[float, float
 
 
 def _draw_memory_floor(axes: Axes, floor: float) -> None:
-    """An upright line at the time of copying the bytes, shaded where nothing can be."""
     axes.axvspan(axes.get_xlim()[0], floor, color=_FLOOR, alpha=0.07, linewidth=0, zorder=0)
     axes.axvline(floor, color=_FLOOR, linewidth=1.1, zorder=1)
     axes.annotate(

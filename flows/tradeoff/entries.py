@@ -127,7 +127,6 @@ class Point:
 
     @property
     def ns_per_unit(self) -> float:
-        """The price for one unit of work [ns]."""
         return 1e9 * self.price_s / self.work
 
 
@@ -205,7 +204,6 @@ def measure_tradeoff(tradeoff: Tradeoff[State, Output], *, repeats: int = 5, see
 
 
 def _judge(tradeoff: Tradeoff[State, Output], state: State, setting: Setting) -> Point:
-    """One setting without its times."""
     output = tradeoff.run(state, setting)
     return Point(
         setting,

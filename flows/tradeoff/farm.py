@@ -59,11 +59,9 @@ class FarmLook:
 
     @property
     def labels(self) -> NDArray[np.uint8]:
-        """Class of each pixel, (y, x)."""
         return np.asarray(self.scene.labels, np.uint8)
 
     def miss(self, drawn: DrawnMap) -> float:
-        """1 - mIoU of a map."""
         return 1 - mean_iou(confusion(self.labels, drawn.classes, self.weights.config.classes))
 
 
@@ -170,7 +168,6 @@ def _prepare_segment(seed: int) -> Farm:
 
 
 def _fine_values(farm: FarmLook) -> Values:
-    """Scene values of every valid seat, (seat, p, p, band)."""
     sweeps = [SimulatedSweep(farm.source, sweep) for sweep in farm.full]
     values, _ = read_seats(sweeps, farm.source.camera, farm.grid, farm.grid.valid_seats(), "catmull-rom")
     return np.asarray(values, np.float32)

@@ -48,7 +48,6 @@ class FarmLines:
 
     @property
     def values(self) -> float:
-        """Px times bands."""
         sizes = (len(block.lines) * len(block.columns) * len(block.wavelength_nm) for block in self.blocks)
         return float(sum(sizes))
 
@@ -90,7 +89,6 @@ class Against:
 
     @staticmethod
     def of(exact: Light, rig: Rig) -> Against:
-        """Take light as the reference."""
         return Against(exact, noise_electrons(exact, rig), rig.camera.electrons_per_dn)
 
     def greatest(self, light: Light) -> float:
@@ -103,7 +101,6 @@ class Against:
         return float(np.sqrt(sum(squares) / light.size))
 
     def greatest_dn(self, light: Light) -> float:
-        """Greatest change [DN]."""
         return float(np.abs(light - self.exact).max()) / self.electrons_per_dn
 
     def _sigmas(self, light: Light) -> Iterator[Light]:
@@ -307,7 +304,6 @@ def _run(state: Counted, variant: Setting) -> Raw:
 
 
 def _variation(state: Counted, _variant: Setting, raw: Raw) -> float:
-    """Total variation between what came and the law, at the worst level."""
     return float(np.abs(state.counts(raw) / state.draws - state.law).sum(axis=1).max()) / 2
 
 
@@ -354,7 +350,6 @@ def _variance_error(state: Counted, _variant: Setting, raw: Raw) -> float:
 
 
 def _mean_error(state: Counted, _variant: Setting, raw: Raw) -> float:
-    """Greatest error of the mean, in sigmas of one number."""
     off, _, variance = _moments(state, raw)
     return float((np.abs(off) / np.sqrt(variance)).max())
 

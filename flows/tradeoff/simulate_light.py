@@ -37,12 +37,10 @@ class Shared:
 
     @property
     def name(self) -> str:
-        """Of the blur."""
         return str(self.blur.name)
 
     @property
     def variants(self) -> tuple[str, ...]:
-        """Of the blur."""
         return tuple(self.blur.variants)
 
     def moments(self, rig: Rig, wavelength_nm: Floats, variant: str, normal: Floats | None = None) -> Moments:
@@ -184,7 +182,6 @@ def _box_alone(lines: FarmLines, variant: str) -> dict[Any, str]:
 
 
 def _as_components(scene: RasterScene) -> RasterScene:
-    """A scene whose light is that of its components, one a band: rays are summed before bands are mixed."""
     count = scene.electrons.shape[0]
     ones = np.ones(count, np.float32)
     light = SceneLight(np.eye(count, dtype=np.float32), ones)
@@ -199,7 +196,6 @@ def _run_rays(state: Rough, setting: Setting) -> Light:
 
 
 def _by_rays(state: Rough, per_px: int) -> Light:
-    """Light of evenly spaced rays, each as much as the others."""
     lines, width = state.lines, state.lines.rig.camera.slit_px
     turns, runs = _middles(width, per_px), _middles(1.0, per_px)
     rays: dict[Any, str] = {effect: its for effect, its in lines.exact.items() if effect in RAYS}

@@ -41,7 +41,6 @@ class TrainingData:
     files: DataSet | None = None
 
     def scenes(self, names: tuple[str, ...]) -> Iterator[RasterScene]:
-        """Make the named scenes in order."""
         for name in names:
             if self.files is None:
                 seed, day, hour = read_farm_name(name)

@@ -42,16 +42,13 @@ class _Taken(SimulatedSweep):
 
     @cached_property
     def raw(self) -> NDArray[np.uint16]:
-        """All lines, (line, sample, band)."""
         return self.source.render(self.sweep, range(self.sweep.lines))
 
     @cached_property
     def references(self) -> References:
-        """Dark and white frames."""
         return self.source.references(self.sweep)
 
     def read(self, start: int, stop: int) -> NDArray[np.uint16]:
-        """Give the lines ``start`` to ``stop``, (line, sample, band) uint16."""
         return self.raw[start:stop]
 
 

@@ -121,7 +121,6 @@ def train_weights(request: TrainRequest, report: Report = lambda what, done, fig
 
 
 def _check_places(out: Path, checkpoint: Path) -> None:
-    """Refuse places that the weights, or the state of the run beside them, cannot be written to."""
     if not out.parent.is_dir():
         raise SettingsError(f"-o {out}: the folder {out.parent} does not exist; make it first")
     if out.is_dir():
