@@ -222,10 +222,7 @@ def _age_s(created: str, now: datetime) -> float | None:
 
 
 def explanation(archive: Archive, product: str) -> dict[str, Any]:
-    """Lineage of a product as nested tables, and what changed since the version before it.
-
-    Raises ArchiveError: there is no such product.
-    """
+    """Lineage of a product as nested tables, and what changed since the version before it (ArchiveError: none)."""
     catalogue = Catalogue.read(archive.root)
     found = find_product(catalogue, product)
     if isinstance(found, Run):

@@ -70,10 +70,7 @@ def compare(archive: ArchiveName, old: str, new: str, *, out: OutFolder = None, 
 
 
 def find_run(catalogue: Catalogue, text: str) -> Run:
-    """A run by its id; ``latest`` is the newest that left a map, ``previous`` the one before it of the same field.
-
-    Raises ArchiveError: there is none.
-    """
+    """A run by its id, `latest` (the newest with a map) or `previous`, of the same field before it (ArchiveError)."""
     mapped = [run for run in catalogue.runs if "class_map" in run.products]
     if text not in ("latest", "previous"):
         found = find_product(catalogue, f"runs/{text.rstrip('/').removeprefix('runs/')}")

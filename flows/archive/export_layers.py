@@ -76,10 +76,7 @@ class ExportedRun:
 
 
 def open_exported(archive: Archive, name: str | None) -> ExportedRun:
-    """Open a run by its name or address, the latest without one.
-
-    Raises SettingsError: there is no such run, or none at all; IncompleteStoreError: its receipt cannot be read.
-    """
+    """A run by name or address, else the latest; SettingsError: none, IncompleteStoreError: receipt unreadable."""
     runs = archive.runs()
     if not runs:
         raise SettingsError(f"{archive.name} has no published run; survey into it first")
@@ -112,10 +109,7 @@ class Layer:
 
 
 def map_layers(run: ExportedRun) -> list[Layer]:
-    """Class map, confidence, attention and picture of a run: on the map where there is one, on angles where not.
-
-    Attention keeps its grid of seats.
-    """
+    """Class map, confidence, attention (on its seats) and picture: on the map where there is one, else on angles."""
     product = "class_map" if run.geobox is None else "ground_map"
     about = open_image(run.path(product), "classes").about
     colours = np.array(about.get("class_colours", ()), np.uint8).reshape(-1, 3)

@@ -88,11 +88,7 @@ class Forecast:
 
 
 def forecast(settings: Settings) -> Forecast:
-    """Tell of every stage what a survey of these settings would do. Writes nothing.
-
-    Raises PipelineError: what the survey itself would refuse at its start, but for a scene that this machine cannot
-    hold.
-    """
+    """What a survey would do, stage by stage; writes nothing. PipelineError: what a survey would refuse, but size."""
     with tempfile.TemporaryDirectory(prefix="spectralzoom-plan-") as empty:
         archive = Archive(Path(empty), writes=False)  # where there is none yet
         if is_archive(settings.out):
@@ -181,10 +177,7 @@ COLOURS = {"cached": "green", "to run": "bold", "blocked": "yellow", "skipped": 
 
 
 def plan_content(settings: Settings) -> dict[str, Any]:
-    """The forecast as plain tables, with sums of what is known (``estimated`` of ``to_make`` stages).
-
-    ``refused`` says why this machine would not begin the survey; None where it would.
-    """
+    """The forecast as plain tables, with sums of what is known; ``refused``: why this machine would not begin."""
     found = forecast(settings)
     rows = found.stages
     ahead = [row for row in rows if row.state in ("to run", "blocked")]

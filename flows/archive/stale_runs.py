@@ -108,8 +108,7 @@ def is_whole(catalogue: Catalogue, run: Run) -> bool:
 def is_current(catalogue: Catalogue, run: Run, settings: Settings) -> bool:
     """Whether its survey with these settings would find all that this run names or rests on, by versions and weights.
 
-    A run whose accuracy is not there yet is not: the survey adds it.
-    What lies in a scene's file is not looked at.
+    A run whose accuracy is not there yet is not: the survey adds it. What lies in a scene's file is not looked at.
     """
     drawn_by = law_of_key(str(run.receipt.get("scene")))
     of_this_law = settings.scene not in BUILT_IN_SCENES or drawn_by == FARM_LAW
@@ -118,10 +117,7 @@ def is_current(catalogue: Catalogue, run: Run, settings: Settings) -> bool:
 
 
 def would_remake(catalogue: Catalogue, run: Run, stage: str, settings: Settings) -> bool:
-    """Whether a stage (a store's, such as segment, or a survey's, such as draw_map) would be made anew.
-
-    Told from versions and weights in the manifests; what new weights of another patch size change in the plan is not.
-    """
+    """Whether a stage (by its or its store's name) would be made anew, as versions and weights in manifests tell."""
     keys = {row.get("key") for row in run.stages if str(row.get("name")) == stage}
     below = ((uri, uri.split("/")) for uri in catalogue.named_and_below[run.uri])
     own = [uri for uri, parts in below if parts[1] == stage or parts[-1] in keys]

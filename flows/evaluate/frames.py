@@ -60,10 +60,7 @@ class EvaluateRequest:
 
 
 def checked_request(request: EvaluateRequest) -> EvaluateRequest:
-    """Put shares in order and drop what is there anyway.
-
-    Raises SettingsError: a number out of its range, or a policy that cannot be judged; names the flag.
-    """
+    """Put shares in order, drop what is there anyway, and refuse what cannot be judged (SettingsError, its flag)."""
     for share in request.shares:
         if not 0 <= share <= 1:
             raise SettingsError(f"--shares are shares of the seats from 0 to 1 (0.1 is 10 %), got {share:g}")

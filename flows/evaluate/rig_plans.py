@@ -169,10 +169,7 @@ def _judged(look: Look, weights: Weights, seats: Seats) -> dict[str, Any]:
 
 
 def camera_of_equal_time(look: Look, camera: LineCamera, cost: CostModel, seats: Seats) -> LineCamera:
-    """Give the camera whose exposure lets coarse pass and seats take the seconds of a full scan with ``camera``.
-
-    Raises PoseError: the field is beyond the mirror's range.
-    """
+    """The camera whose exposure lets coarse pass and seats take a full scan's seconds (PoseError beyond the mirror)."""
     exposed = camera
     for _ in range(ROUNDS):
         seconds = plan_seconds(look, exposed, cost, seats)[0]

@@ -113,10 +113,7 @@ def _round_length(px: float) -> int:
 
 
 def draw_ground(found: GroundMap) -> bytes:
-    """Draw picture and class map side by side, PNG: north up, hectares in the legend.
-
-    Axes are metres from the map's lower left corner.
-    """
+    """Picture and class map side by side, PNG: north up, metres from the lower left corner, hectares in the legend."""
     box = found.geobox.boundingbox
     extent = (0.0, box.right - box.left, 0.0, box.top - box.bottom)
     tall = extent[3] / extent[1]

@@ -65,10 +65,7 @@ class QuicklookData:
 
 
 def draw_quicklook(path: str | Path, panels: QuicklookData) -> None:
-    """Draw the four panels as a PNG of about 1800 x 1400 px (flatter or taller for fields that are).
-
-    Raises OSError: the file cannot be written.
-    """
+    """Draw the four panels as a PNG of about 1800 x 1400 px (flatter or taller for fields that are); OSError."""
     with mpl.rc_context(_STYLE):
         figure = _compose(panels)
         FigureCanvasAgg(figure)

@@ -196,10 +196,7 @@ Row = Mapping[str, Any]
 
 
 def print_effects(effects: Iterable[Row], total: Row, console: Console) -> None:
-    """Print a row for every effect that the rig has, what it has none of, and below what all come to.
-
-    On a narrow terminal the words stand below the table.
-    """
+    """Print a row for every effect of the rig and what all come to; words stand below a narrow terminal's table."""
     rows = list(effects)
     there = [row for row in rows if row["reason"] != "absent"]
     wide = console.width >= WIDE

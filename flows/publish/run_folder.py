@@ -88,10 +88,7 @@ def add_accuracy(run: SurveyRun, draft: RunDraft, products: Products, stage: Sta
 
 
 def load_receipt(folder: Path) -> Receipt:
-    """Read the receipt of a published run.
-
-    Raises IncompleteStoreError: it is not as it was published; ShapeError: it lacks what a receipt has.
-    """
+    """The receipt of a published run; IncompleteStoreError: not as it was published, ShapeError: it lacks a part."""
     found = read_run(folder, {})
     if found.problem is not None:
         raise IncompleteStoreError(f"{found.uri}: {found.problem}; run verify --repair on the archive")
@@ -248,10 +245,7 @@ def block_of(sweep: Sweep, run: SurveyRun) -> tuple[int, int, int, int]:
 
 
 def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
-    """Gather ``plan`` and the parts of the receipt that not every survey has.
-
-    These are ``pointing``, ``ground``, ``pixels`` and ``lines``.
-    """
+    """``plan``, and what not every survey has: ``pointing``, ``ground``, ``pixels`` and ``lines``."""
     plan = load_plan(products.of("attend"))
     told: dict[str, Any] = {
         "kind": plan.kind,

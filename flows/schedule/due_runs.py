@@ -109,10 +109,7 @@ def _as_noted(schedule: FieldSchedule, due: datetime) -> Outcome:
 def run_all(
     schedules: Mapping[str, FieldSchedule], lock_of: Callable[[str], RigLock], survey: Survey, tell: Tell
 ) -> list[Outcome]:
-    """Resume what died, skip what is too late, and run what is due by now, field after field in turn.
-
-    A field whose ledger cannot be written is told of and left for the next time; the others go on.
-    """
+    """Resume what died, skip what is too late, run what is due, field by field; one without a ledger waits, told of."""
     outcomes: list[Outcome] = []
     waiting = [(due, name) for name in schedules for due in _to_run(schedules[name], lock_of(name), tell)]
     for due, name in sorted(waiting, key=lambda one: one[0]):  # of one due time, fields in the order given
@@ -142,10 +139,7 @@ def _to_run(schedule: FieldSchedule, lock: RigLock, tell: Tell) -> list[datetime
 
 @dataclass(frozen=True, kw_only=True)
 class Several(Outcome):
-    """Due runs of a field that ended alike. ``due`` is the last one's, ``since`` the first one's or shortly before it.
-
-    ``count`` is None where there are too many to count.
-    """
+    """Due runs of a field that ended alike, from ``since`` to ``due``; ``count`` is None where too many to count."""
 
     since: datetime
     count: int | None

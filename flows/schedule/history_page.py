@@ -218,10 +218,7 @@ class Chart:
 def line_chart(
     series: Mapping[str, Points], title: str, unit: str = "", colours: Mapping[str, str] | None = None
 ) -> Chart:
-    """Draw series from 0 upwards, shares in percent for the unit "%"; the same points are the same bytes.
-
-    ``colours`` of series by their names; others take `COLOURS` in turn.
-    """
+    """Draw series from 0 up, "%" as shares; same points, same bytes. ``colours`` by name, others in turn."""
     legend = {name: COLOURS[number % len(COLOURS)] for number, name in enumerate(series)}
     legend |= {name: colour for name, colour in (colours or {}).items() if name in series}
     lines = {name: np.array(sorted(points)).reshape(-1, 2) for name, points in series.items()}

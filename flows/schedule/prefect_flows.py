@@ -136,10 +136,7 @@ def reprocess_archive(
     weights: str | None = None,
     dry_run: bool = False,
 ) -> State:
-    """Survey every field of a served archive again: light is found there, only what has changed is made anew.
-
-    ``weights`` may be those that a served field's settings name.
-    """
+    """Survey every field of a served archive again; ``weights`` may be those that a served field's settings name."""
     from flows.archive.reprocess_command import ReprocessRequest, run_reprocess  # torch
 
     try:

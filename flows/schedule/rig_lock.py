@@ -135,10 +135,7 @@ def _bind(held: ExitStack, name: str) -> None:
 
 @contextmanager
 def rig_to_oneself(settings: Settings, words: str) -> Iterator[None]:
-    """Hold the rig while the block runs; the simulated one needs no holding.
-
-    Raises RigError: another survey holds it.
-    """
+    """Hold the rig while the block runs (RigError: another survey holds it); the simulated one needs no holding."""
     if _port(settings) is None:
         yield
         return

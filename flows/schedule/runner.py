@@ -34,10 +34,7 @@ def own_temporary_folder() -> Iterator[None]:
 
 
 def deployments(request: ServeRequest) -> list[Any]:
-    """A deployment of the survey for each field, and of reprocessing for each archive.
-
-    None has a schedule of Prefect's: the watcher plans each due time once, see `flows.schedule.watcher`.
-    """
+    """A deployment for each field and each archive; without schedules: `flows.schedule.watcher` plans each time."""
     made = [
         survey_scheduled.to_deployment(
             one.name,

@@ -108,10 +108,7 @@ def _tell(words: str) -> None:
 
 
 def load_fields(files: Sequence[Path], out: str | None = None) -> list[ServedField]:
-    """Read the settings of every field, in turn, and see whether they can be surveyed; nothing is captured.
-
-    Raises PipelineError: there are none, two are called the same, or the first that cannot be surveyed, named.
-    """
+    """Settings of every field, in turn, each seen to be surveyable; nothing is captured (PipelineError names it)."""
     if not files:
         raise SettingsError("no fields: give the settings file of one or more, such as serve north.toml --every 30m")
     fields = [load_field(file, out) for file in files]
@@ -130,10 +127,7 @@ def load_fields(files: Sequence[Path], out: str | None = None) -> list[ServedFie
 
 @contextmanager
 def alone_on(fields: Sequence[ServedField]) -> Iterator[None]:
-    """Keep another serve off the archives and the rigs of these fields while the block runs.
-
-    Raises ArchiveError: another serves one of the archives; RigError: another serves one of the rigs.
-    """
+    """Keep another serve off these fields' archives (ArchiveError) and rigs (RigError) while the block runs."""
     roots: Mapping[Path, str] = {one.archive: str(one.settings.out) for one in fields}
     rigs = {one.lock().of_servers(): one.settings.rig.port for one in fields if one.settings.source == "rig"}
     with ExitStack() as held:

@@ -60,10 +60,7 @@ class ServedField:
 
 
 def load_field(file: Path, out: str | None = None) -> ServedField:
-    """Read one field's settings; ``out`` wins over the file's archive.
-
-    Raises SettingsError: the file cannot be used, or says neither what to look at nor that a rig looks.
-    """
+    """One field's settings, ``out`` before the file's own; SettingsError: unusable, or nothing to look at."""
     settings = load_settings(file, {"out": out})
     said = read_toml(file)
     if "scene" not in said and settings.source != "rig":
@@ -113,10 +110,7 @@ def write_served(request: ServeRequest, path: Path) -> None:
 
 
 def read_served() -> ServeRequest:
-    """What is served here, by the file that the environment names; fields are read, not yet checked.
-
-    Raises SettingsError: no file is named, or it, or a field's settings in it, cannot be used.
-    """
+    """What is served, by the file that the environment names; fields not yet checked (SettingsError: unusable)."""
     path = os.environ.get(NAMED_BY)
     if not path:
         raise SettingsError(

@@ -84,10 +84,7 @@ class Timetable:
 
 
 def parse_timetable(cron: str | None, every: str | None, timezone: str | None = None) -> Timetable:
-    """Check what was given of a schedule.
-
-    Raises SettingsError: not exactly one of both is given, or it, or the time zone, is none.
-    """
+    """Check what was given of a schedule; SettingsError: not exactly one of both, or it, or the time zone, is none."""
     if (cron is None) == (every is None):
         got = "neither" if cron is None else "both"
         raise SettingsError(f"a schedule needs --cron or --every, got {got}; such as --every 30m or --cron '0 6 * * *'")

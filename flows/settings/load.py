@@ -197,10 +197,7 @@ def _hint(full: str, known: Mapping[str, Declared], prefix: str) -> str:
 
 
 def of_this_version(stored: Mapping[str, Any]) -> dict[str, Any]:
-    """Give what a receipt says of settings that there are: keys of before are left out, in tables too.
-
-    Raises SettingsError: the survey had two rounds of detail, of which this version would make but one.
-    """
+    """A receipt's settings that there are now, in tables too (SettingsError: two rounds of detail, now no more)."""
     if stored.get("rounds", 1) != 1:
         raise SettingsError(
             f"its survey had {stored['rounds']} rounds of detail, which never paid and were removed: survey the "

@@ -128,10 +128,7 @@ def everything(effects: StageRef) -> dict[Effect, str]:
 def compare_with_everything(
     run: CaptureRun, sweeps: Sequence[Sweep], effects: StageRef, say: Callable[[str], None]
 ) -> Comparison:
-    """Take lines of a scan with the effects chosen and with everything on, exact; ``say`` is told how many, and why.
-
-    Raises BoundError: expected light differs by more than the bound of the decision; names the place.
-    """
+    """Take lines both ways; ``say`` is told how many. BoundError, with the place: light differs beyond the bound."""
     clock = sweep_starts(sweeps, run.camera, run.settings.cost)
     chosen = source_with(run.simulated, effects, clock)
     total = load_manifest(effects)["total"]

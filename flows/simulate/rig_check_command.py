@@ -51,10 +51,7 @@ class CheckRequest:
 
 
 def check_request(settings: Path | None, port: str | None, camera: str | None, *, move: bool = False) -> CheckRequest:
-    """Say what to check: both devices of the settings, or those that are named where there are none.
-
-    Raises SettingsError: the settings, or the camera's address, cannot be used.
-    """
+    """What to check: both devices of the settings, or those that are named (SettingsError: they cannot be used)."""
     wanted = load_settings(settings)
     rig = wanted.rig
     if port is not None:

@@ -43,10 +43,7 @@ class EmulateRequest:
     out: Path | None = None  # a survey's TOML to write
 
     def check(self) -> None:
-        """Refuse what cannot be, before minutes are spent on the scene.
-
-        Raises SettingsError: a fault, a speed or a file that cannot be.
-        """
+        """Refuse a fault, a speed or a file that cannot be (SettingsError), before minutes are spent on the scene."""
         read_faults(self.faults)
         FastClock(self.speed)
         if self.baud < 0:
@@ -56,10 +53,7 @@ class EmulateRequest:
 
 
 def emulated_settings(path: Path | None, flags: Mapping[str, object]) -> Settings:
-    """Read the settings of what is emulated; a built-in scene is small where nothing says how large.
-
-    Raises SettingsError: a key or a flag cannot be used.
-    """
+    """Settings of what is emulated (SettingsError: one cannot be used); a built-in scene is small unless told."""
     wanted = load_settings(path, flags)
     small = wanted.scene in BUILT_IN_SCENES and wanted.size is None
     return replace(wanted, size=USUAL_SIZE) if small else wanted
@@ -68,10 +62,7 @@ def emulated_settings(path: Path | None, flags: Mapping[str, object]) -> Setting
 def run_emulate(
     request: EmulateRequest, console: Console, *, as_json: bool = False, ended: threading.Event | None = None
 ) -> int:
-    """Emulate a rig until Ctrl-C, a SIGTERM or ``ended``; how to connect goes to stdout, its state to ``console``.
-
-    Raises PipelineError: what was asked for cannot be.
-    """
+    """Emulate a rig until Ctrl-C, SIGTERM or ``ended``; how to connect goes to stdout, its state to ``console``."""
     request.check()
     mirror_faults, camera_faults = read_faults(request.faults)
     with console.status("drawing the scene"):
@@ -171,10 +162,7 @@ def _ending(event: threading.Event) -> Iterator[threading.Event]:
 
 
 def emulated_source(settings: Settings) -> tuple[SimulatedSource, tuple[str, ...]]:
-    """Give the scene through the simulated rig, and what was assumed of it. Nothing is kept.
-
-    Raises PipelineError: the scene or the effects cannot be used.
-    """
+    """The scene through the simulated rig, and what was assumed of it (PipelineError); nothing is kept."""
     with tempfile.TemporaryDirectory(prefix="spectralzoom-") as folder:
         apart = replace(settings, source="sim", out=str(Path(folder) / "effects"))
         run, _, notes = open_simulation(apart)

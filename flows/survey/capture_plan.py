@@ -81,10 +81,7 @@ def _overlap(settings: Settings, step: int) -> float:
 
 
 def check_memory(settings: Settings, source: SimulatedSource, grid: SceneGrid, plan: CapturePlan) -> None:
-    """Refuse a memory in which no tile of the mosaic can be made, before anything is captured.
-
-    Raises SettingsError: not even one tile at a time fits; names the least that does.
-    """
+    """Refuse memory for not one tile of the mosaic, before anything is captured (SettingsError, with the least)."""
     pixels = PixelGrid.of_scene(grid, grid.factor)
     placed = [place(_PlannedSweep(source, sweep), settings.camera) for sweep in plan.coarse]
     rows, columns = image_spec(("y", "x"), pixels.shape, "<f4").shard or pixels.shape

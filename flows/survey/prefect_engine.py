@@ -195,10 +195,7 @@ def _guarded_server() -> Iterator[None]:
 
 @contextmanager
 def _prefect_home(archive: Path) -> Iterator[None]:
-    """Keep Prefect's own files in the archive; a second survey of it at the same time takes a home of its own.
-
-    A server that PREFECT_API_URL names, and a PREFECT_HOME of the user's, are left as they are.
-    """
+    """Keep Prefect's files in the archive (a second survey: a home of its own); a user's server and home are left."""
     home = archive / ".prefect"
     release = take_lock(archive / ".locks" / "prefect.lock", wait=False)
     if release is None:

@@ -52,11 +52,7 @@ class RigField:
 
 
 def rig_field(scene: RasterScene, settings: Settings, planned: Sequence[Sweep]) -> RigField:
-    """Give the rig; nothing is connected before its first line.
-
-    Raises SettingsError: exposure and frame period are nothing that the camera takes; PoseError: the mirror, as
-    mounted, does not reach all of the planned sweeps.
-    """
+    """The rig, not yet connected; SettingsError: times the camera does not take, PoseError: beyond the mirror."""
     camera, rig = settings.camera, settings.rig
     check_times(camera.exposure_ms, camera.frame_ms, CameraLimits(most_rate_hz=camera.max_rate_hz))
     if rig.mounting != STRAIGHT:

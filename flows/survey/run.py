@@ -200,10 +200,7 @@ def _vgg_file(settings: Settings) -> VggFile | None:
 
 
 def weights_path(settings: Settings) -> Path:
-    """Where the weights of a survey lie: those that come with the house for its own scenes.
-
-    Raises SettingsError: none were given for a scene of one's own.
-    """
+    """Where a survey's weights lie; the house's own for its scenes (SettingsError: none given for one's own scene)."""
     if settings.weights is not None:
         return Path(settings.weights)
     if settings.scene not in BUILT_IN_SCENES:

@@ -35,11 +35,7 @@ SAME_HOUR = 0.5  # by which true solar time is at most off mean solar time, and 
 
 
 def open_scene(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
-    """Open the settings' scene, and say what was assumed of it.
-
-    Raises SceneError, WavelengthError: the file cannot be used; SettingsError: what was given does not go with a
-    built-in scene.
-    """
+    """Open the scene, say what was assumed; SceneError, WavelengthError: its file, SettingsError: not for a farm."""
     if settings.scene == RIG_FIELD:
         return _field_before_rig(settings), ()
     if settings.scene in BUILT_IN_SCENES:

@@ -185,10 +185,7 @@ def find_tradeoffs(stage: str) -> tuple[Tradeoff[Any, Any], ...]:
 
 
 def measure_tradeoff(tradeoff: Tradeoff[State, Output], *, repeats: int = 5, seed: int = 0) -> Result:
-    """Run every setting ``repeats`` times in turn, on one thread, after one run of each that warms up and is judged.
-
-    Raises SettingsError: ``repeats`` is below 1.
-    """
+    """Judge every setting by one run, then time ``repeats`` (1 or more: SettingsError) of each in turn, one thread."""
     if repeats < 1:
         raise SettingsError(f"repeats must be at least 1, got {repeats}")
     state = tradeoff.prepare(seed)
@@ -215,10 +212,7 @@ def _judge(tradeoff: Tradeoff[State, Output], state: State, setting: Setting) ->
 
 
 def _time_in_turn(tradeoff: Tradeoff[State, Output], state: State, repeats: int) -> tuple[list[Clocks], float | None]:
-    """Seconds by setting and round, and the least time of copying a unit's bytes [ns].
-
-    Every round starts at another setting, with one copy of memory before it.
-    """
+    """Seconds by setting and round, each round from another setting on; least time of copying a unit's bytes [ns]."""
     count, moved = len(tradeoff.settings), tradeoff.moved_bytes
     source: NDArray[np.uint8] = np.ones(0 if moved is None else COPIED_BYTES, np.uint8)
     target, copies = np.zeros_like(source), []

@@ -308,10 +308,7 @@ def _variation(state: Counted, _variant: Setting, raw: Raw) -> float:
 
 
 def _by_chance(state: Counted) -> float:
-    """Total variation of exact draws from their law, at the worst level: its mean and three of its deviations.
-
-    Each number's share deviates normally, and nearly by itself.
-    """
+    """Total variation of exact draws from the law, worst level: mean and three deviations of normal, free shares."""
     variance = state.law * (1 - state.law) / state.draws
     mean = np.sqrt(2 / np.pi) * np.sqrt(variance).sum(axis=1)
     spread = np.sqrt((1 - 2 / np.pi) * variance.sum(axis=1))

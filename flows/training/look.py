@@ -55,11 +55,7 @@ class _Taken(SimulatedSweep):
 def observe_scene(
     scene: RasterScene, camera: LineCamera, grid: SceneGrid, basis: SpectralBasis, rng: np.random.Generator
 ) -> Observation:
-    """Look at a labelled scene, and project what was seen onto the basis; the noise follows from ``rng``.
-
-    A built-in farm is surveyed with every line there is, by a seed that ``rng`` draws. Raises SceneError: the scene has
-    no labels, or a pixel that no line reached.
-    """
+    """Look at a labelled scene on the basis, noise by ``rng``; a farm by all lines. SceneError: no labels, or a gap."""
     if law_of_key(scene.key) is None:
         return observe(scene, camera, grid, basis, rng)
     seed = int(rng.integers(2**31))

@@ -66,10 +66,7 @@ RECORD = "accuracy.json"
 def evaluate(
     run: SurveyRun, mosaic: StageRef, patches: StageRef, class_map: StageRef, effects: StageRef, *pointing: StageRef
 ) -> Wanted | None:
-    """Judge the map by the labels, and what other placements would have given. Not part of the survey's own cost.
-
-    What controls see has the effects of the survey.
-    """
+    """Judge the map by the labels, and other placements, with the survey's effects; no part of the survey's cost."""
     if not run.scene.labelled or not run.settings.accuracy:
         return None
     inputs = [mosaic, patches, class_map, effects, *pointing]

@@ -81,10 +81,7 @@ def load_manifest(effects: StageRef) -> dict[str, Any]:
 
 
 def chosen_effects(effects: StageRef) -> dict[Effect, str]:
-    """Read the effects that are on with their variants, in the order of the chain.
-
-    Raises IncompleteStoreError: the store names an effect that this version does not know.
-    """
+    """Effects that are on, with variants, in the chain's order (IncompleteStoreError: one that is not known here)."""
     chosen: dict[Effect, str] = {}
     for row in load_manifest(effects)["effects"]:
         if row["state"] != "on":

@@ -37,10 +37,7 @@ STRANGE = "strange.json"  # beside a map, where values were no readings
     named={"class_map": "class_map.zarr"},
 )
 def draw_map(run: SurveyRun, mosaic: StageRef, patches: StageRef) -> Wanted:
-    """Read coarse and fine patches together and draw the class map, one region of the field after the other.
-
-    Where the scene has no value the map has no class.
-    """
+    """Draw the class map from coarse and fine patches, region by region; no class where the scene has no value."""
 
     def build(path: Path) -> None:
         out, legend = path / "class_map.zarr", ClassNames(run.weights.class_names, run.weights.class_colours)
