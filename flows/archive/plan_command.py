@@ -13,11 +13,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from flows.archive.stage_costs import PastCosts
 from flows.cli.app import AsJson
 from flows.cli.survey_verbs import NO_FLAGS, SurveyFlags, by_setting
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
+from flows.survey.extent import PastCosts
 from flows.survey.run import SurveyRun, open_run
 from flows.survey.stage import Stage, Wanted
 from flows.survey.survey import STAGES, judge, survey

@@ -6,14 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import cache
-from importlib import resources
 from pathlib import Path, PurePath
 from typing import Any
 
 from flows.publish.receipt import is_pending
 from flows.settings.load import of_this_version, parse_settings
 from flows.settings.survey_settings import BUILT_IN_SCENES, OF_THE_MACHINE, Settings
-from flows.survey.run import SHIPPED
+from flows.survey.run import shipped_weights
 from flows.survey.stage import versions
 from flows.survey.survey import STAGES
 from models.weights.files import content_key
@@ -38,11 +37,16 @@ class Generation:
     run: Run
 
 
+def called(run: Run) -> str:
+    """The field that a run is of."""
+    return str(run.receipt.get("survey") or run.facts.get("survey") or run.folder.name)
+
+
 def newest_runs(catalogue: Catalogue) -> list[Generation]:
     """The newest run of every field, oldest first; runs whose settings cannot be read are fields of their own."""
     found: dict[str, Generation] = {}
     for run in catalogue.runs:  # oldest first
-        name = str(run.receipt.get("survey") or run.facts.get("survey") or run.folder.name)
+        name = called(run)
         field = canonical_json([name, _light_of(run) if run.settings else run.uri])
         found.pop(field, None)
         found[field] = Generation(name, run)
@@ -133,8 +137,7 @@ def check_stage(stage: str) -> None:
 
 def weights_key(settings: Settings) -> str | None:
     """What the weights are called by what they hold, as stages know it; None where they cannot be read."""
-    shipped = Path(str(resources.files("models") / "shipped" / SHIPPED))
-    return file_key(shipped if settings.weights is None else Path(settings.weights))
+    return file_key(shipped_weights() if settings.weights is None else Path(settings.weights))
 
 
 def file_key(path: Path) -> str | None:

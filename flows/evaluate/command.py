@@ -27,7 +27,8 @@ from flows.evaluate.rows import design_of, known_or_none, open_controls
 from flows.evaluate.series import REFERENCE, Record, seeds_of
 from flows.evaluate.summary import summarise, summarise_equal_time, summarise_rig
 from flows.evaluate.table import print_evaluation
-from flows.evaluate.work import Made, Work, writing
+from flows.evaluate.work import Made, Work
+from flows.terminal.processes import writing
 from flows.terminal.progress import StageProgress, on_stdout
 from models.evaluation.bootstrap import LEVEL
 from models.evaluation.metrics import agreement, false_pixels, iou_per_class, mean_iou

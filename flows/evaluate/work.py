@@ -6,8 +6,7 @@ import hashlib
 import json
 import time
 import zlib
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -41,9 +40,9 @@ from flows.evaluate.rows import (
 )
 from flows.evaluate.series import Record
 from flows.terminal.figures import format_seconds
+from flows.terminal.processes import writing
 from flows.training.data import TrainingData
 from models.weights.files import AnyWeights, Weights, load_any_weights
-from pipeline.errors import ArchiveError
 from pipeline.geometry.camera import LineCamera
 from pipeline.planning.line_blocks import WIDTHS
 from pipeline.simulator.scenes.scene import RasterScene
@@ -60,15 +59,6 @@ UNITS = {  # kinds of results, with rough shares of time
     "pooled": 0.4,
 }
 Made = dict[str, list[list[Record]]]  # kind -> of each file its records; those of "time" and "capture" in one list
-
-
-@contextmanager
-def writing(folder: Path) -> Iterator[None]:
-    """Turn a folder that cannot be written to into an error that says so."""
-    try:
-        yield
-    except OSError as error:
-        raise ArchiveError(f"cannot write to {folder}: {error.strerror}; choose another --out") from error
 
 
 @dataclass(frozen=True)

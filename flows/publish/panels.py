@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from typing import Any
 
 import numpy as np
 from matplotlib import patheffects
@@ -21,6 +22,17 @@ from storage.arrays.quicklooks import stretch
 GROUND_IN, GROUND_DPI, GROUND_MOST_PX = 9.0, 130, 1200
 INK = "#22241f"
 MUTED = "#6a6d64"
+STYLE: Any = {
+    "font.size": 12,
+    "text.parse_math": False,  # names of surveys and classes may hold dollar signs
+    "font.family": "DejaVu Sans",
+    "axes.edgecolor": "#b8b8b0",
+    "axes.linewidth": 0.8,
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "figure.facecolor": "#fbfaf7",
+    "savefig.facecolor": "#fbfaf7",
+}
 UNLABELLED_COLOUR = (0.86, 0.86, 0.84)
 HALO: list[patheffects.AbstractPathEffect] = [patheffects.withStroke(linewidth=3, foreground="black")]
 # Okabe and Ito (2008), then Paul Tol's muted scheme (2021) without near twins: told apart by colour-blind readers

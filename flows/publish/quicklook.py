@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from flows.publish.panels import (
     HALO,
-    INK,
     MUTED,
+    STYLE,
     UNLABELLED_COLOUR,
     class_palette,
     class_rgb,
@@ -72,20 +72,7 @@ def draw_quicklook(path: str | Path, panels: QuicklookData) -> None:
         figure.savefig(path, format="png")
 
 
-_STYLE: Any = {
-    "font.size": 12,
-    "text.parse_math": False,  # names of surveys and classes may hold dollar signs
-    "font.family": "DejaVu Sans",
-    "axes.titlesize": 14,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.edgecolor": "#b8b8b0",
-    "axes.linewidth": 0.8,
-    "text.color": INK,
-    "axes.labelcolor": INK,
-    "figure.facecolor": "#fbfaf7",
-    "savefig.facecolor": "#fbfaf7",
-}
+_STYLE: Any = {**STYLE, "axes.titlesize": 14, "axes.titleweight": "bold", "axes.titlelocation": "left"}
 _DPI = 100
 _SEAT_COLOUR = "#7df9ff"
 _BLOCK: dict[str, Any] = {"facecolor": "none", "edgecolor": "white", "linewidth": 1.2, "linestyle": (0, (4, 2))}

@@ -1,4 +1,4 @@
-"""The flows that Prefect runs on a schedule or on request: a field's survey, and the reprocessing of an archive.
+"""The flows that Prefect runs on schedule or request, a field's survey and an archive's reprocessing, and their runner.
 
 Their parameters can only name what is served; all else stands in the file of `flows.schedule.served`. What a survey
 needs is imported when it has begun: on a busy machine that takes longer than a run may be late.
@@ -6,16 +6,19 @@ needs is imported when it has begun: on a busy machine that takes longer than a 
 No ``from __future__ import annotations`` here: Prefect reads the signatures. What is done is in plain functions.
 """
 
+import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
-from prefect import State, flow
+from prefect import State, flow, serve
 from prefect.concurrency.sync import concurrency
 from prefect.context import FlowRunContext
 from prefect.states import Cancelled, Completed, Failed
+from prefect.types.entrypoint import EntrypointType
 
 from flows.schedule.due_runs import Outcome, ScheduleNews, run_due, send_notice, together
 from flows.schedule.field_schedule import FieldSchedule, read_moment
@@ -159,3 +162,55 @@ def reprocess_archive(
     if code == FAILED:
         return Failed(message="no field could be reprocessed; reprocess-TIME.json beside the archive says why")
     return Completed(message="some fields failed: see reprocess-TIME.json" if code == PARTLY else "done")
+
+
+@contextmanager
+def own_temporary_folder() -> Iterator[None]:
+    """Let this process have its temporary files in a folder that is this user's alone.
+
+    Prefect's runner keeps what it starts in /tmp/runner_storage, which belongs to the first user who ever ran one: that
+    one could exchange it, and no other can run one.
+    """
+    usual = tempfile.tempdir
+    with tempfile.TemporaryDirectory(prefix="spectralzoom-runner-", ignore_cleanup_errors=True) as own:
+        tempfile.tempdir = own
+        try:
+            yield
+        finally:
+            tempfile.tempdir = usual
+
+
+def deployments(request: ServeRequest) -> list[Any]:
+    """A deployment for each field and each archive; without schedules: `flows.schedule.watcher` plans each time."""
+    alike: dict[str, Any] = {"version": "1", "entrypoint_type": EntrypointType.MODULE_PATH}
+    surveys = [
+        survey_scheduled.to_deployment(
+            one.name,
+            schedules=[],
+            parameters={"field": one.name},
+            tags=[one.settings.source, one.name],
+            description=f"Surveys of {one.name} by {one.file}, {request.timetable.words()}.",
+            **alike,
+        )
+        for one in request.fields
+    ]
+    archives = [
+        reprocess_archive.to_deployment(
+            "archive" if number == 1 else f"archive-{number}",
+            parameters={"archive": str(out)},
+            description=f"Surveys of {out} again, with newer weights or stages; on request.",
+            **alike,
+        )
+        for number, out in enumerate(dict.fromkeys(one.settings.out for one in request.fields), 1)
+    ]
+    return [*surveys, *archives]
+
+
+def serve_runs() -> None:
+    """Let the deployments of what is served run until told to stop: the process that `serve` keeps up.
+
+    It is started anew with the server: by itself Prefect's runner does not come back once its server has been away.
+    """
+    request = read_served()
+    with suppress(KeyboardInterrupt), own_temporary_folder():
+        serve(*deployments(request), limit=request.limit, print_starting_message=False)

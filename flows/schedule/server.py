@@ -163,7 +163,7 @@ def serve_prefect(request: ServeRequest, tell: Tell) -> None:
         write_served(request, served)
         watcher = Watcher(request, schedules, tell)
         # Of the runs that it starts the log has what they say; they go on by themselves when it ends, or are resumed.
-        command = [sys.executable, "-m", "flows.schedule.runner"]
+        command = [sys.executable, "-c", "from flows.schedule.prefect_flows import serve_runs; serve_runs()"]
         runner = KeptProcess(command, log, RUNNER_ENDS_WITHIN_S, {NAMED_BY: str(served)})
         opened: list[FieldSchedule] = []
         try:

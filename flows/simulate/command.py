@@ -15,16 +15,16 @@ from rich.markup import escape
 from flows.publish.receipt_table import print_effects
 from flows.settings.survey_settings import Settings
 from flows.simulate.effect_comparison import Comparison, compare_with_everything
-from flows.survey.capture_plan import lay_out_sweeps
-from flows.survey.run import CaptureRun, make_source
+from flows.survey.run import CaptureRun, lay_out_sweeps, make_source
 from flows.survey.scene import SimulatedField, farm_refusal, open_scene
 from flows.survey.stage import Stage, Wanted
 from flows.survey.stages.capture import capture_coarse, sweeps_wanted
 from flows.survey.stages.effects import choose_effects, load_manifest
 from flows.terminal.figures import format_bytes, format_seconds
+from flows.terminal.processes import writing
 from flows.terminal.progress import StageProgress
 from models.network.process import keep_freed_memory, use_one_thread
-from pipeline.errors import ArchiveError, SceneError, SettingsError
+from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.selection.choice import UNIT_WORDS
@@ -91,7 +91,10 @@ def run_simulate(
     _print(record, console)
     if picture is None or found is None:
         return record
-    _draw(picture, found, settings)
+    from flows.simulate.effect_picture import Words, draw_comparison  # matplotlib
+
+    with writing(picture, "--compare"):
+        draw_comparison(picture, found, Words(f"{Path(settings.scene).stem}, seed {settings.seed}", settings.effects))
     _print_comparison(found, picture, console)
     return record | {"comparison": {**found.record(), "picture": str(picture)}}
 
@@ -102,27 +105,11 @@ def _check_picture(path: Path) -> None:
         raise SettingsError(f"--compare writes a PNG, got {path}; name a file that ends with .png")
     if path.is_dir():
         raise SettingsError(f"--compare {path} is a folder; name a file in it, such as {path / 'difference.png'}")
-    try:
+    with writing(path, "--compare"):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("ab"):
-            pass
-    except OSError as error:
-        raise _unwritable(path, error) from error
+        path.open("ab").close()
     if not path.stat().st_size:
         path.unlink()
-
-
-def _unwritable(path: Path, error: OSError) -> ArchiveError:
-    return ArchiveError(f"cannot write to {path}: {error.strerror}; choose another --compare")
-
-
-def _draw(path: Path, found: Comparison, settings: Settings) -> None:
-    from flows.simulate.effect_picture import Words, draw_comparison  # matplotlib
-
-    try:
-        draw_comparison(path, found, Words(f"{Path(settings.scene).stem}, seed {settings.seed}", settings.effects))
-    except OSError as error:
-        raise _unwritable(path, error) from error
 
 
 def open_simulation(settings: Settings, *, coarse: bool = False) -> tuple[CaptureRun, list[Sweep], tuple[str, ...]]:

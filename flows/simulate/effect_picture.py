@@ -17,7 +17,7 @@ from matplotlib.image import AxesImage
 from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
-from flows.publish.panels import INK, MUTED
+from flows.publish.panels import INK, MUTED, STYLE
 from flows.simulate.effect_comparison import Comparison, View
 from flows.terminal.figures import format_count, format_seconds
 from pipeline.simulator.effects.probe import Unit
@@ -31,17 +31,6 @@ _MARGIN_IN, _HEAD_IN, _CAPTION_IN, _FOOT_IN = 0.4, 0.82, 0.92, 0.98
 _LETTERS_IN = 13.4  # of the smallest words, on an inch
 _TITLE: Any = {"loc": "left", "size": 15, "weight": "bold", "pad": 30}
 _LINEAR = 0.01  # of the range, below which colours are even; beyond by its logarithm
-_STYLE: Any = {
-    "font.size": 12,
-    "text.parse_math": False,
-    "font.family": "DejaVu Sans",
-    "axes.edgecolor": "#b8b8b0",
-    "axes.linewidth": 0.8,
-    "text.color": INK,
-    "axes.labelcolor": INK,
-    "figure.facecolor": "#fbfaf7",
-    "savefig.facecolor": "#fbfaf7",
-}
 
 
 @dataclass(frozen=True)
@@ -54,7 +43,7 @@ class Words:
 
 def draw_comparison(path: str | Path, found: Comparison, words: Words) -> None:
     """Draw the three panels as a PNG, 1600 px wide. Raises OSError: the file cannot be written."""
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = _compose(found, words)
         FigureCanvasAgg(figure)
         figure.savefig(path, format="png", dpi=_DPI, pil_kwargs={"optimize": True})

@@ -12,6 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from flows.settings.load import load_settings
+from flows.terminal.processes import DONE, FAILED, PARTLY
 from flows.terminal.progress import on_stdout, print_json
 from pipeline.errors import SettingsError
 from pipeline.geometry.scan import CostModel
@@ -21,7 +22,6 @@ from pipeline.rig.emulator.fault_names import fault_table
 from pipeline.rig.mirror.mirror_controller import open_mirror
 from pipeline.rig.rig_check import CheckRow, Device, check_camera, check_mirror, works
 
-DONE, FAILED, PARTLY = 0, 1, 3
 LIST = "list"
 _COLOURS = {"ok": "green", "warn": "yellow", "fail": "bold red"}
 

@@ -18,7 +18,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 
-from pipeline.errors import SettingsError
+from pipeline.errors import ArchiveError, SettingsError
 from storage.archive.staging import disk_advice
 
 DONE, FAILED, PARTLY = 0, 1, 3  # exit codes
@@ -70,6 +70,15 @@ def refusal_words(error: BaseException) -> str | None:
         where = f" {error.filename}" if error.filename else ""
         return f"the system refused to read or write{where}: {advice}"
     return None
+
+
+@contextmanager
+def writing(out: Path, flag: str = "--out") -> Iterator[None]:
+    """Turn a place that cannot be written to into an error that says so (ArchiveError)."""
+    try:
+        yield
+    except OSError as error:
+        raise ArchiveError(f"cannot write to {out}: {error.strerror}; choose another {flag}") from error
 
 
 NO_HOME = "/nonexistent"  # as Debian calls the home of users that have none

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from itertools import cycle
 from pathlib import Path
 from typing import Any
@@ -30,8 +29,9 @@ import flows.tradeoff.rectify
 import flows.tradeoff.simulate  # noqa: F401 - each registers its entries
 from flows.publish.panels import INK, MUTED
 from flows.terminal.figures import format_seconds
+from flows.terminal.processes import writing
 from flows.tradeoff.entries import Point, Result, cheapest_within, find_tradeoffs, measure_tradeoff, registered
-from pipeline.errors import ArchiveError, SettingsError
+from pipeline.errors import SettingsError
 
 
 def print_tradeoff(result: Result, console: Console) -> None:
@@ -99,7 +99,7 @@ def run_tradeoff(stage: str | None, out: Path, repeats: int, seed: int, console:
     if seed < 0:
         raise SettingsError(f"--seed must be 0 or more, got {seed}")
     wanted = find_tradeoffs(stage) if stage else sorted(registered().values(), key=lambda one: one.stage)
-    with _writing(out):
+    with writing(out):
         out.mkdir(parents=True, exist_ok=True)  # before minutes are spent on what cannot be kept
     results = []
     for tradeoff in wanted:
@@ -108,19 +108,11 @@ def run_tradeoff(stage: str | None, out: Path, repeats: int, seed: int, console:
         print_tradeoff(result, console)
         results.append(result)
     content = {"tradeoffs": [result.to_dict() for result in results]}
-    with _writing(out):
+    with writing(out):
         (out / "tradeoff.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
         draw_tradeoffs(out / "tradeoff.png", results)
     console.print(f"{out / 'tradeoff.json'}\n{out / 'tradeoff.png'}", highlight=False, soft_wrap=True)
     return content
-
-
-@contextmanager
-def _writing(out: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise ArchiveError(f"cannot write to {out}: {error.strerror}; choose another --out") from error
 
 
 _FRONT: Any = {"marker": "o", "color": "#0072B2", "markersize": 9, "label": "no other setting beats it"}

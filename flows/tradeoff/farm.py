@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib import resources
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.survey.run import SHIPPED
+from flows.survey.run import shipped_weights
 from flows.survey.stages.accuracy import columns_of_all_seats
 from flows.tradeoff.entries import Level, Setting, Tradeoff, register
 from models.evaluation.metrics import confusion, mean_iou
@@ -67,7 +65,7 @@ class FarmLook:
 
 def look_at_farm(seed: int, shape: tuple[int, int], *, noise_seed: int | None = None) -> FarmLook:
     """Sweep a farm of (y, x) px coarsely with the shipped weights at hand; ``noise_seed`` draws other noise on it."""
-    weights = load_weights(Path(str(resources.files("models") / "shipped" / SHIPPED)))
+    weights = load_weights(shipped_weights())
     camera, scene = LineCamera(), farm_scene(seed, shape)
     grid = SceneGrid(*shape, weights.config.patch, weights.config.factor)
     source = SimulatedSource(scene, Rig(camera), seed if noise_seed is None else noise_seed)
