@@ -292,7 +292,14 @@ def run_judge(
     with console.status("opening scene and weights"):
         run = open_run(settings)
         run.archive.reclaim()
-        products = _products(catalogue, found, run)
+        rows = {str(row.get("name")): row for row in found.stages}
+        products = Products()
+        for stage in STAGES.values():
+            if not stage.judges:
+                row = rows.get(stage.name, {})
+                key, what = str(row.get("key") or ""), f"{stage.title} of {found.uri}"
+                skipped = row.get("state") == "skipped"
+                products[stage.name] = None if skipped else _store(catalogue, run.archive, what, key)
         _check_same(catalogue, found, products, run)
     with run.archive.in_use(), run.settings.crew.open(), StageProgress(console, TITLES) as progress:
         draft = run.archive.extend_run(found.folder.name, wait=False)
@@ -304,19 +311,6 @@ def run_judge(
             published = add_accuracy(run, draft, judged, runner.records["evaluate"])
     show_published(published, run.archive, console)
     return published.receipt
-
-
-def _products(catalogue: Catalogue, found: Run, run: SurveyRun) -> Products:
-    """What the run's survey left, each whole by its manifest and of the present version of its stage."""
-    rows = {str(row.get("name")): row for row in found.stages}
-    products = Products()
-    for stage in STAGES.values():
-        if not stage.judges:
-            row = rows.get(stage.name, {})
-            key, what = str(row.get("key") or ""), f"{stage.title} of {found.uri}"
-            skipped = row.get("state") == "skipped"
-            products[stage.name] = None if skipped else _store(catalogue, run.archive, what, key)
-    return products
 
 
 def _store(catalogue: Catalogue, archive: Archive, what: str, key: str) -> StageRef:

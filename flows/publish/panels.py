@@ -102,7 +102,9 @@ def draw_scale(axes: Axes, shape: tuple[int, ...], pixel_mrad: float) -> None:
     """A bar of a round number of px in the lower left corner, with its angle."""
     height, width = shape[:2]
     inch_x, inch_y = (size / inches for size, inches in zip((width, height), panel_inches(axes), strict=True))
-    length = _round_length(width / 4)
+    most = max(width / 4, 1)
+    power = 10 ** int(np.floor(np.log10(most)))
+    length = int(max(step * power for step in (1, 2, 5) if step * power <= most))
     left, bottom = 0.14 * inch_x - 0.5, height - 0.5 - 0.14 * inch_y
     bar = Rectangle((left, bottom - 0.07 * inch_y), length, 0.07 * inch_y, facecolor="white", edgecolor="black")
     axes.add_patch(bar)
@@ -116,12 +118,6 @@ def panel_inches(axes: Axes) -> tuple[float, float]:
     box, page = axes.get_window_extent(), axes.get_figure(root=True)
     dpi = 100.0 if page is None else page.dpi
     return float(box.width / dpi), float(box.height / dpi)
-
-
-def _round_length(px: float) -> int:
-    """The largest of 1, 2, 5 times a power of ten that is not above ``px`` (at least 1)."""
-    power = 10 ** int(np.floor(np.log10(max(px, 1))))
-    return int(max(step * power for step in (1, 2, 5) if step * power <= max(px, 1)))
 
 
 def draw_ground(found: GroundMap) -> bytes:

@@ -139,10 +139,10 @@ def read_served() -> ServeRequest:
 
 def served_field(request: ServeRequest, name: str) -> ServedField:
     """The field of that name (SettingsError where it is not served)."""
-    for one in request.fields:
-        if one.name == name:
-            return one
-    raise SettingsError(f"the field {name!r} is not served here: {', '.join(one.name for one in request.fields)} are")
+    found = {one.name: one for one in request.fields}
+    if name not in found:
+        raise SettingsError(f"the field {name!r} is not served here: {', '.join(found)} are")
+    return found[name]
 
 
 def served_archive(request: ServeRequest, name: str) -> str:

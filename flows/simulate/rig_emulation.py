@@ -90,7 +90,18 @@ def _tell(request: EmulateRequest, served: ServedRig, console: Console, *, as_js
     table = _rig_table(served, request.settings.rig)
     if request.out is not None:
         try:
-            request.out.write_text(_survey_toml(request.settings, table), encoding="utf-8")
+            settings = request.settings
+            size = None if settings.size is None else f"{settings.size[0]}x{settings.size[1]}"
+            names = ("scene", "size", "day", "hour", "bands", "wavelengths", "seed", "effects", "tol", "source")
+            wanted = {name: getattr(settings, name) for name in names}
+            wanted |= {"size": size, "tol": str(settings.tol), "source": "rig"}
+            given = [f"{key} = {_toml_value(value)}" for key, value in wanted.items() if value is not None]
+            request.out.write_text(
+                "\n".join(
+                    ["# A survey of an emulated rig, for as long as that runs.", *given, "", _toml_table("rig", table)]
+                ),
+                encoding="utf-8",
+            )
         except OSError as error:
             raise SettingsError(f"cannot write {request.out}: {error.strerror}; choose another --out") from error
         console.print(f"survey it with: spectralzoom survey {escape(str(request.out))}", highlight=False)
@@ -116,18 +127,6 @@ def _rig_table(served: ServedRig, rig: SurveyRig) -> dict[str, object]:
         "provenance": "emulated",
         **{name: getattr(rig, name) for name in mounted if rig.mounting != STRAIGHT},
     }
-
-
-def _survey_toml(settings: Settings, table: dict[str, object]) -> str:
-    """A survey of the emulated rig: the scene says how large the field is, and what is true there."""
-    size = None if settings.size is None else f"{settings.size[0]}x{settings.size[1]}"
-    names = ("scene", "size", "day", "hour", "bands", "wavelengths", "seed", "effects", "tol", "source")
-    wanted = {name: getattr(settings, name) for name in names}
-    wanted |= {"size": size, "tol": str(settings.tol), "source": "rig"}
-    given = [f"{key} = {_toml_value(value)}" for key, value in wanted.items() if value is not None]
-    return "\n".join(
-        ["# A survey of an emulated rig, for as long as that runs.", *given, "", _toml_table("rig", table)]
-    )
 
 
 def _toml_table(name: str, values: dict[str, object]) -> str:

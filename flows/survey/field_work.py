@@ -130,20 +130,13 @@ def seat_columns(
         part = slice(kept, kept := kept + int(some.sum()))
         seats[part] = numbers[entries][some]
         columns[part] = weights.columns(values[some], wavelength_nm)
-        _fill_unseen(columns[part], seats[part], reached[some], seen)
+        pixel = np.arange(p)
+        for patch, seat, there in zip(columns[part], seats[part], reached[some], strict=True):
+            if not there.all():  # where no line reached a pixel of a seat
+                y, x = seen.grid.seat_origin(seat)[..., None] + pixel
+                coarse = seen.columns[np.ix_(y // seen.grid.factor, x // seen.grid.factor)]
+                patch[~there] = coarse[~there]
     return seats[:kept], columns[:kept]
-
-
-def _fill_unseen(
-    columns: NDArray[np.float32], seats: NDArray[np.int64], reached: NDArray[np.bool_], seen: CoarseLook
-) -> None:
-    """Put the columns of the coarse look, in place, where no line reached a pixel of a seat."""
-    pixel = np.arange(seen.grid.patch)
-    for patch, seat, there in zip(columns, seats, reached, strict=True):
-        if not there.all():
-            y, x = seen.grid.seat_origin(seat)[..., None] + pixel
-            coarse = seen.columns[np.ix_(y // seen.grid.factor, x // seen.grid.factor)]
-            patch[~there] = coarse[~there]
 
 
 SHARD = (SHARD_ROWS, SHARD_COLUMNS)

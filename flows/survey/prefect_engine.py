@@ -106,7 +106,8 @@ def _task_step(runner: StageRunner) -> Step:
             persist_result=False,
             retries=STAGES[name].retries,
             retry_delay_seconds=RETRY_DELAY_S,
-            retry_condition_fn=_may_help,
+            # a device or disk may answer the second time; wrong input will not
+            retry_condition_fn=lambda task, run, state: isinstance(state.result(raise_on_failure=False), OSError),
         )(stage)
         found = one(name, {ref.uri: ref.key for ref in inputs}, before)
         if found is None:
@@ -161,11 +162,6 @@ def _stopping(stopped: list[KeyboardInterrupt]) -> Iterator[None]:
             stopped.append(error)
             get_current_settings().client.max_retries = 0
             raise
-
-
-def _may_help(task: Any, run: Any, state: Any) -> bool:
-    """A device or disk may answer the second time; wrong input will not."""
-    return isinstance(state.result(raise_on_failure=False), OSError)
 
 
 @contextmanager

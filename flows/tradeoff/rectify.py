@@ -58,10 +58,6 @@ def _ends(along: Floats, scan: Floats) -> tuple[Floats, Floats]:
     return along[:, [0, -1]], scan[:, [0, -1]]
 
 
-def _model_lines(state: Strips, model: Setting) -> Lines:
-    return [line_points(cast("LineModel", model), strip, scan, state.camera) for strip, scan in state.centres]
-
-
 def _error_at_ends(state: Strips, _model: Setting, out: Lines) -> float:
     pairs = zip(map(_ends, *zip(*out, strict=True)), state.ends, strict=True)
     return max(float(np.hypot(a - exact_a, b - exact_b).max()) for (a, b), (exact_a, exact_b) in pairs)
@@ -76,7 +72,9 @@ LINE_MODEL = register(
         reference=f"exact rays over {FIELD_PX} x {FIELD_PX} px, as far as the mirror reaches",
         settings=LINE_MODELS,
         prepare=_prepare_strips,
-        run=_model_lines,
+        run=lambda state, model: [
+            line_points(cast("LineModel", model), strip, scan, state.camera) for strip, scan in state.centres
+        ],
         judge=_error_at_ends,
         work=lambda state, _model: float(sum(len(scan) for _, scan in state.centres) * state.camera.samples),
         levels=lambda _state: (Level("half a pixel", 0.5),),

@@ -40,15 +40,6 @@ def validate(weights: AnyWeights, examples: Iterable[Example], seed: int, show: 
         grid, cells, labels = _parts(two_scale, example)
         seen = glance_of_columns(two_scale, example.coarse, grid)
         rows.append(run_controls(two_scale, seen, cells, labels, share=CONTROL_SHARE, seed=seed, report=show))
-    return _summary(rows)
-
-
-def _parts(weights: AnyWeights, example: Example) -> tuple[SceneGrid, Patches, NDArray[np.uint8]]:
-    grid = SceneGrid(*example.shape, weights.config.patch, weights.config.factor)
-    return grid, patches_of(example.fine, grid.patch).astype(np.float32), example.labels[: grid.height, : grid.width]
-
-
-def _summary(rows: list[Controls]) -> dict[str, Any] | None:
     if not rows:
         return None
     whole = Controls(
@@ -66,6 +57,11 @@ def _summary(rows: list[Controls]) -> dict[str, Any] | None:
         "all": agreement(whole.every),
         **whole.as_dict(),
     }
+
+
+def _parts(weights: AnyWeights, example: Example) -> tuple[SceneGrid, Patches, NDArray[np.uint8]]:
+    grid = SceneGrid(*example.shape, weights.config.patch, weights.config.factor)
+    return grid, patches_of(example.fine, grid.patch).astype(np.float32), example.labels[: grid.height, : grid.width]
 
 
 def _validate_control(weights: AnyWeights, examples: Iterable[Example], seed: int, show: Show) -> dict[str, Any] | None:

@@ -48,8 +48,8 @@ from storage.archive.manifests import read_table
 from storage.archive.whole_files import to_json
 from storage.arrays.class_maps import load_class_map
 
-ACCURACY = Product("evaluate", version=7, by_weights=True)
 RECORD = "accuracy.json"
+ACCURACY = Product("evaluate", version=7, files=(RECORD,), by_weights=True)
 
 
 @stage(
@@ -61,7 +61,6 @@ RECORD = "accuracy.json"
     unit="operations of a glance",
     size="surveys",
     judges=True,
-    named={"accuracy": RECORD},
 )
 def evaluate(
     run: SurveyRun, mosaic: StageRef, patches: StageRef, class_map: StageRef, effects: StageRef, *pointing: StageRef

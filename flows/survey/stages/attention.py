@@ -21,17 +21,10 @@ from storage.archive.keys import StageRef, array_digest
 from storage.archive.manifests import read_table, write_table
 from storage.arrays.mosaics import Attention, load_attention, mosaic_brightness, write_attention
 
-ATTENTION = Product("attend", version=7, by_weights=True)
+ATTENTION = Product("attend", version=7, files=("attention.zarr", "plan.json"), by_weights=True)
 
 
-@stage(
-    "attend",
-    "attention and plan",
-    ATTENTION,
-    of=("rectify",),
-    unit="pixels",
-    named={"attention": "attention.zarr", "plan": "plan.json"},
-)
+@stage("attend", "attention and plan", ATTENTION, of=("rectify",), unit="pixels")
 def attend(run: SurveyRun, mosaic: StageRef) -> Wanted:
     """Score every seat by the coarse mosaic, and plan the sweeps that show the most score in the time left."""
     settings = run.settings
@@ -99,8 +92,8 @@ def load_plan(attention: StageRef) -> FinePlan:
     return FinePlan(**(plan | kept))
 
 
-TURNED = Product("turned", version=1)
 FILE = "orientation.json"
+TURNED = Product("turned", version=1, files=(FILE,))
 
 
 @stage(
@@ -110,7 +103,6 @@ FILE = "orientation.json"
     of=("rectify", "attend"),
     after=("draw_map",),
     unit="pixels",
-    named={"turned": FILE},
 )
 def compare_turned(run: SurveyRun, mosaic: StageRef, attention: StageRef) -> Wanted:
     """Plan the scores with lines along the other axis, and find which way crop rows run."""

@@ -34,7 +34,7 @@ RIG_RECORD = "rig.json"  # beside the cubes: what a rig's captures were like
     inputs=1,
     unit="coarse values",
     retries=2,
-    named={"raw_coarse": ""},
+    named="raw_coarse",
 )
 def capture_coarse(run: SurveyRun, effects: StageRef) -> Wanted:
     """Sweep the whole field once, fast."""
@@ -49,7 +49,7 @@ def capture_coarse(run: SurveyRun, effects: StageRef) -> Wanted:
     inputs=2,
     unit="fine values",
     retries=2,
-    named={"raw_fine": ""},
+    named="raw_fine",
 )
 def capture_fine(run: SurveyRun, attention: StageRef, effects: StageRef) -> Wanted:
     """Go back for the places that the plan chose."""

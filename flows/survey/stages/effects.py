@@ -28,8 +28,8 @@ from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table
 from storage.archive.whole_files import to_json
 
-MANIFEST = Product("effects", version=2)
 RECORD = "effects.json"
+MANIFEST = Product("effects", version=2, files=(RECORD,))
 LOOK = {
     ROTATION: ROTATION.variants[0],
     SLIT: SLIT.variants[-1],
@@ -37,7 +37,7 @@ LOOK = {
 DRAFT, VERIFIED = 0.3, 1.0
 
 
-@stage("choose_effects", "effects that matter", MANIFEST, unit="surveys", named={"effects": RECORD})
+@stage("choose_effects", "effects that matter", MANIFEST, unit="surveys")
 def choose_effects(run: CaptureRun) -> Wanted:
     """Decide for scene and rig which effects to simulate, and check it on the worst lines of the scene.
 

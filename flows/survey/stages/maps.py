@@ -23,19 +23,11 @@ from storage.arrays.layout import SHARD_ROWS, open_group, read_array, read_bands
 from storage.arrays.mosaics import open_patches
 from storage.arrays.quicklooks import choose_bands, develop, stretch
 
-CLASS_MAP = Product("segment", version=5, by_weights=True)
+CLASS_MAP = Product("segment", version=5, files=("class_map.zarr",), by_weights=True)
 STRANGE = "strange.json"  # beside a map, where values were no readings
 
 
-@stage(
-    "draw_map",
-    "class map",
-    CLASS_MAP,
-    of=("rectify", "cut_patches"),
-    unit="operations of the map",
-    size="pixels",
-    named={"class_map": "class_map.zarr"},
-)
+@stage("draw_map", "class map", CLASS_MAP, of=("rectify", "cut_patches"), unit="operations of the map", size="pixels")
 def draw_map(run: SurveyRun, mosaic: StageRef, patches: StageRef) -> Wanted:
     """Draw the class map from coarse and fine patches, region by region; no class where the scene has no value."""
 
@@ -74,19 +66,11 @@ def patch_columns(run: SurveyRun, patches: StageRef, seen: CoarseLook) -> tuple[
     return seat_columns(run.weights, store, run.scene.wavelength_nm, seen, whole_field(run.grid))
 
 
-GROUND = Product("ground", version=2)
 STORE = "ground_map.zarr"
+GROUND = Product("ground", version=2, files=(STORE,))
 
 
-@stage(
-    "ground",
-    "map on the ground",
-    GROUND,
-    of=("draw_map", "rectify"),
-    after=("compare_turned",),
-    unit="pixels",
-    named={"ground_map": STORE},
-)
+@stage("ground", "map on the ground", GROUND, of=("draw_map", "rectify"), after=("compare_turned",), unit="pixels")
 def ground(run: SurveyRun, class_map: StageRef, mosaic: StageRef) -> Wanted | None:
     """Draw the class map and the coarse picture on the ground; nothing where the settings have no pose."""
     grid = survey_grid(run)

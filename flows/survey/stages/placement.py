@@ -36,8 +36,8 @@ from storage.arrays.mosaics import MosaicWriter, PatchWriter, load_mosaic, open_
 from storage.arrays.quicklooks import choose_bands, stretched
 from storage.arrays.tile_work import MosaicRecipe, Sighted, Thumbnail, sight_sweeps, write_mosaic
 
-POINTING = Product("register", version=2)
 RECORD = "registration.json"
+POINTING = Product("register", version=2, files=(RECORD,))
 
 
 def sighted(run: SurveyRun, raw: StageRef, registration: StageRef | None) -> list[Sighted]:
@@ -57,7 +57,7 @@ def record_of(registration: StageRef | None) -> Path | None:
     of=("capture_coarse",),
     inputs=1,
     unit="coarse values",
-    named={"coarse_pointing": RECORD},
+    named="coarse_pointing",
 )
 def register_coarse(run: SurveyRun, raw: StageRef) -> Wanted | None:
     """Find pointing and light of the coarse sweeps from what neighbours show twice."""
@@ -124,7 +124,7 @@ def _window_record(seen: SeamWindow, names: Sequence[str]) -> dict[str, Any]:
     of=("capture_fine", "rectify"),
     inputs=2,
     unit="fine values",
-    named={"fine_pointing": RECORD},
+    named="fine_pointing",
 )
 def register_fine(run: SurveyRun, raw: StageRef, mosaic: StageRef) -> Wanted | None:
     """Find where each fine sweep lies on the coarse mosaic, which itself may be off by as much."""
@@ -159,20 +159,15 @@ def load_registration(registration: StageRef) -> dict[str, Any]:
     return read_table(registration.path / RECORD)
 
 
-LOOKUP, MOSAIC, PATCHES = Product("locate", version=2), Product("rectify", version=3), Product("patches", version=3)
+LOOKUP = Product("locate", version=2, files=("lookup.zarr",))
+MOSAIC = Product("rectify", version=3, files=("mosaic.zarr",))
+PATCHES = Product("patches", version=3, files=("patches.zarr",))
 QUICKLOOK_PX = 512
 SEATS_AT_ONCE = 64
 CACHE_SHARE = 8  # raw lines kept for the next patches may take this part of the memory
 
 
-@stage(
-    "locate",
-    "lookup",
-    LOOKUP,
-    of=("capture_coarse", "register_coarse"),
-    unit="coarse pixels",
-    named={"lookup": "lookup.zarr"},
-)
+@stage("locate", "lookup", LOOKUP, of=("capture_coarse", "register_coarse"), unit="coarse pixels")
 def locate(run: SurveyRun, raw: StageRef, *registration: StageRef) -> Wanted:
     """Look up where each coarse pixel was seen: a table that every survey along the same path shares."""
     grid = PixelGrid.of_scene(run.grid, run.grid.factor)
@@ -203,14 +198,7 @@ def locate(run: SurveyRun, raw: StageRef, *registration: StageRef) -> Wanted:
     return Wanted(build, params)  # keyed by the paths, not by what was seen along them
 
 
-@stage(
-    "rectify",
-    "mosaic",
-    MOSAIC,
-    of=("capture_coarse", "locate", "register_coarse"),
-    unit="mosaic values",
-    named={"mosaic": "mosaic.zarr"},
-)
+@stage("rectify", "mosaic", MOSAIC, of=("capture_coarse", "locate", "register_coarse"), unit="mosaic values")
 def rectify(run: SurveyRun, raw: StageRef, lookup: StageRef, *registration: StageRef) -> Wanted:
     """Bring the coarse sweeps onto the scene grid and blend them into one mosaic, tile by tile."""
 
@@ -242,14 +230,7 @@ def rectify(run: SurveyRun, raw: StageRef, lookup: StageRef, *registration: Stag
     return Wanted(build, params, [raw, lookup, *registration])
 
 
-@stage(
-    "cut_patches",
-    "fine patches",
-    PATCHES,
-    of=("attend", "capture_fine", "register_fine"),
-    unit="patch values",
-    named={"patches": "patches.zarr"},
-)
+@stage("cut_patches", "fine patches", PATCHES, of=("attend", "capture_fine", "register_fine"), unit="patch values")
 def cut_patches(run: SurveyRun, attention: StageRef, raw: StageRef, *registration: StageRef) -> Wanted:
     """Bring every chosen seat onto the scene grid, one patch a seat; NaN where a mirror off the plan did not look."""
 

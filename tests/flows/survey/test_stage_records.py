@@ -41,6 +41,6 @@ def test_a_module_is_all_that_a_stage_takes(tmp_path: Path, monkeypatch: pytest.
 
 def test_every_stage_says_once_what_receipts_call_its_store() -> None:
     """No two stages share a name in receipts, and each has one at least."""
-    names = [name for one in all_stages().values() for name in one.named]
-    assert len(set(names)) == len(names)
-    assert all(one.named for one in all_stages().values())
+    named = [one.addresses(StageRef(one.product.name, "abc", Path())) for one in all_stages().values()]
+    assert all(named)
+    assert len({name for one in named for name in one}) == sum(map(len, named))
