@@ -120,7 +120,7 @@ def seal(*weights: Path) -> int:
         raise SettingsError("seal needs files of weights: spectralzoom seal FILE ...")
     for path in weights:
         done = "sealed" if seal_weights(path) else "sealed already, every tensor as it was written"
-        stderr.print(f"{path}: {done}", highlight=False, markup=False, soft_wrap=True)
+        stderr.print(f"{path}: {done}", markup=False, soft_wrap=True)
     return 0
 
 

@@ -336,7 +336,7 @@ def show_comparison(content: dict[str, Any], console: Console) -> None:
     """Print what `compare` found."""
 
     def say(text: str) -> None:
-        console.print(escape(text), highlight=False, soft_wrap=True)
+        console.print(escape(text), soft_wrap=True)
 
     say(f"A: {panel_words(content['a'])}\nB: {panel_words(content['b'])}")
     console.print(_class_table(content["classes"]))

@@ -114,9 +114,9 @@ def run_export(archive: str | Path, run: str | None, out: Path, envi: bool, cons
     }
     placed = opened.geobox is not None
     if not placed:
-        console.print("[dim]note: no rig pose in this survey, so the images have no CRS[/]", highlight=False)
+        console.print("[dim]note: no rig pose in this survey, so the images have no CRS[/]")
     for path in (*(out / name for name in files.values()), item, collection):
-        console.print(f"  {escape(str(path))}", highlight=False, soft_wrap=True)
+        console.print(f"  {escape(str(path))}", soft_wrap=True)
     return {"run": opened.id, "item": str(item), "collection": str(collection), "placed": placed, "files": files}
 
 

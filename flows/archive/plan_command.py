@@ -216,9 +216,9 @@ def show_plan(content: dict[str, Any], console: Console) -> None:
             *figures,
         )
     console.print(table)
-    console.print(escape(_sentence(content)), highlight=False, soft_wrap=True)
+    console.print(escape(_sentence(content)), soft_wrap=True)
     if content["refused"] is not None:
-        console.print(f"[yellow]refused here[/]: {escape(content['refused'])}", highlight=False, soft_wrap=True)
+        console.print(f"[yellow]refused here[/]: {escape(content['refused'])}", soft_wrap=True)
 
 
 def _sentence(content: dict[str, Any]) -> str:

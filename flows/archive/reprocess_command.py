@@ -146,9 +146,9 @@ def run_reprocess(
     with request.crew.open():  # one start of its workers for all fields
         for number, generation in enumerate(wanted, 1):
             told = f"{number} of {len(wanted)}: {generation.field} ({generation.run.folder.name})"
-            console.print(f"[bold]reprocess {escape(told)}[/]", highlight=False, soft_wrap=True)
+            console.print(f"[bold]reprocess {escape(told)}[/]", soft_wrap=True)
             rows.append(_again(catalogue, generation, request, console, survey or _survey))
-            console.print(escape(_words(rows[-1])), highlight=False, soft_wrap=True)
+            console.print(escape(_words(rows[-1])), soft_wrap=True)
             if file is not None:
                 write_whole(file, to_json(content))  # also of what was done before an interruption
     content["finished"] = f"{datetime.now(UTC):%Y%m%dT%H%M%S}"
@@ -285,7 +285,7 @@ def run_judge(
         settings = replace(settings, labels=labels)
     there = "accuracy" in receipt and labels is None
     if there and (receipt["accuracy"]["controls"] or not settings.controls):
-        console.print(escape(f"{found.uri} has its accuracy already"), highlight=False, soft_wrap=True)
+        console.print(escape(f"{found.uri} has its accuracy already"), soft_wrap=True)
         return receipt
     use_one_thread()
     keep_freed_memory()

@@ -47,9 +47,9 @@ def run_evaluate(request: EvaluateRequest, console: Console, *, as_json: bool = 
         print_evaluation(content, on_stdout())
     for path in (*request.weights, *request.controls):
         if not describe_weights(path).sealed:
-            console.print(f"note: {unsealed_note(path)}", highlight=False, markup=False, soft_wrap=True)
+            console.print(f"note: {unsealed_note(path)}", markup=False, soft_wrap=True)
     for path in content["files"]:
-        console.print(path, highlight=False, soft_wrap=True)
+        console.print(path, soft_wrap=True)
     return content
 
 

@@ -20,11 +20,11 @@ ENDS = ("none", "all")
 def print_evaluation(content: dict[str, Any], console: Console) -> None:
     """Print what was judged, accuracy, costs, placement, budgets and classes, and what the figures mean."""
     for line in _head(content):
-        console.print(escape(line), highlight=False, soft_wrap=True)
+        console.print(escape(line), soft_wrap=True)
     tables = (_accuracy(content), *_both_definitions(content), _costs(content), _compute(content), _placement(content))
     for table in (*tables, *budget_tables(content), _classes(content)):
         console.print(table)
-    console.print(escape(_caption(content)), highlight=False, soft_wrap=True, style="dim")
+    console.print(escape(_caption(content)), soft_wrap=True, style="dim")
 
 
 def _head(content: dict[str, Any]) -> list[str]:

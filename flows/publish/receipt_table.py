@@ -207,15 +207,15 @@ def print_effects(effects: Iterable[Row], total: Row, console: Console) -> None:
     for row in there:
         table.add_row(*_figures(row, total), *([escape(_words(row))] if wide else []))
     console.print(table)
-    console.print(escape(_KEY.format(unit=UNIT_WORDS[total["unit"]])), style="dim", highlight=False)
+    console.print(escape(_KEY.format(unit=UNIT_WORDS[total["unit"]])), style="dim")
     if not wide:
         for row in there:
-            console.print(f"[bold]{escape(row['name'])}[/]: {escape(_words(row))}", highlight=False)
+            console.print(f"[bold]{escape(row['name'])}[/]: {escape(_words(row))}")
     absent = [f"{row['name']} ({row['magnitude']})" for row in rows if row["reason"] == "absent"]
     if absent:
-        console.print(f"[bold]Not there[/]: {escape(', '.join(absent))}.", highlight=False)
+        console.print(f"[bold]Not there[/]: {escape(', '.join(absent))}.")
     for sentence in total_words(total):
-        console.print(escape(sentence), highlight=False)
+        console.print(escape(sentence))
 
 
 def _figures(row: Row, total: Row) -> list[str]:

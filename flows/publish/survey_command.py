@@ -45,7 +45,7 @@ def run_survey(settings: Settings, console: Console) -> Published:
         run = open_run(settings)
         run.archive.reclaim()  # what a killed run left half made
     for note in run.notes:
-        console.print(f"[dim]note: {escape(note)}[/]", highlight=False)
+        console.print(f"[dim]note: {escape(note)}[/]")
     with run.archive.in_use(), settings.crew.open():
         published = _survey_and_publish(run, settings, console, started)
     show_published(published, run.archive, console)
@@ -55,14 +55,14 @@ def run_survey(settings: Settings, console: Console) -> Published:
 def show_published(published: Published, archive: Archive, console: Console) -> None:
     """Print a run's receipt as tables and sentences, and where its files lie."""
     print_table(published.receipt, console)
-    console.print(escape(headline(published.receipt, published.looked_twice)), highlight=False)
+    console.print(escape(headline(published.receipt, published.looked_twice)))
     for sentence in sentences(published.receipt):
-        console.print(escape(sentence), highlight=False)
+        console.print(escape(sentence))
     if archive.in_bucket:
         address = f"{archive.name}/runs/{published.folder.name}"
-        console.print(f"  {escape(address)}, and on this machine", highlight=False, soft_wrap=True)
+        console.print(f"  {escape(address)}, and on this machine", soft_wrap=True)
     for name in ("report.html", "quicklook.png", "receipt.json"):
-        console.print(f"  {escape(str(published.folder / name))}", highlight=False, soft_wrap=True)
+        console.print(f"  {escape(str(published.folder / name))}", soft_wrap=True)
 
 
 def _survey_and_publish(run: SurveyRun, settings: Settings, console: Console, started: str) -> Published:
@@ -77,7 +77,7 @@ def _survey_and_publish(run: SurveyRun, settings: Settings, console: Console, st
         runner = StageRunner(replace(run, source=run.source.saying(progress.say)), watch)
 
         def tell(words: str) -> None:
-            console.print(escape(words), highlight=False, soft_wrap=True)
+            console.print(escape(words), soft_wrap=True)
 
         def finish(step: Step, products: Products) -> Published:
             return publish_and_judge(runner, step, products, started, tell)
@@ -86,7 +86,7 @@ def _survey_and_publish(run: SurveyRun, settings: Settings, console: Console, st
             try:
                 return survey_with_prefect(runner, finish)
             except EngineUnavailable as error:
-                console.print(f"[yellow]{escape(str(error))}; going on with --engine plain[/]", highlight=False)
+                console.print(f"[yellow]{escape(str(error))}; going on with --engine plain[/]")
         return finish(runner, survey(runner))
 
 

@@ -195,7 +195,7 @@ def report(archive: ArchiveName, *, field: str | None = None, out: OutFile, as_j
     if not field:
         write_whole(page, render_index(histories, opened.name, names))
         written.append(page)
-    stderr.print(f"  {escape(str(written[-1]))}", highlight=False, soft_wrap=True)
+    stderr.print(f"  {escape(str(written[-1]))}", soft_wrap=True)
     if as_json:
         print_json({**content, "pages": [str(path) for path in written]})
     return DONE

@@ -104,7 +104,7 @@ def survey_field(one: ServedField, due: datetime, timetable: Timetable, console:
 
 
 def _tell(words: str) -> None:
-    stderr.print(escape(words), highlight=False, soft_wrap=True)
+    stderr.print(escape(words), soft_wrap=True)
 
 
 def load_fields(files: Sequence[Path], out: str | None = None) -> list[ServedField]:

@@ -73,7 +73,7 @@ def run_simulate(
         run, sweeps, notes = open_simulation(settings, coarse=coarse)
         run.archive.reclaim()  # what a killed scan left half made
     for note in notes:
-        console.print(f"[dim]note: {escape(note)}[/]", highlight=False)
+        console.print(f"[dim]note: {escape(note)}[/]")
     with run.archive.in_use(), StageProgress(console, TITLES) as progress:
         make = _Maker(run, progress)
         effects = make("effects", choose_effects, choose_effects.needed(make.watching("effects")))
@@ -83,7 +83,7 @@ def run_simulate(
         if picture is not None:
 
             def say(words: str) -> None:
-                console.print(f"[dim]everything on, exact: {escape(words)}[/]", highlight=False)
+                console.print(f"[dim]everything on, exact: {escape(words)}[/]")
 
             progress.show("comparison", 0.0)
             found = compare_with_everything(make.watching("comparison"), sweeps, effects, say)
@@ -175,11 +175,10 @@ def _print(record: Mapping[str, Any], console: Console) -> None:
     print_effects(record["effects"], record["effects_total"], console)
     done = "already there" if record["cached"] else f"{format_seconds(record['cpu_s'])} of CPU"
     console.print(
-        f"{record['lines']} lines in {record['sweeps']} sweeps: {done}, {format_bytes(record['bytes_stored'])} stored",
-        highlight=False,
+        f"{record['lines']} lines in {record['sweeps']} sweeps: {done}, {format_bytes(record['bytes_stored'])} stored"
     )
     for name in record["cubes"]:
-        console.print(f"  {escape(str(Path(record['path']) / Path(name).name))}", highlight=False, soft_wrap=True)
+        console.print(f"  {escape(str(Path(record['path']) / Path(name).name))}", soft_wrap=True)
 
 
 def _print_comparison(found: Comparison, picture: Path, console: Console) -> None:
@@ -189,7 +188,6 @@ def _print_comparison(found: Comparison, picture: Path, console: Console) -> Non
     console.print(
         f"Everything on, exact, takes {format_seconds(found.exact_cpu_s)} of CPU for {which} lines, these effects"
         f" {format_seconds(found.cpu_s)}: {found.ratio:.1f} times less. Light differs by {found.measured:.2g} {unit}"
-        f" at most ({bound}).",
-        highlight=False,
+        f" at most ({bound})."
     )
-    console.print(f"  {escape(str(picture))}", highlight=False, soft_wrap=True)
+    console.print(f"  {escape(str(picture))}", soft_wrap=True)

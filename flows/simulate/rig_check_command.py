@@ -102,9 +102,9 @@ def _print(rows: Sequence[CheckRow], console: Console) -> None:
     mend = [row for row in rows if row.mend]
     for row in mend:
         say = f"[{_COLOURS[row.verdict]}]{row.verdict}[/] {row.device}, {escape(row.asked)}: {escape(row.mend)}"
-        console.print(say, highlight=False, soft_wrap=True)
+        console.print(say, soft_wrap=True)
     if not mend:
-        console.print("nothing to mend", highlight=False)
+        console.print("nothing to mend")
 
 
 def _at(rig: SurveyRig, camera: str) -> SurveyRig:

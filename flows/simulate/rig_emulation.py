@@ -68,7 +68,7 @@ def run_emulate(
     with console.status("drawing the scene"):
         source, notes = emulated_source(request.settings)
     for note in notes:
-        console.print(f"[dim]note: {escape(note)}[/]", highlight=False)
+        console.print(f"[dim]note: {escape(note)}[/]")
     rig = EmulatedRig(
         source,
         FastClock(request.speed),
@@ -82,7 +82,7 @@ def run_emulate(
         with console.status(_state(rig)) as line:
             while not end.wait(EVERY_S):
                 line.update(_state(rig))
-        console.print(f"closed: {_state(rig)}", highlight=False, soft_wrap=True)
+        console.print(f"closed: {_state(rig)}", soft_wrap=True)
     return 0
 
 
@@ -104,14 +104,14 @@ def _tell(request: EmulateRequest, served: ServedRig, console: Console, *, as_js
             )
         except OSError as error:
             raise SettingsError(f"cannot write {request.out}: {error.strerror}; choose another --out") from error
-        console.print(f"survey it with: spectralzoom survey {escape(str(request.out))}", highlight=False)
+        console.print(f"survey it with: spectralzoom survey {escape(str(request.out))}")
     if as_json:
         faults = list(request.faults)
         print_json({"rig": table, "speed": request.speed, "faults": faults, "toml": request.out and str(request.out)})
     else:
         sys.stdout.write(f"{_toml_table('rig', table)}\n")
     sys.stdout.flush()
-    console.print("emulating a rig; Ctrl-C ends it", highlight=False)
+    console.print("emulating a rig; Ctrl-C ends it")
 
 
 def _rig_table(served: ServedRig, rig: SurveyRig) -> dict[str, object]:

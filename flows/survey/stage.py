@@ -84,7 +84,7 @@ class Stage:
         return wanted
 
     def addresses(self, ref: StageRef) -> dict[str, str]:
-        """Where its store lies, or the files in it, by the names that receipts give them: the stage's own by default."""
+        """Where its store lies, or the files in it, by the names in receipts: the stage's own by default."""
         if self.named is not None or not self.product.files:
             return {self.named or self.name: "/".join((ref.uri, *self.product.files))}
         return {Path(file).stem: f"{ref.uri}/{file}" for file in self.product.files}

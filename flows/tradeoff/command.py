@@ -111,7 +111,7 @@ def run_tradeoff(stage: str | None, out: Path, repeats: int, seed: int, console:
     with writing(out):
         (out / "tradeoff.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
         draw_tradeoffs(out / "tradeoff.png", results)
-    console.print(f"{out / 'tradeoff.json'}\n{out / 'tradeoff.png'}", highlight=False, soft_wrap=True)
+    console.print(f"{out / 'tradeoff.json'}\n{out / 'tradeoff.png'}", soft_wrap=True)
     return content
 
 

@@ -277,7 +277,7 @@ def print_start(begun: Mapping[str, Any], console: Console) -> None:
         shown = f"{names[0]} and {len(names) - 1} more" if len(names) > 1 else names[0]
         console.print(f"  skipped {shown}: {why}")
     if "unsealed" in begun:
-        console.print(f"  note: {begun['unsealed']}", highlight=False, markup=False, soft_wrap=True)
+        console.print(f"  note: {begun['unsealed']}", markup=False, soft_wrap=True)
     if begun["licence"]:
         console.print(f"  its licence: {begun['licence']}")
 
@@ -345,7 +345,6 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
             "no scene was kept for validation; to judge the weights on scenes that they were not trained on: "
             f"spectralzoom evaluate {request.dataset} {given} {out}",
             soft_wrap=True,
-            highlight=False,
         )
         return
     title = f"{figures['scenes']} scene{'s' if figures['scenes'] > 1 else ''} kept for validation"
