@@ -149,7 +149,13 @@ def compare(archive: ArchiveName, old: str, new: str, *, out: OutFolder = None, 
     folder = opened.around if out is None else check_outside(out, opened.root)
     catalogue = Catalogue.read(opened.root)
     runs = (find_run(catalogue, old), find_run(catalogue, new))
-    _check_same_field(*runs)
+    for run in runs:
+        if "class_map" not in run.products:
+            raise ArchiveError(f"{run.uri} has no class map to compare: {run.problem or 'it left none'}; see verify")
+    if not _is_same_field(*runs):
+        scenes = ((run, run.settings.get("scene")) for run in runs)
+        fields = (f"{run.uri} is of {_field_key(run) if scene in NO_FILES else scene}" for run, scene in scenes)
+        raise SceneError(f"these runs are of different fields: {', '.join(fields)}; give two runs of one field")
     pair = _pair_of([_class_map(catalogue, opened, run) for run in runs])
     content = _comparison(catalogue, runs, pair)
     name = f"compare-{runs[0].folder.name}-{runs[1].folder.name}.png"
@@ -191,16 +197,6 @@ def _field_key(run: Run) -> str:
     if law_of_key(key) is None:
         return key
     return "/".join(part for part in key.split("/") if not part.startswith(("day=", "hour=")))
-
-
-def _check_same_field(old: Run, new: Run) -> None:
-    for run in (old, new):
-        if "class_map" not in run.products:
-            raise ArchiveError(f"{run.uri} has no class map to compare: {run.problem or 'it left none'}; see verify")
-    if not _is_same_field(old, new):
-        scenes = ((run, run.settings.get("scene")) for run in (old, new))
-        fields = (f"{run.uri} is of {_field_key(run) if scene in NO_FILES else scene}" for run, scene in scenes)
-        raise SceneError(f"these runs are of different fields: {', '.join(fields)}; give two runs of one field")
 
 
 def _class_map(catalogue: Catalogue, archive: Archive, run: Run) -> ClassMap:

@@ -125,8 +125,17 @@ def _arrange(tallness: float) -> tuple[float, list[tuple[float, list[tuple[float
 
 
 def _draw_raw(axes: Axes, data: QuicklookData) -> None:
-    """Panel 1, first half: the sweeps as they came, lying as they looked at the field, stretched to its shape."""
-    image = _side_by_side([_colours(data, np.asarray(sweep)) for sweep in data.raw])
+    """Panel 1, first half: the sweeps as they came, next to each other with a light gap, shorter ones filled up below.
+
+    They lie as they looked at the field, stretched to its shape.
+    """
+    sweeps = [_colours(data, np.asarray(sweep)) for sweep in data.raw]
+    tall, gap = max(one.shape[0] for one in sweeps), max(1, sum(one.shape[1] for one in sweeps) // 60)
+    image = np.full((tall, sum(one.shape[1] for one in sweeps) + gap * (len(sweeps) - 1), 3), 0.98, np.float32)
+    left = 0
+    for one in sweeps:
+        image[: one.shape[0], left : left + one.shape[1]] = one
+        left += one.shape[1] + gap
     _show(axes, image if data.along == "x" else image.swapaxes(0, 1))
     axes.set_aspect("auto")
     lines, count = sum(sweep.shape[0] for sweep in data.raw), len(data.raw)
@@ -147,18 +156,6 @@ def _colours(data: QuicklookData, image: NDArray[np.generic]) -> NDArray[np.floa
     if words.startswith("true colour"):
         return develop(image[..., chosen], data.rectified[..., chosen])
     return stretch(image[..., chosen])
-
-
-def _side_by_side(images: list[NDArray[np.float32]]) -> NDArray[np.float32]:
-    """Sweeps next to each other with a light gap; shorter ones are filled up below."""
-    tall = max(image.shape[0] for image in images)
-    gap = max(1, sum(image.shape[1] for image in images) // 60)
-    parts: list[NDArray[np.float32]] = []
-    for number, image in enumerate(images):
-        filled = np.full((tall, image.shape[1] + (gap if number else 0), 3), 0.98, np.float32)
-        filled[: image.shape[0], -image.shape[1] :] = image
-        parts.append(filled)
-    return np.concatenate(parts, axis=1)
 
 
 def _draw_attention(axes: Axes, data: QuicklookData) -> None:

@@ -242,7 +242,12 @@ def check_receipt(receipt: Mapping[str, Any]) -> Receipt:
     if receipt.get("accuracy_is") == "judged":
         _need(receipt, ("judged", "accuracy"), "receipt")
     if "accuracy" in receipt:
-        _check_accuracy(receipt["accuracy"])
+        accuracy, place = receipt["accuracy"], "receipt.accuracy"
+        _need(accuracy, ("miou", "per_class_iou", "none", "all", "gap_closed", "controls"), place)
+        for name in ("none", "all"):
+            _need(accuracy[name], ("miou", "per_class_iou"), f"{place}.{name}")
+        for policy, control in accuracy["controls"].items():
+            _need(control, ("miou", "spread"), f"{place}.controls.{policy}")
     for number, effect in enumerate(receipt.get("effects", ())):
         _need(effect, _EFFECT_FIELDS, f"receipt.effects[{number}]")
     if "effects_total" in receipt:
@@ -260,15 +265,6 @@ def areas_on_ground(receipt: Mapping[str, Any]) -> Mapping[str, Any] | None:
     ground = receipt.get("ground")
     areas = ground.get("areas_ha") if isinstance(ground, Mapping) else None
     return areas if isinstance(areas, Mapping) else None
-
-
-def _check_accuracy(accuracy: Mapping[str, Any]) -> None:
-    place = "receipt.accuracy"
-    _need(accuracy, ("miou", "per_class_iou", "none", "all", "gap_closed", "controls"), place)
-    for name in ("none", "all"):
-        _need(accuracy[name], ("miou", "per_class_iou"), f"{place}.{name}")
-    for policy, control in accuracy["controls"].items():
-        _need(control, ("miou", "spread"), f"{place}.controls.{policy}")
 
 
 def _need(part: object, names: Iterable[str], place: str) -> None:

@@ -145,7 +145,13 @@ def compare_with_everything(
         ways.add(sweep, lines, sums)
         run.report((number + 1) / (len(taken) + 1))
     found = _compared(run, ways, sums, taken, blocks, effects)
-    _check(found, sums)
+    if found.bound is not None and sums.unexplained > found.bound:
+        place = found.place
+        raise BoundError(
+            f"against everything on, light differs by {found.measured:.3g} {UNIT_WORDS[found.unit]} at sweep "
+            f"{place.sweep}, line {place.line}, sample {place.sample}, band {place.band}, above the bound of "
+            f"{found.bound:.3g}; simulate with --tol 0 or --effects all, and please report it with the rig's settings"
+        )
     run.report(1.0)
     return found
 
@@ -294,14 +300,3 @@ def _about(middle: int, count: int, most: int) -> range:
     count = min(count, most)
     first = max(0, min(middle - count // 2, most - count))
     return range(first, first + count)
-
-
-def _check(found: Comparison, sums: _ChangeSums) -> None:
-    if found.bound is None or sums.unexplained <= found.bound:
-        return
-    place = found.place
-    raise BoundError(
-        f"against everything on, light differs by {found.measured:.3g} {UNIT_WORDS[found.unit]} at sweep {place.sweep},"
-        f" line {place.line}, sample {place.sample}, band {place.band}, above the bound of {found.bound:.3g}; simulate"
-        " with --tol 0 or --effects all, and please report it with the rig's settings"
-    )

@@ -170,6 +170,12 @@ def register(tradeoff: Tradeoff[State, Output]) -> Tradeoff[State, Output]:
     return tradeoff
 
 
+def register_all(*tradeoffs: Tradeoff[Any, Any]) -> None:
+    """Add a module's trade-offs, in the order in which a stage shows them."""
+    for one in tradeoffs:
+        register(one)
+
+
 def registered() -> dict[tuple[str, str], Tradeoff[Any, Any]]:
     """Give the trade-offs registered so far, by stage and knob."""
     return dict(_REGISTRY)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.tradeoff.entries import Level, Setting, Tradeoff, register
+from flows.tradeoff.entries import Level, Setting, Tradeoff, register_all
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
@@ -178,25 +178,23 @@ def _judged(state: Surveyed, setting: Setting, made: tuple[Light, Raw]) -> Light
     return _shown(state.lines, state.chosen[setting].effects, made[0])
 
 
-TOLERANCE = register(
-    Tradeoff(
-        stage="simulate",
-        knob="tolerance",
-        error=ERROR,
-        unit="px*band",
-        reference="everything that the rig has, exact; on average over the noise",
-        settings=CHOICES,
-        prepare=_prepare,
-        run=lambda state, setting: _simulate(state.lines, state.chosen[setting].effects),
-        judge=lambda state, setting, made: state.against.greatest(_judged(state, setting, made)),
-        work=lambda state, _setting: state.lines.values,
-        levels=lambda state: state.against.levels(),
-        beside={
-            "bound [σ]": lambda state, setting, _made: state.chosen[setting].bound,  # noqa: RUF001
-            RMS: lambda state, setting, made: state.against.rms(_judged(state, setting, made)),
-            DN: lambda state, setting, made: state.against.greatest_dn(_judged(state, setting, made)),
-        },
-    )
+TOLERANCE = Tradeoff(
+    stage="simulate",
+    knob="tolerance",
+    error=ERROR,
+    unit="px*band",
+    reference="everything that the rig has, exact; on average over the noise",
+    settings=CHOICES,
+    prepare=_prepare,
+    run=lambda state, setting: _simulate(state.lines, state.chosen[setting].effects),
+    judge=lambda state, setting, made: state.against.greatest(_judged(state, setting, made)),
+    work=lambda state, _setting: state.lines.values,
+    levels=lambda state: state.against.levels(),
+    beside={
+        "bound [σ]": lambda state, setting, _made: state.chosen[setting].bound,  # noqa: RUF001
+        RMS: lambda state, setting, made: state.against.rms(_judged(state, setting, made)),
+        DN: lambda state, setting, made: state.against.greatest_dn(_judged(state, setting, made)),
+    },
 )
 
 
@@ -214,24 +212,22 @@ def prepare_footprint(seed: int) -> Seen:
     return Seen(lines, Against.of(lines.light(lines.footprint), lines.rig))
 
 
-FOOTPRINT = register(
-    Tradeoff(
-        stage="simulate",
-        knob="slit",
-        error=ERROR,
-        unit="px*band",
-        reference=f"slit and pixel as {SLIT.variants[0]} boxes, all blurs of the rig",
-        settings=(*SLIT.variants, OFF),
-        prepare=prepare_footprint,
-        run=lambda state, variant: state.lines.light(with_variant(state.lines.footprint, SLIT, str(variant))),
-        judge=lambda state, _variant, light: state.against.greatest(light),
-        work=lambda state, _variant: state.lines.values,
-        levels=lambda state: state.against.levels(),
-        beside={
-            RMS: lambda state, _variant, light: state.against.rms(light),
-            DN: lambda state, _variant, light: state.against.greatest_dn(light),
-        },
-    )
+FOOTPRINT = Tradeoff(
+    stage="simulate",
+    knob="slit",
+    error=ERROR,
+    unit="px*band",
+    reference=f"slit and pixel as {SLIT.variants[0]} boxes, all blurs of the rig",
+    settings=(*SLIT.variants, OFF),
+    prepare=prepare_footprint,
+    run=lambda state, variant: state.lines.light(with_variant(state.lines.footprint, SLIT, str(variant))),
+    judge=lambda state, _variant, light: state.against.greatest(light),
+    work=lambda state, _variant: state.lines.values,
+    levels=lambda state: state.against.levels(),
+    beside={
+        RMS: lambda state, _variant, light: state.against.rms(light),
+        DN: lambda state, _variant, light: state.against.greatest_dn(light),
+    },
 )
 
 
@@ -351,27 +347,24 @@ def _mean_error(state: Counted, _variant: Setting, raw: Raw) -> float:
     return float((np.abs(off) / np.sqrt(variance)).max())
 
 
-NOISE = register(
-    Tradeoff(
-        stage="simulate",
-        knob="shot noise",
-        error="total variation of a number, worst level",
-        unit="px*band",
-        reference=f"the law of counts, read noise and rounding, {DIM_E:g} electrons to {BRIGHT_SHARE:g} of full scale",
-        settings=(*SHOT.variants, OFF),
-        prepare=lambda seed: _even_light(seed, DIM_E, BRIGHT_SHARE * LineCamera().full_well_e),
-        run=_run,
-        judge=_variation,
-        work=lambda state, _variant: float(state.light.size),
-        levels=lambda state: (Level("exact draws, by chance", _by_chance(state)),),
-        beside={"bound": _bound, "p of χ²": _chi_square, "mean [σ]": _mean_error, "variance": _variance_error},  # noqa: RUF001
-    )
+NOISE = Tradeoff(
+    stage="simulate",
+    knob="shot noise",
+    error="total variation of a number, worst level",
+    unit="px*band",
+    reference=f"the law of counts, read noise and rounding, {DIM_E:g} electrons to {BRIGHT_SHARE:g} of full scale",
+    settings=(*SHOT.variants, OFF),
+    prepare=lambda seed: _even_light(seed, DIM_E, BRIGHT_SHARE * LineCamera().full_well_e),
+    run=_run,
+    judge=_variation,
+    work=lambda state, _variant: float(state.light.size),
+    levels=lambda state: (Level("exact draws, by chance", _by_chance(state)),),
+    beside={"bound": _bound, "p of χ²": _chi_square, "mean [σ]": _mean_error, "variance": _variance_error},  # noqa: RUF001
 )
-DIM_NOISE = register(
-    replace(
-        NOISE,
-        knob="shot noise, dim light",
-        reference=f"the law of counts, read noise and rounding, 1 to {DIM_E:g} electrons",
-        prepare=lambda seed: _even_light(seed, 1.0, DIM_E),
-    )
+DIM_NOISE = replace(
+    NOISE,
+    knob="shot noise, dim light",
+    reference=f"the law of counts, read noise and rounding, 1 to {DIM_E:g} electrons",
+    prepare=lambda seed: _even_light(seed, 1.0, DIM_E),
 )
+register_all(TOLERANCE, FOOTPRINT, NOISE, DIM_NOISE)
