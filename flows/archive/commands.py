@@ -1,7 +1,4 @@
-"""The verbs `ls`, `explain`, `verify`, `gc` and `seal`: what an archive holds as plain tables, and its care.
-
-Storage does the work; this says where, shows what was found, and gives the exit code.
-"""
+"""The verbs `ls`, `explain`, `verify`, `gc` and `seal`: storage does the work, this shows it and gives exit codes."""
 
 from __future__ import annotations
 
@@ -298,10 +295,7 @@ def verdict(archive: Archive, findings: list[Finding]) -> dict[str, Any]:
 
 
 def command(settings: Mapping[str, Any], out: str) -> str:
-    """The command that asks for these settings in the archive ``out``, as far as flags can say it; empty without any.
-
-    The archive may have been moved since: what its receipt calls ``out`` is not said.
-    """
+    """The command for these settings into the archive ``out`` (it may have moved), as far as flags can say it."""
     if not settings:
         return ""
     asked, defaults = {**settings, "out": out}, Settings().to_dict()

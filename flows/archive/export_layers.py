@@ -43,10 +43,7 @@ class ExportedRun:
         return self.folder.name
 
     def store(self, product: str) -> StageRef | None:
-        """The store behind a product, None where the run has no such product.
-
-        Raises IncompleteStoreError: the archive does not have it any more, or a file of it is missing or cut short.
-        """
+        """The store behind a product, None without one. IncompleteStoreError: the archive has lost it, or a part."""
         uri = self.receipt["products"].get(product)
         if uri is None:
             return None

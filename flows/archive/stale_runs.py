@@ -110,10 +110,7 @@ def is_whole(catalogue: Catalogue, run: Run) -> bool:
 
 
 def is_current(catalogue: Catalogue, run: Run, settings: Settings) -> bool:
-    """Whether its survey with these settings would find all that this run names or rests on, by versions and weights.
-
-    A run whose accuracy is not there yet is not: the survey adds it. What lies in a scene's file is not looked at.
-    """
+    """Whether its survey would find all that this run rests on, by versions and weights, not by a scene's file."""
     drawn_by = law_of_key(str(run.receipt.get("scene")))
     of_this_law = settings.scene not in BUILT_IN_SCENES or drawn_by == FARM_LAW
     stale = stale_stores(catalogue, catalogue.named_and_below[run.uri], weights_key(settings))

@@ -192,10 +192,7 @@ def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
 def open_frames(
     dataset: str, frames: tuple[str, ...], scenes: int | None, camera: LineCamera, choices: dict[str, Any]
 ) -> TrainingData:
-    """Name the frames to judge on; ``train`` of what comes holds them all, whoever was trained on them.
-
-    Raises SettingsError: a choice that does not go with the data set; SceneError: no scene, or a name that it has not.
-    """
+    """Name the frames to judge on, in ``train``. SettingsError: choices of other data, SceneError: no such frame."""
     built_in = dataset in FARM_NAMES
     data = open_training_data(dataset, 0, 1 if built_in else scenes, camera, **choices)
     if built_in:

@@ -44,10 +44,7 @@ def judge_rig(
     seed: int,
     report: Callable[[float], None] = lambda done: None,
 ) -> dict[str, Any]:
-    """Judge the map of every plan at every budget that pays for the coarse pass; all plans read the same glance.
-
-    ``left_out`` says why a budget is missing: it does not pay for the coarse pass, or the mirror does not reach.
-    """
+    """Judge each plan at each budget by one glance; ``left_out``: which budgets do not pay, or what is out of reach."""
     grid, rows, left_out = look.seen.grid, [], []
     try:
         along, full, full_s = cheapest_full(grid, camera, cost)

@@ -222,10 +222,7 @@ def score_by_image(sight: Sight) -> np.ndarray[Any, np.dtype[np.float64]]:
 def judge_control(
     trial: Trial, sight: Sight, weights: AnyWeights, report: Callable[[float], None] = lambda done: None
 ) -> dict[str, Any]:
-    """Judge a control's map of a frame at each of its shares; a record like `judge_frame`'s, without placement.
-
-    Its camera takes coarse samples, fine ones of the seats, or those of a grid coarser by two.
-    """
+    """Judge a control's map at each of its shares, by what its own camera takes; rows like `judge_frame`'s."""
     config, grid, rows = weights.config, sight.seen.grid, []
     design = config.preset
     shares = control_shares(design, trial.shares)

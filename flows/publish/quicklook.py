@@ -1,7 +1,4 @@
-"""The quicklook: one PNG with four captioned panels that shows a survey at a glance.
-
-Raw lines against the rectified field, where the camera looked twice, the class map, and the truth (or the confidence).
-"""
+"""The quicklook, a survey at a glance as one PNG: raw lines and field, where it looked twice, class map, truth."""
 
 from __future__ import annotations
 
@@ -125,10 +122,7 @@ def _arrange(tallness: float) -> tuple[float, list[tuple[float, list[tuple[float
 
 
 def _draw_raw(axes: Axes, data: QuicklookData) -> None:
-    """Panel 1, first half: the sweeps as they came, next to each other with a light gap, shorter ones filled up below.
-
-    They lie as they looked at the field, stretched to its shape.
-    """
+    """Panel 1, first half: the sweeps as they came, next to each other, stretched to the field's shape."""
     sweeps = [_colours(data, np.asarray(sweep)) for sweep in data.raw]
     tall, gap = max(one.shape[0] for one in sweeps), max(1, sum(one.shape[1] for one in sweeps) // 60)
     image = np.full((tall, sum(one.shape[1] for one in sweeps) + gap * (len(sweeps) - 1), 3), 0.98, np.float32)

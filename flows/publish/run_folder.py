@@ -298,10 +298,7 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
 
 
 def _pointing(ref: StageRef) -> dict[str, Any]:
-    """Corrections of one pass, and what its windows say of them.
-
-    Each sweep beside the held one has an offset and a drift: where windows are no more than these, they leave nothing.
-    """
+    """Corrections of one pass; what they leave is told only where windows are more than offsets and drifts."""
     record = load_registration(ref)
     left = np.array([window["residual_px"] for window in record["windows"] if window.get("residual_px")])
     tells = len(left) > 2 * (len(record["sweeps"]) - len(record["untied"]) - 1)

@@ -227,10 +227,7 @@ def small_jpeg(png: bytes) -> bytes:
 
 
 def progress_shown(field: str) -> Callable[[str, str, float], None]:
-    """What shows how far stages are on Prefect's pages, every two seconds at most: nothing outside of a flow.
-
-    A stage has an artifact where it takes longer than a moment. A server that is gone is no matter.
-    """
+    """What shows on Prefect's pages how far stages are, every two seconds at most: nothing outside of a flow."""
     if not inside_flow():
         return lambda stage, state, done: None
     from prefect.artifacts import create_progress_artifact, update_progress_artifact

@@ -1,7 +1,4 @@
-"""What `spectralzoom report` does: histories of an archive's fields, with charts, as pages that open from disk.
-
-A history is a field's runs and what its ledger says, oldest first; links lead to reports in the archive.
-"""
+"""What `spectralzoom report` does: histories of fields (runs and ledgers, oldest first) as pages with charts."""
 
 from __future__ import annotations
 

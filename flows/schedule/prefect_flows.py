@@ -207,10 +207,7 @@ def deployments(request: ServeRequest) -> list[Any]:
 
 
 def serve_runs() -> None:
-    """Let the deployments of what is served run until told to stop: the process that `serve` keeps up.
-
-    It is started anew with the server: by itself Prefect's runner does not come back once its server has been away.
-    """
+    """Run what is served until told to stop; `serve` starts it anew, for Prefect's runner can lose its server."""
     request = read_served()
     with suppress(KeyboardInterrupt), own_temporary_folder():
         serve(*deployments(request), limit=request.limit, print_starting_message=False)

@@ -45,11 +45,7 @@ class RigLock:
         return self._release is not None
 
     def take(self, words: str = "") -> bool:
-        """Try to take it, without waiting; ``words`` tell others who holds it.
-
-        Raises RigError: it cannot be had at all, held or not; the rig is not to be used then; ArchiveError: a link is
-        in the place of its file.
-        """
+        """Try to take it, ``words`` telling who holds it. RigError: it cannot be had at all, ArchiveError: a link."""
         if not self.held:
             self._release = hold_place(self.place, f"{words or 'a survey'} (process {os.getpid()})")
         return self.held

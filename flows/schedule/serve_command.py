@@ -174,10 +174,7 @@ def serve_plain(
     note: Callable[[Outcome], object] = lambda outcome: None,
     until: datetime | None = None,
 ) -> None:
-    """Serve schedules until ``until``, or until interrupted; then they are closed, and what began is resumed later.
-
-    Raises PipelineError: a ledger cannot be written at the start; what was opened until then is closed.
-    """
+    """Serve until ``until`` or interrupted, then close. PipelineError: a ledger cannot be written at the start."""
     watch, news = clock or SystemWallClock(), ScheduleNews(schedules, lambda name, error: tell(f"{name}: {error}"))
     with ExitStack() as opened:
         for name, schedule in schedules.items():

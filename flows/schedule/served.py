@@ -49,10 +49,7 @@ class ServedField:
         return rig_lock(self.settings, self.archive)
 
     def settings_of(self, due: datetime, timetable: Timetable) -> Settings:
-        """What the survey of a due time is asked for: a visit of its own; a simulated farm is as on that day.
-
-        What stands before a rig, an emulated one too, is as it is.
-        """
+        """What the survey of a due time is asked for: a visit of its own, a simulated farm as on that day."""
         asked = replace(self.settings, name=self.name, visit=moment_words(due))
         if asked.source == "sim" and asked.scene in FARM_NAMES and asked.day is None:
             asked = replace(asked, day=due.astimezone(timetable.zone).timetuple().tm_yday)

@@ -152,10 +152,7 @@ def _check_free(port: int) -> None:
 
 
 def serve_prefect(request: ServeRequest, tell: Tell) -> None:
-    """Serve until interrupted.
-
-    Raises PipelineError: no server, or a ledger cannot be written at the start; what was opened until then is closed.
-    """
+    """Serve until interrupted. PipelineError: no server, or a ledger cannot be written at the start; all is closed."""
     schedules, home = request.schedules(), request.fields[0].archive / ".prefect"
     log = home / "surveys.log"
     with server_for(home, request.port) as server:

@@ -153,10 +153,7 @@ class Watcher:
                 self._alone(one, lambda one=one: self._reap_prefect(one))  # type: ignore[misc]
 
     def tell_news(self) -> None:
-        """Tell how runs ended since the last time, a line each, and give notice where an address was given.
-
-        Of all that ended alike in a field there is one notice.
-        """
+        """Tell how runs ended since the last time, a line each; one notice for all that ended alike in a field."""
         archives, fresh = {one.name: one.settings.out for one in self.request.fields}, self.news.fresh()
         for outcome in fresh:
             self.tell(outcome.words())
@@ -213,10 +210,7 @@ class Watcher:
         return looking == len(rigs) or looking + reprocessing >= self.request.limit
 
     def look(self) -> bool:
-        """Once over all fields: what is too late or dead is accounted for, and Prefect has a run of each due time.
-
-        False where Prefect does not know of a field yet.
-        """
+        """Account for what is too late or dead, plan due times in Prefect; False where it does not know a field yet."""
         for one in self.request.fields:
             with self._errors(one.name):
                 self._look_at(one, self.schedules[one.name])
@@ -301,10 +295,7 @@ def _ahead(timetable: Timetable, now: datetime) -> list[datetime]:
 
 
 def reap_flow_runs(client: Any, field: str | None, archive: str | None) -> list[str]:
-    """Set flow runs that Prefect believes alive to Crashed; only for whoever holds their lock. Gives their names.
-
-    Of the survey of ``field``, or of the reprocessing of ``archive``.
-    """
+    """Crash runs that Prefect believes alive, of a field or an archive whose lock is held here; gives their names."""
     from prefect.states import Crashed
 
     flow, parameter, value = ("reprocess", "archive", archive) if field is None else ("survey", "field", field)

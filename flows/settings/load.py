@@ -1,7 +1,4 @@
-"""Read a survey's settings: one TOML file and flags, every key checked by what `Settings` and its parts declare of it.
-
-Flags win over the file, the file over the defaults.
-"""
+"""Read a survey's settings, each key checked as `Settings` declares it: flags over one TOML file over defaults."""
 
 from __future__ import annotations
 

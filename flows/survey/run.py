@@ -267,10 +267,7 @@ def open_run(settings: Settings, *, planning: bool = False) -> SurveyRun:
 
 
 def make_source(scene: RasterScene, settings: Settings) -> SimulatedSource:
-    """Give the simulated rig before a scene, with no effect on: `flows.survey.stages.effects` decides on them.
-
-    Where a rig takes the lines it stands for the plan of them alone: sizes, paths and memory.
-    """
+    """The simulated rig before a scene, without effects; beside a rig it stands for the plan: sizes, paths, memory."""
     pointing = None
     if settings.source == "sim" and settings.pointing_px:
         pointing = PointingErrors(offset_px=settings.pointing_px, jitter_px=0.0, seed=settings.seed)

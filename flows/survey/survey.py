@@ -40,10 +40,7 @@ class Products(dict[str, StageRef | None]):
 
 
 def survey(step: Step) -> Products:
-    """Sweep the field coarsely, decide where detail changes the map, look there again, and draw the map.
-
-    Each stage of `STAGES` runs once those that it is made of have. How good the map is `judge` tells.
-    """
+    """Sweep coarsely, decide where detail changes the map, look there again, draw the map; `judge` says how good."""
     return _run_all(step, Products(), judging=False)
 
 

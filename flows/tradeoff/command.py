@@ -1,7 +1,4 @@
-"""What `spectralzoom tradeoff` shows: for each stage a table (to be right to X you pay Y), JSON and a plot.
-
-Plots are of error against time, with the floors that apply: noise, half a step, memory.
-"""
+"""What `spectralzoom tradeoff` shows: tables (to be right to X you pay Y), JSON, plots of error against time."""
 
 from __future__ import annotations
 

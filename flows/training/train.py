@@ -219,11 +219,7 @@ Split = dict[str, Any]
 
 
 def open_start(init: Path | None, tokens: Mapping[str, Any], preset: Preset) -> StartFile | None:
-    """Open the file to begin from; None without one.
-
-    Raises SettingsError: no such file, tokens of other sizes than ``tokens`` and the usual ones, or another network;
-    WeightsError: a file of no kind that is known.
-    """
+    """The file to begin from, if any. SettingsError: not there, or another network; WeightsError: no known kind."""
     if init is None:
         return None
     if preset != "two-scale":

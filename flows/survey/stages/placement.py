@@ -1,8 +1,4 @@
-"""Where lines lie, and what they show on the grid: registration of sweeps, lookup, mosaic, patches.
-
-A coarse pass is registered by its seams, a fine one on the mosaic; nothing is where the settings believe the mirror
-(``pointing_px = 0``).
-"""
+"""Where lines lie and what they show: registration (none where the mirror is believed), lookup, mosaic, patches."""
 
 from __future__ import annotations
 
