@@ -335,7 +335,14 @@ def show_comparison(content: dict[str, Any], console: Console) -> None:
         console.print(escape(text), soft_wrap=True)
 
     say(f"A: {panel_words(content['a'])}\nB: {panel_words(content['b'])}")
-    console.print(_class_table(content["classes"]))
+    classes = content["classes"]
+    hectares = ("ha in A", "ha in B") if any("ha" in row for row in classes) else ()
+    table = _table("Classes", "class", "px in A", "px in B", "in A", "in B", *hectares, "IoU of A and B", left=1)
+    for row in classes:
+        cells = [*map(format_count, row["pixels"]), *map(format_percent, row["share"])]
+        cells += [f"{area:.4g}" for area in row["ha"]] if "ha" in row else [DASH] * len(hectares)
+        table.add_row(escape(row["name"].replace("_", " ")), *cells, format_points(row["iou"]))
+    console.print(table)
     say(f"{change_words(content['differing'])} differ")
     if content["largest"]:
         table = _table("Largest changes", "A", "B", "pixels", "share", left=2)
@@ -358,17 +365,6 @@ def show_comparison(content: dict[str, Any], console: Console) -> None:
             table.add_row(kind.removesuffix("s"), *(escape(str(row[name])) for name in ("name", "old", "new")))
     console.print(table if changes else "settings and versions are the same")
     say(f"  {content['picture']}")
-
-
-def _class_table(rows: list[dict[str, Any]]) -> Table:
-    ground = any("ha" in row for row in rows)
-    hectares = ("ha in A", "ha in B") if ground else ()
-    table = _table("Classes", "class", "px in A", "px in B", "in A", "in B", *hectares, "IoU of A and B", left=1)
-    for row in rows:
-        figures = [*map(format_count, row["pixels"]), *map(format_percent, row["share"])]
-        figures += [f"{area:.4g}" for area in row["ha"]] if "ha" in row else [DASH] * len(hectares)
-        table.add_row(escape(row["name"].replace("_", " ")), *figures, format_points(row["iou"]))
-    return table
 
 
 def _table(title: str, *columns: str, left: int) -> Table:

@@ -18,7 +18,6 @@ from flows.schedule.due_runs import ScheduleNews, Tell, send_notice, together
 from flows.schedule.field_schedule import FieldSchedule, moment_words, read_moment
 from flows.schedule.rig_lock import RigLock
 from flows.schedule.served import ServedField, ServeRequest
-from flows.schedule.times import Timetable
 from storage.archive.staging import take_lock
 
 LIMIT = "rig"  # a Prefect concurrency limit that shows who waits; the kernel's lock decides
@@ -221,7 +220,9 @@ class Watcher:
         free = self._alone(one, lambda: resumed.extend(schedule.reap(self._why)))
         waiting = schedule.pending(None if free else f"the rig was in use by {one.lock().holder()}")
         state, now = schedule.state(), schedule.clock.now()
-        wanted = dict.fromkeys((*waiting, *_ahead(schedule.timetable, now)), 0)
+        coming = enumerate(islice(schedule.timetable.due_after(now), MOST_AHEAD))
+        ahead = (due for number, due in coming if number < LEAST_AHEAD or due - now <= AHEAD)
+        wanted = dict.fromkeys((*waiting, *ahead), 0)
         wanted |= {due: len(state.begun.get(due, ())) for due in resumed}
         self._note(one.name, wanted, now)
         cancelled: list[datetime] = []
@@ -287,11 +288,6 @@ class Watcher:
             yield
         except Exception as error:
             self.tell(f"{what}: {error}")
-
-
-def _ahead(timetable: Timetable, now: datetime) -> list[datetime]:
-    coming = islice(timetable.due_after(now), MOST_AHEAD)
-    return [due for number, due in enumerate(coming) if number < LEAST_AHEAD or due - now <= AHEAD]
 
 
 def reap_flow_runs(client: Any, field: str | None, archive: str | None) -> list[str]:

@@ -39,7 +39,12 @@ def open_scene(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
     if settings.scene == RIG_FIELD:
         return _field_before_rig(settings), ()
     if settings.scene in BUILT_IN_SCENES:
-        return _open_farm(settings), _notes_of_moment(settings)
+        for name, value in {"labels": settings.labels, "wavelengths": settings.wavelengths}.items():
+            if value is not None:
+                raise SettingsError(f"--{name} is for scene files; the scene '{settings.scene}' brings its own")
+        shape = settings.shape or FARM_SHAPE
+        farm = farm_scene(settings.seed, shape, camera=settings.camera, day=settings.day, hour=settings.hour)
+        return farm if settings.bands is None else _some_bands(farm, settings.bands), _notes_of_moment(settings)
     file = load_scene_file(
         settings.scene, labels=settings.labels, bands=settings.bands, wavelengths=settings.wavelengths
     )
@@ -74,15 +79,6 @@ def _field_before_rig(settings: Settings) -> RasterScene:
         panel=np.full(bands, settings.rig.panel, np.float32),
         wavelength_nm=np.array(settings.wavelengths, np.float64),
     )
-
-
-def _open_farm(settings: Settings) -> RasterScene:
-    for name, value in {"labels": settings.labels, "wavelengths": settings.wavelengths}.items():
-        if value is not None:
-            raise SettingsError(f"--{name} is for scene files; the scene '{settings.scene}' brings its own")
-    shape = settings.shape or FARM_SHAPE
-    farm = farm_scene(settings.seed, shape, camera=settings.camera, day=settings.day, hour=settings.hour)
-    return farm if settings.bands is None else _some_bands(farm, settings.bands)
 
 
 def _notes_of_moment(settings: Settings) -> tuple[str, ...]:

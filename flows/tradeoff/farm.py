@@ -14,16 +14,7 @@ from flows.tradeoff.entries import Level, Setting, Tradeoff, register_all
 from models.evaluation.metrics import confusion, mean_iou
 from models.network.process import keep_freed_memory
 from models.policies.policies import score_seats
-from models.reading.inference import (
-    CoarseLook,
-    DrawnMap,
-    Glance,
-    Precision,
-    glance,
-    look_coarsely,
-    read_glance,
-    segment,
-)
+from models.reading.inference import CoarseLook, DrawnMap, Glance, glance, look_coarsely, read_glance, segment
 from models.weights.files import Weights, load_weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
@@ -179,11 +170,6 @@ def _with_seats(state: Farm, share: Setting) -> DrawnMap:
     return segment(weights, seen, state.columns[np.searchsorted(state.seats, chosen)], chosen)
 
 
-def _in_precision(state: Farm, precision: Setting) -> DrawnMap:
-    chosen: Precision = "bfloat16" if precision == "bfloat16" else "float32"
-    return segment(state.farm.weights, state.look, state.columns, state.seats, precision=chosen)
-
-
 def _with_bands(state: Farm, bands: Setting) -> DrawnMap:
     """From scene values on: fewer bands are fewer values to bring to spectral columns."""
     weights, pixels = state.farm.weights, state.pixels[bands]
@@ -214,7 +200,17 @@ SEATS = Tradeoff(
     moved_bytes=float(COLUMN_BYTES + MAP_BYTES),
 )
 PRECISION = replace(
-    SEATS, knob="precision", reference=f"labels of {_PX}; every seat", settings=PRECISIONS, run=_in_precision
+    SEATS,
+    knob="precision",
+    reference=f"labels of {_PX}; every seat",
+    settings=PRECISIONS,
+    run=lambda state, kind: segment(
+        state.farm.weights,
+        state.look,
+        state.columns,
+        state.seats,
+        precision="bfloat16" if kind == "bfloat16" else "float32",
+    ),
 )
 BAND_COUNT = replace(
     SEATS,
@@ -270,11 +266,6 @@ def _bytes_a_sample(state: CapturedToStore, _codec: Setting, made: Stored) -> fl
     return size / state.raw.size
 
 
-def _write_rounded(state: CapturedToStore, bits: Setting) -> Stored:
-    kept, mosaic = int(bits), state.farm.mosaic
-    return store_in_memory(round_bits(mosaic, kept) if kept < 23 else mosaic, "zstd-3")
-
-
 def _classes_changed(state: CapturedToStore, _bits: Setting, made: Stored) -> float:
     return float(np.mean(_map_of(state.farm, np.asarray(made[1], np.float32)) != state.classes))
 
@@ -299,7 +290,9 @@ BITS = Tradeoff(
     reference=f"the map that the coarse mosaic of a farm of {STORE_SHAPE[1]} x {STORE_SHAPE[0]} px gives unrounded",
     settings=(23.0, 13.0, 11.0, 9.0, 7.0, 5.0),
     prepare=_prepare_store,
-    run=_write_rounded,
+    run=lambda state, bits: store_in_memory(
+        state.farm.mosaic if int(bits) >= 23 else round_bits(state.farm.mosaic, int(bits)), "zstd-3"
+    ),
     judge=_classes_changed,
     work=lambda state, _bits: float(state.farm.mosaic.size),
 )

@@ -139,11 +139,6 @@ def _prepare_seams(seed: int) -> Seams:
     return Seams(pairs, shifts)
 
 
-def _find_shifts(state: Seams, overlap: Setting) -> list[PairShift]:
-    part = slice(0, int(overlap))
-    return [pair_shift(first[:, part], second[:, part], prior_px=PRIOR_PX) for first, second in state.pairs]
-
-
 def _median_miss(state: Seams, _overlap: Setting, found: list[PairShift]) -> float:
     """A pair that is not decided counts as infinitely far."""
     off = np.linalg.norm([pair.shift for pair in found] - state.shifts, axis=1)
@@ -161,7 +156,9 @@ OVERLAP = Tradeoff(
     ),
     settings=OVERLAPS_PX,
     prepare=_prepare_seams,
-    run=_find_shifts,
+    run=lambda state, overlap: [
+        pair_shift(one[:, : int(overlap)], other[:, : int(overlap)], prior_px=PRIOR_PX) for one, other in state.pairs
+    ],
     judge=_median_miss,
     work=lambda _state, _overlap: float(PAIRS),
     levels=lambda _state: (Level("goal of 0.1 px", 0.1),),
@@ -192,11 +189,6 @@ def _prepare_points(seed: int) -> Scattered:
     return Scattered(samples, coordinates, waves.at(coordinates))
 
 
-def _resample(state: Scattered, kernel: Setting) -> Values:
-    valid = np.ones(state.samples.shape[:2], bool)
-    return resample(state.samples, valid, state.coordinates, cast("Kernel", kernel))[0]
-
-
 def noise_levels(camera: LineCamera) -> tuple[Level, ...]:
     """A tenth of the noise and half a step of the converter, over the scene's standard deviation."""
     electrons = camera.full_well_e / 2
@@ -216,7 +208,9 @@ RESAMPLE = Tradeoff(
     reference=f"waves of {PERIODS_PX[0]:g} to {PERIODS_PX[1]:g} px, evaluated at the output pixels",
     settings=("nearest", "bilinear", "catmull-rom"),
     prepare=_prepare_points,
-    run=_resample,
+    run=lambda state, kernel: resample(
+        state.samples, np.ones(state.samples.shape[:2], bool), state.coordinates, cast("Kernel", kernel)
+    )[0],
     judge=lambda state, _kernel, out: float(np.sqrt(np.mean((out - state.truth) ** 2)) / np.std(state.truth)),
     work=lambda state, _kernel: float(state.truth.size),
     levels=lambda _state: noise_levels(LineCamera()),

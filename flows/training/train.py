@@ -158,12 +158,7 @@ def _observe_all(
     for number, (name, scene) in enumerate(zip(names, data.scenes(names), strict=True)):
         report(what, number / len(names), name)
         known = about or _common(request, scene)
-        if scene.class_names != known.names:
-            raise SceneError(f"scene {scene.name} has classes {scene.class_names}, the scenes before it {known.names}")
-        if not np.array_equal(scene.wavelength_nm, known.wavelength_nm):
-            raise SceneError(
-                f"scene {scene.name} has other bands than the scenes before it; train on scenes of one camera"
-            )
+        _check_alike(scene, known)
         known.keys[name] = scene.key
         mask = trained_pixels(scene)
         if request.choices.get("train_mask") is not None:
@@ -198,6 +193,13 @@ def suggested_patch(shape: tuple[int, int], *, built_in: bool) -> int:
 def usual_crop(dataset: str, preset: Preset) -> int:
     """Size of the crops to train on [px]: whole scenes for the paper's network, as far as they are square."""
     return WHOLE_CROP if preset == "paper" else FARM_CROP if dataset in FARM_NAMES else FRAME_CROP
+
+
+def _check_alike(scene: RasterScene, about: _About) -> None:
+    if scene.class_names != about.names:
+        raise SceneError(f"scene {scene.name} has classes {scene.class_names}, the scenes before it {about.names}")
+    if not np.array_equal(scene.wavelength_nm, about.wavelength_nm):
+        raise SceneError(f"scene {scene.name} has other bands than the scenes before it; train on scenes of one camera")
 
 
 def _config(request: TrainRequest, about: _About) -> SegmenterConfig:

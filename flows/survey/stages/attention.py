@@ -48,7 +48,9 @@ def attend(run: SurveyRun, mosaic: StageRef) -> Wanted:
         rank[plan.seats[np.argsort(-scores[plan.seats], kind="stable")]] = np.arange(len(plan.seats))
         shape = run.grid.seat_shape
         write_attention(path / "attention.zarr", Attention(scores.reshape(shape), rank.reshape(shape), settings.policy))
-        write_plan(path, plan)
+        content = asdict(plan) | {"seats": plan.seats.tolist()}
+        absent = [name for name in ("threshold", "spared_s") if content[name] is None]
+        write_table(path / "plan.json", {name: value for name, value in content.items() if name not in absent})
 
     params = {
         "weights": run.weights_key,
@@ -76,13 +78,6 @@ def _scores(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> NDArray[np.flo
         return work.score(policy, mosaic.path / "mosaic.zarr", lambda done: run.report(0.5 * done)).ravel()
     nothing = np.empty((0, 0, 0), np.float32)
     return score_seats(policy, Glance(run.grid, nothing, nothing), seed=run.settings.seed, mask=run.mask)
-
-
-def write_plan(folder: Path, plan: FinePlan) -> None:
-    """Write the plan of an attention store; of a threshold only where there was one."""
-    content = asdict(plan) | {"seats": plan.seats.tolist()}
-    absent = [name for name in ("threshold", "spared_s") if content[name] is None]
-    write_table(folder / "plan.json", {name: value for name, value in content.items() if name not in absent})
 
 
 def load_plan(attention: StageRef) -> FinePlan:
