@@ -77,15 +77,9 @@ def export(
 def run_export(archive: str | Path, run: str | None, out: Path, envi: bool, console: Console) -> dict[str, Any]:
     """Export a run (the latest without a name) into ``out``, beside others that lie there, and print what was written.
 
-    Returns
-    -------
-    run, item and collection (paths), placed (whether there is a CRS), and files: every asset's path seen from ``out``.
-
-    Raises
-    ------
-    SettingsError : there is no such run, or ``out`` lies in the archive.
-    ArchiveError : rasterio or pystac is missing, ``out`` is another archive's or refuses to be written.
-    IncompleteStoreError : a store of the run is missing or damaged.
+    Gives run, item and collection (paths), placed (whether there is a CRS), and files: every asset's path seen from
+    ``out``. Raises SettingsError: no such run, or ``out`` lies in the archive; ArchiveError: rasterio or pystac is
+    missing, ``out`` is another archive's or cannot be written; IncompleteStoreError: a store is missing or damaged.
     """
     need_rasterio()
     need_pystac()

@@ -100,15 +100,8 @@ def publish_and_judge(
     """Publish the run of a map, then judge the map and add its accuracy to the run.
 
     Where there is nothing to judge by, or the archive holds the accuracy, the run is published once, with all of it.
-
-    Parameters
-    ----------
-    step
-        What runs the stage that judges.
-    started
-        When the survey began, ISO 8601.
-    tell
-        Is given a line once the run is there and the map is about to be judged.
+    ``step`` runs the stage that judges; ``started`` is when the survey began, ISO 8601; ``tell`` is given a line once
+    the run is there and the map is about to be judged.
     """
     run = runner.run
     draft = _draft_of_stopped(runner)

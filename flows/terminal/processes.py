@@ -90,15 +90,8 @@ def place_caches(environment: MutableMapping[str, str] | None = None) -> Path | 
 
     It is `spectralzoom-UID` in the temporary folder, so that the next process finds what this one compiled: where it
     is not ours alone, a new one that goes with this process. What is in it is run as code, so nobody else may write it.
-    ``environment`` is this process's own unless given.
-
-    Returns
-    -------
-    The folder, or None where the usual one (XDG_CACHE_HOME, or ~/.cache) can be written.
-
-    Raises
-    ------
-    SettingsError : nothing can be written, the temporary folder included.
+    ``environment`` is this process's own unless given. None where the usual one (XDG_CACHE_HOME, or ~/.cache) can be
+    written. Raises SettingsError: nothing can be written, the temporary folder included.
     """
     environment = os.environ if environment is None else environment
     try:
