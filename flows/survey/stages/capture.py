@@ -130,8 +130,8 @@ def take_lines(
     """Give ``take`` the sweep's lines one by one, in order, from line ``first`` on.
 
     ``take`` is called in this thread while others render. Beside one block of ``at_once`` lines for each worker there
-    is one more, so that nobody waits while lines are taken. Where ``take`` raises, what was rendered ahead is lost; what
-    the first block that cannot be rendered raises comes once the lines before it are taken. A source that is no
+    is one more, so that nobody waits while lines are taken. Where ``take`` raises, what was rendered ahead is lost;
+    what the first block that cannot be rendered raises comes once the lines before it are taken. A source that is no
     simulation gives its lines when it has them. Neither the number of workers nor the size of blocks changes a line.
     """
     workers = Crew("threads", crew.workers)  # whoever else makes blocks, for the scene lies in this process's memory
