@@ -9,7 +9,6 @@ from typing import Any, NamedTuple, cast
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from flows.cli.app import ArchiveName, AsJson, OutFolder, check_outside
-from flows.publish.panels import UNLABELLED_COLOUR, class_palette, class_rgb
+from flows.publish.panels import UNLABELLED_COLOUR, class_palette, class_rgb, save_png
 from flows.publish.receipt import areas_on_ground
 from flows.settings.survey_settings import BUILT_IN_SCENES
 from flows.survey.scores import score_of
@@ -64,7 +63,6 @@ def draw_difference(maps: MapPair, titles: Sequence[str]) -> bytes:
     rows = max(-(-len(present) // 2), -(-len(maps.pairs[:MOST_PAIRS]) // 2) + 1)
     with mpl.rc_context({"text.parse_math": False}):  # names may hold dollar signs
         figure = Figure(figsize=(3 * PANEL_IN, tall + 0.6 + 0.17 * rows), dpi=DPI, layout="constrained")
-        FigureCanvasAgg(figure)
         step = -(-max(height, width) // MOST_PX)
         thin = slice(None, None, step)
         palette = class_palette(len(maps.names), maps.colours)
@@ -76,7 +74,7 @@ def draw_difference(maps: MapPair, titles: Sequence[str]) -> bytes:
             axes.set_axis_off()
         _draw_legends(figure, maps, palette, present)
         buffer = io.BytesIO()
-        figure.savefig(buffer, format="png")
+        save_png(figure, buffer)
     return buffer.getvalue()
 
 

@@ -162,7 +162,8 @@ def publish_evaluation(work: Work, content: dict[str, Any], runs: list[list[Reco
     out = work.request.out
     if out is None:
         return []
-    from flows.evaluate.plots import evaluation_figure, frame_figure, rig_figure, save_png  # matplotlib
+    from flows.evaluate.plots import evaluation_figure, frame_figure, rig_figure  # matplotlib
+    from flows.publish.panels import save_png
 
     policies, shares = work.trial.policies, work.trial.shares
     shown = ("none", 0.0)

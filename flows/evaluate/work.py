@@ -12,19 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from flows.evaluate.costs import capture_seconds, time_frame
-from flows.evaluate.frames import (
-    COST,
-    Candidate,
-    EvaluateRequest,
-    Job,
-    Jobs,
-    Look,
-    Show,
-    Sight,
-    look_at,
-    scene_of,
-    sight_of,
-)
+from flows.evaluate.frames import COST, Candidate, EvaluateRequest, Jobs, Look, Show, Sight, look_at, scene_of, sight_of
 from flows.evaluate.rig_plans import BUDGETS, judge_equal_time, judge_rig
 from flows.evaluate.rows import (
     Bought,
@@ -140,7 +128,9 @@ class Work:
                 kinds = ("frame", *(kind for kind, wanted in asked.items() if wanted))
                 found += [Task(kind, job.name, index) for kind in kinds]
                 if number < self.request.timed_frames and index == job.weights[0]:
-                    found += [Task("time", job.name, index, self._first_of_each(job)), Task("capture", job.name, index)]
+                    first = {design_of(self.controls[one]): one for one in reversed(job.controls)}  # of each design
+                    found.append(Task("time", job.name, index, tuple(sorted(first.values()))))
+                    found.append(Task("capture", job.name, index))
             found += [Task("control", job.name, index) for index in job.controls]
         return found
 
@@ -150,12 +140,6 @@ class Work:
         if not pooled or len(jobs.frames) < 2:
             return []
         return [Task("pooled", job.name, index) for job in jobs.frames for index in job.weights]
-
-    def _first_of_each(self, job: Job) -> tuple[int, ...]:
-        first: dict[str, int] = {}
-        for index in job.controls:
-            first.setdefault(design_of(self.controls[index]), index)
-        return tuple(first.values())
 
     def _make(self, tasks: Sequence[Task], made: Made, show: Show) -> None:
         for task in tasks:

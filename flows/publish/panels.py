@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from typing import Any
+from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 from matplotlib import patheffects
@@ -54,6 +55,12 @@ _SAFE = (
     "#88CCEE",
     "#CC6677",
 )
+
+
+def save_png(figure: Figure, file: str | Path | IO[bytes], **choices: Any) -> None:
+    """Write a figure as PNG, into a file or a buffer."""
+    FigureCanvasAgg(figure)
+    figure.savefig(file, format="png", **choices)
 
 
 def grey_of(image: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -127,7 +134,6 @@ def draw_ground(found: GroundMap) -> bytes:
     tall = extent[3] / extent[1]
     size = (GROUND_IN, GROUND_IN / 2 * min(max(tall, 0.4), 1.6) + 1.1)
     figure = Figure(figsize=size, dpi=GROUND_DPI, layout="constrained")
-    FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
     thin = slice(None, None, -(-max(found.classes.shape) // GROUND_MOST_PX))
     seen = found.picture[thin, thin].any(axis=-1, keepdims=True)
@@ -153,5 +159,5 @@ def draw_ground(found: GroundMap) -> bytes:
     ]
     figure.legend(handles=patches, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
+    save_png(figure, buffer)
     return buffer.getvalue()

@@ -10,7 +10,6 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
@@ -28,6 +27,7 @@ from flows.publish.panels import (
     grey_of,
     outline,
     panel_inches,
+    save_png,
 )
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.geometry.scan import Axis
@@ -64,9 +64,7 @@ class QuicklookData:
 def draw_quicklook(path: str | Path, panels: QuicklookData) -> None:
     """Draw the four panels as a PNG of about 1800 x 1400 px (flatter or taller for fields that are); OSError."""
     with mpl.rc_context(_STYLE):
-        figure = _compose(panels)
-        FigureCanvasAgg(figure)
-        figure.savefig(path, format="png")
+        save_png(_compose(panels), path)
 
 
 _STYLE: Any = {**STYLE, "axes.titlesize": 14, "axes.titleweight": "bold", "axes.titlelocation": "left"}

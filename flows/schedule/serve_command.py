@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -23,7 +22,7 @@ from flows.schedule.served import ServedField, ServeRequest, load_field
 from flows.schedule.server import serve_prefect
 from flows.schedule.times import SystemWallClock, Timetable, WallClock, parse_timetable
 from flows.survey.run import open_run
-from flows.terminal.processes import DONE
+from flows.terminal.processes import DONE, terminable
 from pipeline.errors import ArchiveError, PipelineError, RigError, SettingsError
 from storage.archive.staging import take_lock
 from storage.remote.object_stores import is_remote
@@ -151,17 +150,11 @@ def alone_on(fields: Sequence[ServedField]) -> Iterator[None]:
 @contextmanager
 def _stopped_cleanly(tell: Tell) -> Iterator[None]:
     """Let Ctrl-C, and a service manager's SIGTERM, be the way to stop: the schedule is closed, and that is no error."""
-
-    def interrupt(number: int, frame: object) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
     try:
-        yield
+        with terminable():
+            yield
     except KeyboardInterrupt:
         tell("stopped: nothing is due any more; the same command serves again, and resumes what was interrupted")
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def serve_plain(

@@ -129,10 +129,8 @@ def _password_in(path: Path) -> str:
 
 def _check_answers(url: str) -> None:
     try:
-        with urllib.request.urlopen(f"{url.rstrip('/')}/health", timeout=PATIENCE_S):
-            return
-    except urllib.error.HTTPError:  # it is there, and wants to know who asks
-        return
+        with suppress(urllib.error.HTTPError):  # it is there, and wants to know who asks
+            urllib.request.urlopen(f"{url.rstrip('/')}/health", timeout=PATIENCE_S).close()
     except NO_ANSWER as error:
         raise SettingsError(
             f"no Prefect server answers at {url}, which PREFECT_API_URL names ({error}): start it, or unset the "

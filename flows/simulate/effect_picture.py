@@ -10,14 +10,13 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
-from flows.publish.panels import INK, MUTED, STYLE
+from flows.publish.panels import INK, MUTED, STYLE, save_png
 from flows.simulate.effect_comparison import Comparison, View
 from flows.terminal.figures import format_count, format_seconds
 from pipeline.simulator.effects.probe import Unit
@@ -44,9 +43,7 @@ class Words:
 def draw_comparison(path: str | Path, found: Comparison, words: Words) -> None:
     """Draw the three panels as a PNG, 1600 px wide. Raises OSError: the file cannot be written."""
     with mpl.rc_context(STYLE):
-        figure = _compose(found, words)
-        FigureCanvasAgg(figure)
-        figure.savefig(path, format="png", dpi=_DPI, pil_kwargs={"optimize": True})
+        save_png(_compose(found, words), path, dpi=_DPI, pil_kwargs={"optimize": True})
 
 
 def _compose(found: Comparison, words: Words) -> Figure:

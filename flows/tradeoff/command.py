@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
@@ -24,7 +23,7 @@ from rich.table import Table
 import flows.tradeoff.farm
 import flows.tradeoff.rectify
 import flows.tradeoff.simulate  # noqa: F401 - each registers its entries
-from flows.publish.panels import INK, MUTED
+from flows.publish.panels import INK, MUTED, save_png
 from flows.terminal.figures import format_seconds
 from flows.terminal.processes import writing
 from flows.tradeoff.entries import Point, Result, cheapest_within, find_tradeoffs, measure_tradeoff, registered
@@ -125,9 +124,7 @@ _ROOM, _RIGHT_ROOM = 0.18, 0.28  # of the range of the logarithms, beyond points
 
 def draw_tradeoffs(path: str | Path, results: Sequence[Result]) -> None:
     """Draw one panel for each trade-off into a PNG file."""
-    figure = tradeoff_figure(results)
-    FigureCanvasAgg(figure)
-    figure.savefig(path, format="png")
+    save_png(tradeoff_figure(results), path)
 
 
 def tradeoff_figure(results: Sequence[Result]) -> Figure:
