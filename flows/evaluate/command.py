@@ -163,7 +163,7 @@ def publish_evaluation(work: Work, content: dict[str, Any], runs: list[list[Reco
     if out is None:
         return []
     from flows.evaluate.plots import evaluation_figure, frame_figure, rig_figure  # matplotlib
-    from flows.publish.panels import save_png
+    from flows.publish.panels import save_png  # matplotlib
 
     policies, shares = work.trial.policies, work.trial.shares
     shown = ("none", 0.0)
