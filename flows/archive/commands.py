@@ -1,7 +1,4 @@
-"""The verbs `ls`, `explain`, `verify`, `gc` and `seal`: what an archive holds as plain tables, and its care.
-
-Storage does the work; this says where, shows what was found, and gives the exit code.
-"""
+"""The verbs `ls`, `explain`, `verify`, `gc` and `seal`: storage does the work, this shows it and gives exit codes."""
 
 from __future__ import annotations
 
@@ -120,7 +117,7 @@ def seal(*weights: Path) -> int:
         raise SettingsError("seal needs files of weights: spectralzoom seal FILE ...")
     for path in weights:
         done = "sealed" if seal_weights(path) else "sealed already, every tensor as it was written"
-        stderr.print(f"{path}: {done}", highlight=False, markup=False, soft_wrap=True)
+        stderr.print(f"{path}: {done}", markup=False, soft_wrap=True)
     return 0
 
 
@@ -222,12 +219,7 @@ def _age_s(created: str, now: datetime) -> float | None:
 
 
 def explanation(archive: Archive, product: str) -> dict[str, Any]:
-    """Lineage of a product as nested tables, and what changed since the version before it.
-
-    Raises
-    ------
-    ArchiveError : there is no such product.
-    """
+    """Lineage of a product as nested tables, and what changed since the version before it (ArchiveError: none)."""
     catalogue = Catalogue.read(archive.root)
     found = find_product(catalogue, product)
     if isinstance(found, Run):
@@ -303,10 +295,7 @@ def verdict(archive: Archive, findings: list[Finding]) -> dict[str, Any]:
 
 
 def command(settings: Mapping[str, Any], out: str) -> str:
-    """The command that asks for these settings in the archive ``out``, as far as flags can say it; empty without any.
-
-    The archive may have been moved since: what its receipt calls ``out`` is not said.
-    """
+    """The command for these settings into the archive ``out`` (it may have moved), as far as flags can say it."""
     if not settings:
         return ""
     asked, defaults = {**settings, "out": out}, Settings().to_dict()

@@ -77,15 +77,9 @@ def export(
 def run_export(archive: str | Path, run: str | None, out: Path, envi: bool, console: Console) -> dict[str, Any]:
     """Export a run (the latest without a name) into ``out``, beside others that lie there, and print what was written.
 
-    Returns
-    -------
-    run, item and collection (paths), placed (whether there is a CRS), and files: every asset's path seen from ``out``.
-
-    Raises
-    ------
-    SettingsError : there is no such run, or ``out`` lies in the archive.
-    ArchiveError : rasterio or pystac is missing, ``out`` is another archive's or refuses to be written.
-    IncompleteStoreError : a store of the run is missing or damaged.
+    Gives run, item and collection (paths), placed (whether there is a CRS), and files: every asset's path seen from
+    ``out``. Raises SettingsError: no such run, or ``out`` lies in the archive; ArchiveError: rasterio or pystac is
+    missing, ``out`` is another archive's or cannot be written; IncompleteStoreError: a store is missing or damaged.
     """
     need_rasterio()
     need_pystac()
@@ -114,9 +108,9 @@ def run_export(archive: str | Path, run: str | None, out: Path, envi: bool, cons
     }
     placed = opened.geobox is not None
     if not placed:
-        console.print("[dim]note: no rig pose in this survey, so the images have no CRS[/]", highlight=False)
+        console.print("[dim]note: no rig pose in this survey, so the images have no CRS[/]")
     for path in (*(out / name for name in files.values()), item, collection):
-        console.print(f"  {escape(str(path))}", highlight=False, soft_wrap=True)
+        console.print(f"  {escape(str(path))}", soft_wrap=True)
     return {"run": opened.id, "item": str(item), "collection": str(collection), "placed": placed, "files": files}
 
 
@@ -140,7 +134,6 @@ def _export_images(export: Export, console: Console) -> None:
 
 
 def _export_cubes(export: Export, console: Console) -> None:
-    """The coarse mosaic and the raw sweeps as ENVI files, a block of lines at a time."""
     run = export.run
     mosaic = open_image(run.path("mosaic"), "values")
     rows, columns, bands = mosaic.shape
@@ -174,7 +167,6 @@ class Export:
 
     @property
     def folder(self) -> Path:
-        """Where the run's files go."""
         return self.out / self.run.id
 
     @property

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
 from flows.publish.receipt import Receipt, check_receipt
-from flows.survey.stages.ground import coarse_colours
+from flows.survey.stages.maps import coarse_colours
 from pipeline.errors import IncompleteStoreError, SettingsError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
 from storage.archive.archive import Archive
@@ -40,16 +40,10 @@ class ExportedRun:
 
     @property
     def id(self) -> str:
-        """The run's name in the archive."""
         return self.folder.name
 
     def store(self, product: str) -> StageRef | None:
-        """The store behind a product, None where the run has no such product.
-
-        Raises
-        ------
-        IncompleteStoreError : the archive does not have it any more, or a file of it is missing or cut short.
-        """
+        """The store behind a product, None without one. IncompleteStoreError: the archive has lost it, or a part."""
         uri = self.receipt["products"].get(product)
         if uri is None:
             return None
@@ -69,7 +63,6 @@ class ExportedRun:
         return self.archive.locate(self.receipt["products"][product])
 
     def sweeps(self) -> list[Path]:
-        """Stores of the raw sweeps, coarse ones first."""
         refs = [self.store(product) for product in ("raw_coarse", "raw_fine", "raw_again")]  # the last of earlier runs
         return [path for ref in refs if ref is not None for path in sorted(ref.path.glob("*.zarr"))]
 
@@ -80,13 +73,7 @@ class ExportedRun:
 
 
 def open_exported(archive: Archive, name: str | None) -> ExportedRun:
-    """Open a run by its name or address, the latest without one.
-
-    Raises
-    ------
-    SettingsError : there is no such run, or none at all.
-    IncompleteStoreError : its receipt cannot be read.
-    """
+    """A run by name or address, else the latest; SettingsError: none, IncompleteStoreError: receipt unreadable."""
     runs = archive.runs()
     if not runs:
         raise SettingsError(f"{archive.name} has no published run; survey into it first")
@@ -119,10 +106,7 @@ class Layer:
 
 
 def map_layers(run: ExportedRun) -> list[Layer]:
-    """Class map, confidence, attention and picture of a run: on the map where there is one, on angles where not.
-
-    Attention keeps its grid of seats.
-    """
+    """Class map, confidence, attention (on its seats) and picture: on the map where there is one, else on angles."""
     product = "class_map" if run.geobox is None else "ground_map"
     about = open_image(run.path(product), "classes").about
     colours = np.array(about.get("class_colours", ()), np.uint8).reshape(-1, 3)
@@ -139,7 +123,6 @@ def map_layers(run: ExportedRun) -> list[Layer]:
 
 
 def _tags(run: ExportedRun, product: str, place: Place) -> dict[str, str]:
-    """What a file says of where it comes from and where it lies."""
     return {
         "TIFFTAG_SOFTWARE": f"spectralzoom {run.receipt['versions'].get('spectralzoom', 'of unknown version')}",
         "run": run.id,

@@ -70,12 +70,9 @@ def run_ingest(
     """Store a source in an archive, with progress on ``console``; give the record that --json prints.
 
     What the files hold and the flags say is the store's key: the same content is stored once, whatever it is called and
-    wherever it lies. Killed anywhere it leaves nothing under that key.
-
-    Raises
-    ------
-    SceneError, WavelengthError : the source cannot be used, or changed while it was read.
-    ArchiveError : the name cannot be one in an archive, or the archive cannot be written to.
+    wherever it lies. Killed anywhere it leaves nothing under that key. Raises SceneError, WavelengthError: the source
+    cannot be used, or changed while it was read; ArchiveError: the name cannot be one in an archive, or the archive
+    cannot be written to.
     """
     if name is not None:
         check_name(name)
@@ -162,14 +159,12 @@ def _print(record: dict[str, Any], source: CubeSource, console: Console) -> None
     lines, samples, bands = record["shape"]
     span = record["wavelength_nm"]
     light = "no wavelengths (give --wavelengths)" if span is None else f"{span[0]:g}-{span[1]:g} nm"
-    console.print(
-        f"{escape(record['name'])}: {lines} x {samples} px, {bands} bands, {light}", highlight=False, soft_wrap=True
-    )
+    console.print(f"{escape(record['name'])}: {lines} x {samples} px, {bands} bands, {light}", soft_wrap=True)
     for note in (*source.notes, *([source.bands.origin] if source.bands.origin else [])):
-        console.print(f"[dim]note: {escape(note)}[/]", highlight=False, soft_wrap=True)
+        console.print(f"[dim]note: {escape(note)}[/]", soft_wrap=True)
     lost = record["lost_lines"]
     if lost:
-        console.print(f"[yellow]{lost} of {lines} lines are in no file and flagged[/]", highlight=False)
+        console.print(f"[yellow]{lost} of {lines} lines are in no file and flagged[/]")
     done = "already there" if record["cached"] else "stored"
     sizes = f"{record['bytes_read'] / 1e6:.1f} MB read, {record['bytes_stored'] / 1e6:.1f} MB stored"
-    console.print(f"{done}: {escape(record['path'])} ({sizes})", highlight=False, soft_wrap=True)
+    console.print(f"{done}: {escape(record['path'])} ({sizes})", soft_wrap=True)

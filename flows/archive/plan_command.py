@@ -13,11 +13,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from flows.archive.stage_costs import PastCosts
 from flows.cli.app import AsJson
 from flows.cli.survey_verbs import NO_FLAGS, SurveyFlags, by_setting
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
+from flows.survey.extent import PastCosts
 from flows.survey.run import SurveyRun, open_run
 from flows.survey.stage import Stage, Wanted
 from flows.survey.survey import STAGES, judge, survey
@@ -88,12 +88,7 @@ class Forecast:
 
 
 def forecast(settings: Settings) -> Forecast:
-    """Tell of every stage what a survey of these settings would do. Writes nothing.
-
-    Raises
-    ------
-    PipelineError : what the survey itself would refuse at its start, but for a scene that this machine cannot hold.
-    """
+    """What a survey would do, stage by stage; writes nothing. PipelineError: what a survey would refuse, but size."""
     with tempfile.TemporaryDirectory(prefix="spectralzoom-plan-") as empty:
         archive = Archive(Path(empty), writes=False)  # where there is none yet
         if is_archive(settings.out):
@@ -117,7 +112,6 @@ class Planner:
         self._costs = PastCosts(self.catalogue, self.run)
 
     def __call__(self, stage: str, /, *inputs: StageRef) -> StageRef | None:
-        """Forecast one of ``STAGES`` by its name."""
         ref: StageRef | None = None
         try:
             wanted = STAGES[stage](self.run, *inputs)
@@ -174,7 +168,6 @@ def _in_words(changes: Sequence[Change], stage: str) -> str:
 
 
 def _shown(value: object) -> str:
-    """A value as a person writes it: lists with commas, nothing as none."""
     parts = value if isinstance(value, list) else [value]
     return ", ".join("none" if part is None else str(part) for part in parts) or "none"
 
@@ -184,10 +177,7 @@ COLOURS = {"cached": "green", "to run": "bold", "blocked": "yellow", "skipped": 
 
 
 def plan_content(settings: Settings) -> dict[str, Any]:
-    """The forecast as plain tables, with sums of what is known (``estimated`` of ``to_make`` stages).
-
-    ``refused`` says why this machine would not begin the survey; None where it would.
-    """
+    """The forecast as plain tables, with sums of what is known; ``refused``: why this machine would not begin."""
     found = forecast(settings)
     rows = found.stages
     ahead = [row for row in rows if row.state in ("to run", "blocked")]
@@ -226,9 +216,9 @@ def show_plan(content: dict[str, Any], console: Console) -> None:
             *figures,
         )
     console.print(table)
-    console.print(escape(_sentence(content)), highlight=False, soft_wrap=True)
+    console.print(escape(_sentence(content)), soft_wrap=True)
     if content["refused"] is not None:
-        console.print(f"[yellow]refused here[/]: {escape(content['refused'])}", highlight=False, soft_wrap=True)
+        console.print(f"[yellow]refused here[/]: {escape(content['refused'])}", soft_wrap=True)
 
 
 def _sentence(content: dict[str, Any]) -> str:

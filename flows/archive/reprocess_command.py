@@ -1,4 +1,4 @@
-"""What `spectralzoom reprocess` does: the surveys of an archive again, each beside the one before it.
+"""What `spectralzoom reprocess` and `evaluate ARCHIVE RUN` do: surveys of an archive again, and maps judged later.
 
 What the archive holds is found by its key, raw light above all; only what new weights or newer stages change is made.
 """
@@ -16,6 +16,7 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
+from flows.archive.compare_command import find_run
 from flows.archive.stale_runs import (
     Generation,
     asked_again,
@@ -28,16 +29,25 @@ from flows.archive.stale_runs import (
     would_remake,
 )
 from flows.cli.app import ArchiveName, AsJson, OutFolder, Scheduler, Switch, Workers, check_outside, stderr
-from flows.publish.survey_command import run_survey
+from flows.publish.receipt import Receipt
+from flows.publish.run_folder import add_accuracy, load_receipt
+from flows.publish.survey_command import run_survey, show_published
 from flows.settings.load import of_this_version, parse_settings
 from flows.settings.survey_settings import OF_THE_MACHINE, Settings
+from flows.survey.run import SurveyRun, open_run
+from flows.survey.scene import for_rig
 from flows.survey.scores import score_of
+from flows.survey.stage import versions
+from flows.survey.survey import STAGES, TITLES, Products, StageRunner, judge
 from flows.terminal.figures import counted, format_points, format_seconds
 from flows.terminal.processes import DONE, FAILED, PARTLY
-from flows.terminal.progress import put_out
-from pipeline.errors import PipelineError, SettingsError, visible
+from flows.terminal.progress import StageProgress, put_out
+from models.network.process import keep_freed_memory, use_one_thread
+from pipeline.errors import ArchiveError, PipelineError, SceneError, SettingsError, WeightsError, visible
+from storage.archive.archive import Archive
+from storage.archive.keys import StageRef
 from storage.archive.lineage import Catalogue
-from storage.archive.records import read_run
+from storage.archive.records import Run, read_run
 from storage.archive.whole_files import new_file, to_json, write_whole
 from storage.parallel.crew import THREADS, Crew
 from storage.remote.opening import open_archive
@@ -105,12 +115,9 @@ def run_reprocess(
     """Survey again what was asked for; progress on ``console``, the summary on stdout and in a file.
 
     Fields whose newest run is already as it would become are skipped: the same command goes on after an interruption.
-    The file is there before the first field is begun, and its ``finished`` is null until all have been.
-
-    Raises
-    ------
-    SettingsError : a date or stage that is none, no field is called so, or ``out`` lies in the archive.
-    ArchiveError : the archive cannot be read or written, or there is no room for the summary.
+    The file is there before the first field is begun, and its ``finished`` is null until all have been. Raises
+    SettingsError: a date or stage that is none, no field is called so, or ``out`` lies in the archive; ArchiveError:
+    the archive cannot be read or written, or there is no room for the summary.
     """
     opened = open_archive(request.archive, create=False, write=not request.dry_run)
     folder = opened.around if request.out is None else check_outside(request.out, opened.root)
@@ -139,9 +146,9 @@ def run_reprocess(
     with request.crew.open():  # one start of its workers for all fields
         for number, generation in enumerate(wanted, 1):
             told = f"{number} of {len(wanted)}: {generation.field} ({generation.run.folder.name})"
-            console.print(f"[bold]reprocess {escape(told)}[/]", highlight=False, soft_wrap=True)
+            console.print(f"[bold]reprocess {escape(told)}[/]", soft_wrap=True)
             rows.append(_again(catalogue, generation, request, console, survey or _survey))
-            console.print(escape(_words(rows[-1])), highlight=False, soft_wrap=True)
+            console.print(escape(_words(rows[-1])), soft_wrap=True)
             if file is not None:
                 write_whole(file, to_json(content))  # also of what was done before an interruption
     content["finished"] = f"{datetime.now(UTC):%Y%m%dT%H%M%S}"
@@ -156,7 +163,6 @@ def run_reprocess(
 
 
 def _chosen(catalogue: Catalogue, request: ReprocessRequest, out: str) -> list[Generation]:
-    """Newest runs of the fields that were asked for."""
 
     def remakes(one: Generation) -> bool:
         try:
@@ -257,3 +263,80 @@ def _show(content: Mapping[str, Any], file: Path | None) -> None:
     ]
     lines += [] if file is None else [f"  {file}"]
     sys.stdout.write(visible("\n".join(lines)) + "\n")
+
+
+def run_judge(
+    archive: str, name: str, console: Console, *, controls: bool | None = None, labels: str | None = None
+) -> Receipt:
+    """Judge a run's map and add its accuracy to the run; gives its receipt, as it is where it has what is asked for.
+
+    ``name`` may be `latest` or `previous`; what is None is as the survey was asked for. Raises ArchiveError: there is
+    no such run, it is damaged, or lacks what is needed; SceneError, WeightsError: scene, labels or weights are not
+    those of the run, or there are no labels.
+    """
+    opened = open_archive(archive, create=False)
+    catalogue = Catalogue.read(opened.root)
+    found = find_run(catalogue, name)
+    receipt = load_receipt(found.folder)
+    settings = replace(asked_again(found, opened.name, None), accuracy=True)
+    if controls is not None:
+        settings = for_rig(replace(settings, controls=controls))
+    if labels is not None:
+        settings = replace(settings, labels=labels)
+    there = "accuracy" in receipt and labels is None
+    if there and (receipt["accuracy"]["controls"] or not settings.controls):
+        console.print(escape(f"{found.uri} has its accuracy already"), soft_wrap=True)
+        return receipt
+    use_one_thread()
+    keep_freed_memory()
+    with console.status("opening scene and weights"):
+        run = open_run(settings)
+        run.archive.reclaim()
+        rows = {str(row.get("name")): row for row in found.stages}
+        products = Products()
+        for stage in STAGES.values():
+            if not stage.judges:
+                row = rows.get(stage.name, {})
+                key, what = str(row.get("key") or ""), f"{stage.title} of {found.uri}"
+                skipped = row.get("state") == "skipped"
+                products[stage.name] = None if skipped else _store(catalogue, run.archive, what, key)
+        _check_same(catalogue, found, products, run)
+    with run.archive.in_use(), run.settings.crew.open(), StageProgress(console, TITLES) as progress:
+        draft = run.archive.extend_run(found.folder.name, wait=False)
+        if draft is None:
+            raise ArchiveError(f"{found.uri} is being judged by another process; it adds the accuracy")
+        with draft:
+            runner = StageRunner(run, progress.watch)
+            judged = judge(runner, products)
+            published = add_accuracy(run, draft, judged, runner.records["evaluate"])
+    show_published(published, run.archive, console)
+    return published.receipt
+
+
+def _store(catalogue: Catalogue, archive: Archive, what: str, key: str) -> StageRef:
+    uris = [uri for uri in catalogue.by_key.get(key, []) if uri in catalogue.stores]
+    store = catalogue.stores[uris[0]] if uris else None
+    if store is None or store.problem is not None:
+        raise ArchiveError(f"the {what} is missing or damaged; run verify --repair")
+    now = versions().get(store.ref.stage)
+    if store.version != str(now):
+        raise ArchiveError(
+            f"the {what} was made by version {store.version} of the stage {store.ref.stage}, which is now {now}:"
+            " reprocess makes a new run, with its accuracy"
+        )
+    return archive.ref(store.ref.stage, store.ref.key)
+
+
+def _check_same(catalogue: Catalogue, found: Run, products: Products, run: SurveyRun) -> None:
+    """Refuse to judge by another scene or other weights than the map is of, or where there is nothing to judge by."""
+    if run.scene.key != found.receipt.get("scene"):
+        raise SceneError(
+            f"the scene {run.settings.scene} is another than {found.uri} looked at; put that one back, or survey again"
+        )
+    if run.weights_key != catalogue.stores[products.of("draw_map").uri].params.get("weights"):
+        raise WeightsError(
+            f"the weights {run.settings.weights or 'that come with SpectralZoom'} are others than the map of"
+            f" {found.uri} was drawn with; put those back, or reprocess with these"
+        )
+    if not run.scene.labelled:
+        raise SceneError(f"there are no labels to judge {found.uri} by; give --labels FILE, on the scene's pixels")

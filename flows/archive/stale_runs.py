@@ -6,14 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import cache
-from importlib import resources
 from pathlib import Path, PurePath
 from typing import Any
 
 from flows.publish.receipt import is_pending
 from flows.settings.load import of_this_version, parse_settings
 from flows.settings.survey_settings import BUILT_IN_SCENES, OF_THE_MACHINE, Settings
-from flows.survey.run import SHIPPED
+from flows.survey.run import shipped_weights
 from flows.survey.stage import versions
 from flows.survey.survey import STAGES
 from models.weights.files import content_key
@@ -38,11 +37,16 @@ class Generation:
     run: Run
 
 
+def called(run: Run) -> str:
+    """The field that a run is of."""
+    return str(run.receipt.get("survey") or run.facts.get("survey") or run.folder.name)
+
+
 def newest_runs(catalogue: Catalogue) -> list[Generation]:
     """The newest run of every field, oldest first; runs whose settings cannot be read are fields of their own."""
     found: dict[str, Generation] = {}
     for run in catalogue.runs:  # oldest first
-        name = str(run.receipt.get("survey") or run.facts.get("survey") or run.folder.name)
+        name = called(run)
         field = canonical_json([name, _light_of(run) if run.settings else run.uri])
         found.pop(field, None)
         found[field] = Generation(name, run)
@@ -78,10 +82,7 @@ def asked_again(run: Run, out: str | Path, weights: Path | None) -> Settings:
     """The settings of a run for another survey into the archive ``out``, with other weights if they are given.
 
     A farm is asked for by the law that the run was drawn by: it is the same land, or none where the law was removed.
-
-    Raises
-    ------
-    SettingsError, BudgetError : the run's settings cannot be read, or are not of this version.
+    Raises SettingsError, BudgetError: the run's settings cannot be read, or are not of this version.
     """
     if not run.settings:
         raise SettingsError(f"the settings of {run.uri} cannot be read ({run.problem}); survey this field by hand")
@@ -109,11 +110,7 @@ def is_whole(catalogue: Catalogue, run: Run) -> bool:
 
 
 def is_current(catalogue: Catalogue, run: Run, settings: Settings) -> bool:
-    """Whether its survey with these settings would find all that this run names or rests on, by versions and weights.
-
-    A run whose accuracy is not there yet is not: the survey adds it.
-    What lies in a scene's file is not looked at.
-    """
+    """Whether its survey would find all that this run rests on, by versions and weights, not by a scene's file."""
     drawn_by = law_of_key(str(run.receipt.get("scene")))
     of_this_law = settings.scene not in BUILT_IN_SCENES or drawn_by == FARM_LAW
     stale = stale_stores(catalogue, catalogue.named_and_below[run.uri], weights_key(settings))
@@ -121,10 +118,7 @@ def is_current(catalogue: Catalogue, run: Run, settings: Settings) -> bool:
 
 
 def would_remake(catalogue: Catalogue, run: Run, stage: str, settings: Settings) -> bool:
-    """Whether a stage (a store's, such as segment, or a survey's, such as draw_map) would be made anew.
-
-    Told from versions and weights in the manifests; what new weights of another patch size change in the plan is not.
-    """
+    """Whether a stage (by its or its store's name) would be made anew, as versions and weights in manifests tell."""
     keys = {row.get("key") for row in run.stages if str(row.get("name")) == stage}
     below = ((uri, uri.split("/")) for uri in catalogue.named_and_below[run.uri])
     own = [uri for uri, parts in below if parts[1] == stage or parts[-1] in keys]
@@ -140,8 +134,7 @@ def check_stage(stage: str) -> None:
 
 def weights_key(settings: Settings) -> str | None:
     """What the weights are called by what they hold, as stages know it; None where they cannot be read."""
-    shipped = Path(str(resources.files("models") / "shipped" / SHIPPED))
-    return file_key(shipped if settings.weights is None else Path(settings.weights))
+    return file_key(shipped_weights() if settings.weights is None else Path(settings.weights))
 
 
 def file_key(path: Path) -> str | None:

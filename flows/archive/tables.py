@@ -55,7 +55,7 @@ def show_contents(content: dict[str, Any], console: Console) -> None:
             stores.add_row("", f"[dim]and {len(rows) - MOST_ROWS} older[/]", "", "", "", "")
     console.print(stores if content["stages"] else "no stores")
     for uri in content["lost"]:
-        console.print(f"[bold red]{escape(uri)} has lost its manifest; run verify[/]", highlight=False, soft_wrap=True)
+        console.print(f"[bold red]{escape(uri)} has lost its manifest; run verify[/]", soft_wrap=True)
     count = sum(map(len, content["stages"].values()))
     _say(
         console, f"{counted(len(content['runs']), 'run')}, {counted(count, 'store')}, {format_bytes(content['bytes'])}"
@@ -73,7 +73,7 @@ def show_clearance(content: dict[str, Any], console: Console) -> None:
         count = sum(why == reason for why in content["kept"].values())
         _say(console, f"{counted(count, 'store')} that no run names {'stays' if count == 1 else 'stay'}: {reason}")
     if content["obstacle"] is not None:
-        console.print(f"[bold yellow]{escape(content['obstacle'])}[/]", highlight=False, soft_wrap=True)
+        console.print(f"[bold yellow]{escape(content['obstacle'])}[/]", soft_wrap=True)
     _say(console, f"{len(content['removals'])} things {verb}, {format_bytes(content['bytes'])}")
 
 
@@ -107,7 +107,7 @@ def _show_changes(content: dict[str, Any], console: Console) -> None:
 
 def _branch(node: Mapping[str, Any], parent: Tree | None) -> Tree:
     words = _node_words(node)
-    tree = Tree(words, highlight=False) if parent is None else parent.add(words, highlight=False)
+    tree = Tree(words) if parent is None else parent.add(words)
     for given in node["inputs"]:
         _branch(given, tree)
     return tree
@@ -131,9 +131,7 @@ def _node_words(node: Mapping[str, Any]) -> str:
 def show_verdict(content: dict[str, Any], console: Console) -> None:
     """Print what `verify` found, and what would remake it."""
     for finding in content["problems"]:
-        console.print(
-            f"[bold red]{escape(finding['uri'])}[/]: {escape(finding['problem'])}", highlight=False, soft_wrap=True
-        )
+        console.print(f"[bold red]{escape(finding['uri'])}[/]: {escape(finding['problem'])}", soft_wrap=True)
     for uri, why in content.get("hopeless", {}).items():
         _say(console, f"{uri} cannot be remade: {why}")
     if content.get("to_remake") or content.get("surveys"):
@@ -153,7 +151,7 @@ def show_repair(content: dict[str, Any], console: Console) -> None:
         ("left as it is", done["hopeless"]),
     ):
         for uri, why in part.items():
-            console.print(f"[bold yellow]{title}[/] {escape(uri)}: {escape(why)}", highlight=False, soft_wrap=True)
+            console.print(f"[bold yellow]{title}[/] {escape(uri)}: {escape(why)}", soft_wrap=True)
     left = "nothing broken is left" if done["complete"] else "some is left as it was"
     _say(console, f"{len(done['remade'])} remade, {len(done['dropped'])} that no run named removed; {left}")
 
@@ -174,7 +172,7 @@ def _table(title: str, *columns: str, left: int = 3) -> Table:
 
 
 def _say(console: Console, text: str) -> None:
-    console.print(escape(text), highlight=False, soft_wrap=True)
+    console.print(escape(text), soft_wrap=True)
 
 
 def _age(seconds: float | None) -> str:

@@ -10,14 +10,13 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from flows.archive.judge_command import run_judge
+from flows.archive.reprocess_command import run_judge
 from flows.cli.app import AsJson, OutFile, OutFolder, Switch, parse_numbers, parse_wholes, split_list, stderr
 from flows.evaluate.command import run_evaluate
-from flows.evaluate.request import SHARES, USUAL, EvaluateRequest
+from flows.evaluate.frames import SHARES, USUAL, EvaluateRequest
 from flows.terminal.progress import print_json
 from flows.tradeoff.command import run_tradeoff
-from flows.training.command import run_train
-from flows.training.train import TrainRequest, usual_crop
+from flows.training.train import TrainRequest, run_train, usual_crop
 from models.training.train import TrainingSettings
 from pipeline.errors import SettingsError
 

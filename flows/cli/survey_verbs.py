@@ -11,9 +11,8 @@ from cyclopts import Parameter
 
 from flows.cli.app import AsJson, OutFolder, Switch, removed, split_list, stderr
 from flows.schedule.rig_lock import rig_to_oneself
-from flows.settings.declared import SURVEY, TABLES
 from flows.settings.documents import flag_help
-from flows.settings.load import load_settings
+from flows.settings.load import SURVEY, TABLES, load_settings
 from flows.settings.survey_settings import REPLACED
 from flows.terminal.progress import print_json
 from pipeline.rig.device_settings import SurveyRig

@@ -11,13 +11,24 @@ import numpy as np
 from rich.console import Console
 
 from flows.evaluate.costs import Prices
-from flows.evaluate.frames import Candidate, Jobs, Show, open_candidates, open_frames, scene_of, sort_frames
-from flows.evaluate.request import COST, EvaluateRequest, checked_request
+from flows.evaluate.frames import (
+    COST,
+    Candidate,
+    EvaluateRequest,
+    Jobs,
+    Show,
+    checked_request,
+    open_candidates,
+    open_frames,
+    scene_of,
+    sort_frames,
+)
 from flows.evaluate.rows import design_of, known_or_none, open_controls
 from flows.evaluate.series import REFERENCE, Record, seeds_of
 from flows.evaluate.summary import summarise, summarise_equal_time, summarise_rig
 from flows.evaluate.table import print_evaluation
-from flows.evaluate.work import Made, Work, writing
+from flows.evaluate.work import Made, Work
+from flows.terminal.processes import writing
 from flows.terminal.progress import StageProgress, on_stdout
 from models.evaluation.bootstrap import LEVEL
 from models.evaluation.metrics import agreement, false_pixels, iou_per_class, mean_iou
@@ -36,19 +47,17 @@ def run_evaluate(request: EvaluateRequest, console: Console, *, as_json: bool = 
         print_evaluation(content, on_stdout())
     for path in (*request.weights, *request.controls):
         if not describe_weights(path).sealed:
-            console.print(f"note: {unsealed_note(path)}", highlight=False, markup=False, soft_wrap=True)
+            console.print(f"note: {unsealed_note(path)}", markup=False, soft_wrap=True)
     for path in content["files"]:
-        console.print(path, highlight=False, soft_wrap=True)
+        console.print(path, soft_wrap=True)
     return content
 
 
 def evaluate_weights(request: EvaluateRequest, show: Show = lambda what, done, words: None) -> dict[str, Any]:
     """Judge weights on every frame of a data set that they were not trained on.
 
-    Raises
-    ------
-    SettingsError : shares, policies, weights or controls that cannot be.
-    SceneError : no frame is left, one that was asked for by name has no weights left, or one has no labels.
+    Raises SettingsError: shares, policies, weights or controls that cannot be; SceneError: no frame is left, one that
+    was asked for by name has no weights left, or one has no labels.
     """
     request = checked_request(request)
     keep_freed_memory()
@@ -67,7 +76,6 @@ def evaluate_weights(request: EvaluateRequest, show: Show = lambda what, done, w
 
 
 def _files(candidates: Sequence[Candidate], controls: Sequence[Candidate], jobs: Jobs) -> dict[str, Any]:
-    """What was judged, and on which frames."""
     names = [job.name for job in jobs.frames] + jobs.left_out
 
     def told(one: Candidate, number: int, *, control: bool) -> Record:
@@ -154,7 +162,8 @@ def publish_evaluation(work: Work, content: dict[str, Any], runs: list[list[Reco
     out = work.request.out
     if out is None:
         return []
-    from flows.evaluate.plots import evaluation_figure, frame_figure, rig_figure, save_png  # matplotlib
+    from flows.evaluate.plots import evaluation_figure, frame_figure, rig_figure  # matplotlib
+    from flows.publish.panels import save_png  # matplotlib
 
     policies, shares = work.trial.policies, work.trial.shares
     shown = ("none", 0.0)

@@ -110,10 +110,7 @@ def cpu_seconds(works: Mapping[Part, Callable[[], object]], rounds: int, *, warm
 
 
 def row_seconds(timed: dict[str, Any], policy: str, share: float) -> float | None:
-    """Glance, scores and map of a row [s]; None where it was not timed.
-
-    `none`, `all` and a control are the map alone; the oracle's scores cost nothing.
-    """
+    """Seconds of a row's glance, scores and map, None where not timed; `none`, `all` and controls are the map alone."""
     own = timed["control"].get(f"{policy} {share:g}")
     if own is not None:
         return float(own)
@@ -203,12 +200,7 @@ def capture_seconds(
 
 
 def plan_seconds(look: Look, camera: LineCamera, cost: CostModel, seats: NDArray[np.integer]) -> tuple[float, float]:
-    """Seconds of the coarse pass and these seats by runs of lines (or the full scan), and of a full scan alone.
-
-    Raises
-    ------
-    PoseError : the field is beyond the mirror's range.
-    """
+    """Seconds of coarse pass and seats by runs of lines, and of a full scan; PoseError beyond the mirror's range."""
     grid = look.seen.grid
     along, _, full_s = cheapest_full(grid, camera, cost)
     coarse_s = cost.seconds(coarse_sweeps(grid, camera, along), camera)

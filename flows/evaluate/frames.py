@@ -1,4 +1,4 @@
-"""Which frames `spectralzoom evaluate` judges which weights on, and what the weights see of them: what training saw.
+"""What `spectralzoom evaluate` is asked, on which frames it judges which weights, and what these see of them.
 
 Each frame is judged by those that never saw its labels. Of frames left out in turn each file is judged on its own: what
 it kept for validation is held out by another of them.
@@ -8,26 +8,79 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.evaluate.request import EvaluateRequest
 from flows.survey.scene import check_labels, judged_labels
 from flows.training.data import TrainingData, farm_test_data, open_training_data
 from flows.training.look import observe_scene
+from models.evaluation.bootstrap import DRAWS
 from models.network.spectral import patches_of
+from models.policies.policies import NETWORK_POLICIES, POLICIES
 from models.reading.inference import CoarseLook, Glance, glance_of_columns
 from models.training.examples import normalised
 from models.weights.files import AnyWeights, Description, Weights, content_key, describe_weights
 from pipeline.errors import PipelineError, SceneError, SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
+from pipeline.geometry.scan import CostModel
 from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES
 from pipeline.simulator.scenes.scene import RasterScene
+
+SHARES = (0.05, 0.10, 0.15, 0.20, 0.35)
+JUDGED = tuple(name for name in POLICIES if name not in ("mask", *NETWORK_POLICIES))  # these need a file of one's own
+USUAL = ("gain", "entropy", "sobel", "random")
+COST = CostModel()
+
+
+@dataclass(frozen=True)
+class EvaluateRequest:
+    """What to judge and how."""
+
+    dataset: str
+    weights: tuple[Path, ...]
+    out: Path | None = None
+    shares: tuple[float, ...] = SHARES
+    policies: tuple[str, ...] = USUAL
+    frames: tuple[str, ...] = ()  # all, without one
+    scenes: int | None = None  # of the built-in farm
+    seed: int = 0
+    draws: int = DRAWS
+    timed_frames: int = 2
+    timed_runs: int = 10  # after warm-ups
+    controls: tuple[Path, ...] = ()
+    rig: bool = True
+    equal_time: bool = False
+    pooled: bool = True
+    choices: dict[str, Any] = field(default_factory=dict)  # of load_data_set: labels, bands, wavelengths
+
+
+def checked_request(request: EvaluateRequest) -> EvaluateRequest:
+    """Put shares in order, drop what is there anyway, and refuse what cannot be judged (SettingsError, its flag)."""
+    for share in request.shares:
+        if not 0 <= share <= 1:
+            raise SettingsError(f"--shares are shares of the seats from 0 to 1 (0.1 is 10 %), got {share:g}")
+    for policy in request.policies:
+        if policy not in JUDGED and policy != "oracle":
+            raise SettingsError(
+                f"--policies: {policy!r} is none that can be judged on a data set; choose of {', '.join(JUDGED)}"
+            )
+    for flag, value, least in (
+        ("--seed", request.seed, 0),
+        ("--draws", request.draws, 1),
+        ("--timed-frames", request.timed_frames, 0),
+        ("--timed-runs", request.timed_runs, 1),
+    ):
+        if value < least:
+            raise SettingsError(f"{flag} must be at least {least}, got {value}")
+    shares = tuple(sorted({share for share in request.shares if 0 < share < 1}))
+    policies = tuple(dict.fromkeys(name for name in request.policies if name != "oracle"))
+    return replace(request, shares=shares, policies=policies)
+
 
 FARM_TEST_SCENES = 4
 
@@ -47,7 +100,6 @@ class Candidate:
 
     @property
     def camera(self) -> LineCamera:
-        """The camera that training looked through."""
         known = self.described.record.get("camera")
         try:
             return LineCamera(**known) if isinstance(known, dict) else LineCamera()
@@ -108,10 +160,8 @@ class Look(Sight):
 def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
     """Describe the weights; none of their tensors is read yet.
 
-    Raises
-    ------
-    SettingsError : none given, or weights that are not seeds of one another: other sizes or classes.
-    WeightsError : a file that cannot be read.
+    Raises SettingsError: none given, or weights that are not seeds of one another: other sizes or classes;
+    WeightsError: a file that cannot be read.
     """
     if not paths:
         raise SettingsError("evaluate needs --weights FILE; train some with: spectralzoom train DATASET -o FILE")
@@ -142,13 +192,7 @@ def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
 def open_frames(
     dataset: str, frames: tuple[str, ...], scenes: int | None, camera: LineCamera, choices: dict[str, Any]
 ) -> TrainingData:
-    """Name the frames to judge on; ``train`` of what comes holds them all, whoever was trained on them.
-
-    Raises
-    ------
-    SettingsError : a choice that does not go with the data set.
-    SceneError : no scene, or a name that it has not.
-    """
+    """Name the frames to judge on, in ``train``. SettingsError: choices of other data, SceneError: no such frame."""
     built_in = dataset in FARM_NAMES
     data = open_training_data(dataset, 0, 1 if built_in else scenes, camera, **choices)
     if built_in:
@@ -210,7 +254,6 @@ class Jobs:
     left_out: list[str]
 
     def covered(self, number: int, *, control: bool = False) -> list[str]:
-        """Frames that one of the weights, or one of the controls, is judged on."""
         return [job.name for job in self.frames if number in (job.controls if control else job.weights)]
 
 
@@ -228,11 +271,9 @@ def sort_frames(
 ) -> Jobs:
     """Look at every frame for who was trained on it.
 
-    Raises
-    ------
-    SceneError : no frame or no labelled pixel is left, a frame that was asked for by name has no weights left, a
-        control has no frame left, or a frame that cannot be judged.
-    SettingsError : files that were trained on different pixels of one frame.
+    Raises SceneError: no frame or no labelled pixel is left, a frame that was asked for by name has no weights left, a
+    control has no frame left, or a frame that cannot be judged; SettingsError: files that were trained on different
+    pixels of one frame.
     """
     jobs, labelled = Jobs([], []), False
     chosen = any(request.choices.get(what) is not None for what in ("bands", "wavelengths"))

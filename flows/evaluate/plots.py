@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
@@ -27,12 +25,6 @@ from storage.arrays.quicklooks import choose_bands, stretch
 
 _COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#882255", "#332288", "#999933")
 PAPER, GRID = "#fbfaf7", "#e3e1d8"
-
-
-def save_png(figure: Figure, path: Path) -> None:
-    """Write a figure into a PNG file."""
-    FigureCanvasAgg(figure)
-    figure.savefig(path, format="png")
 
 
 def evaluation_figure(content: dict[str, Any]) -> Figure:

@@ -44,10 +44,7 @@ def judge_rig(
     seed: int,
     report: Callable[[float], None] = lambda done: None,
 ) -> dict[str, Any]:
-    """Judge the map of every plan at every budget that pays for the coarse pass; all plans read the same glance.
-
-    ``left_out`` says why a budget is missing: it does not pay for the coarse pass, or the mirror does not reach.
-    """
+    """Judge each plan at each budget by one glance; ``left_out``: which budgets do not pay, or what is out of reach."""
     grid, rows, left_out = look.seen.grid, [], []
     try:
         along, full, full_s = cheapest_full(grid, camera, cost)
@@ -72,7 +69,6 @@ def judge_rig(
 
 
 def _plans(look: Look, camera: LineCamera, cost: CostModel, along: Axis, seed: int) -> list[tuple[str, int, Spend]]:
-    """Every way to spend seconds, with its name and draw."""
     grid = look.seen.grid
     options = [line_blocks(grid, camera, cost, along, rows) for rows in WIDTHS]
 
@@ -86,7 +82,6 @@ def _plans(look: Look, camera: LineCamera, cost: CostModel, along: Axis, seed: i
         return spend
 
     def without_a_model(draw: int | None) -> Spend:
-        """Blocks of lines evenly spread, or placed by a draw."""
 
         def spend(seconds: float) -> tuple[Seats, float, int]:
             if draw is None:
@@ -141,7 +136,6 @@ def judge_equal_time(
 def _longer_plans(
     trial: Trial, scene: RasterScene, look: Look, weights: Weights, camera: LineCamera, cost: CostModel, full_s: float
 ) -> list[dict[str, Any]]:
-    """Plans of lines: at each budget the exposure grows by its inverse, and lines fill the full scan's seconds."""
     grid = look.seen.grid
     along = cheapest_full(grid, camera, cost)[0]
     coarse = coarse_sweeps(grid, camera, along)
@@ -172,12 +166,7 @@ def _judged(look: Look, weights: Weights, seats: Seats) -> dict[str, Any]:
 
 
 def camera_of_equal_time(look: Look, camera: LineCamera, cost: CostModel, seats: Seats) -> LineCamera:
-    """Give the camera whose exposure lets coarse pass and seats take the seconds of a full scan with ``camera``.
-
-    Raises
-    ------
-    PoseError : the field is beyond the mirror's range.
-    """
+    """The camera whose exposure lets coarse pass and seats take a full scan's seconds (PoseError beyond the mirror)."""
     exposed = camera
     for _ in range(ROUNDS):
         seconds = plan_seconds(look, exposed, cost, seats)[0]

@@ -146,7 +146,6 @@ def cost_of_seats(look: Look, weights: Weights, seats: Seats, policy: str) -> di
 
 
 def _cost_of(look: Sight, samples: float, adds: MultiplyAdds) -> dict[str, Any]:
-    """Samples, their bytes before compression, and multiply-adds, also told apart by what they are for."""
     return {
         "samples": samples,
         "bytes": samples * look.bands * BYTES_PER_SAMPLE,
@@ -173,11 +172,8 @@ POLICY = "sobel"  # of the paper's network
 def open_controls(paths: tuple[Path, ...], weights: list[Candidate]) -> list[Candidate]:
     """Describe the controls; none of their tensors is read yet.
 
-    Raises
-    ------
-    SettingsError : weights of two scales, of other classes or another camera than the weights they stand beside, two
-        files of one design that differ in sizes, or one file twice.
-    WeightsError : a file that cannot be read.
+    Raises SettingsError: weights of two scales, of other classes or another camera than the weights they stand beside,
+    two files of one design that differ in sizes, or one file twice; WeightsError: a file that cannot be read.
     """
     found = [Candidate.of(path) for path in paths]
     first: dict[str, Candidate] = {}
@@ -227,18 +223,24 @@ def score_by_image(sight: Sight) -> np.ndarray[Any, np.dtype[np.float64]]:
 def judge_control(
     trial: Trial, sight: Sight, weights: AnyWeights, report: Callable[[float], None] = lambda done: None
 ) -> dict[str, Any]:
-    """Judge a control's map of a frame at each of its shares; a record like `judge_frame`'s, without placement."""
-    design, rows = weights.config.preset, []
+    """Judge a control's map at each of its shares, by what its own camera takes; rows like `judge_frame`'s."""
+    config, grid, rows = weights.config, sight.seen.grid, []
+    design = config.preset
     shares = control_shares(design, trial.shares)
     for number, share in enumerate(shares):
         seats = seats_of_control(sight, design, share)
         drawn = draw_with_control(weights, sight.seen, sight.fine[seats], seats).classes
         row = {"policy": design, "draw": 0, "share": share, "seats": len(seats)}
-        row |= judge_map(sight, drawn, seats, weights.config.classes)
-        row |= _control_cost(sight, weights, design, seats)
+        row |= judge_map(sight, drawn, seats, config.classes)
+        samples = fine_samples(sight, seats) + (0.0 if design == DENSE else float(np.prod(grid.coarse_shape)))
+        if design == "coarser":
+            samples = float(-(-grid.height // 2) * -(-grid.width // 2))
+        adds = control_multiply_adds(config, grid, len(seats), sight.bands)
+        if design == BUYS_SEATS:
+            adds = replace(adds, score=adds.score + score_multiply_adds(POLICY, config, grid))
+        row |= _cost_of(sight, samples, adds)
         rows.append(row | {"gain": None, "best_gain": None, "ap_top": None})
         report((number + 1) / len(shares))
-    grid = sight.seen.grid
     return {
         "frame": sight.name,
         "shape": [grid.height, grid.width],
@@ -247,19 +249,6 @@ def judge_control(
         "ranking": [],
         "positive_seats": None,
     }
-
-
-def _control_cost(sight: Sight, weights: AnyWeights, design: str, seats: Seats) -> dict[str, Any]:
-    """Its camera takes coarse samples, fine ones of the seats, or those of a grid coarser by two."""
-    config, grid = weights.config, sight.seen.grid
-    samples = 0.0 if design == DENSE else float(np.prod(grid.coarse_shape))
-    samples += fine_samples(sight, seats)
-    if design == "coarser":
-        samples = float(-(-grid.height // 2) * -(-grid.width // 2))
-    adds = control_multiply_adds(config, grid, len(seats), sight.bands)
-    if design == BUYS_SEATS:
-        adds = replace(adds, score=adds.score + score_multiply_adds(POLICY, config, grid))
-    return _cost_of(sight, samples, adds)
 
 
 POOLED = ("gain", "entropy")  # scores that mean the same on every frame [nat]

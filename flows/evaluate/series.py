@@ -43,10 +43,7 @@ class Row:
 
 
 def seeds_of(runs: Runs) -> list[list[int]]:
-    """Put weights together that have no frame in common, in the order given: of each seed, the numbers of its weights.
-
-    Weights without a frame are left out.
-    """
+    """Numbers of the weights of each seed: those with no frame in common, in the order given; without a frame none."""
     seeds: list[tuple[set[str], list[int]]] = []
     for number, records in enumerate(runs):
         names = {record["frame"] for record in records}

@@ -85,7 +85,6 @@ def summarise(
 
 
 def _rows(runs: Runs, trial: Record, controls: Runs, designs: Sequence[str]) -> dict[Key, Row]:
-    """Every row: none, policies, pooled ones and the oracle at every share, controls, all."""
     names, seeds = frame_names(runs), by_seed(runs)
     pooled = (policy + POOLED_MARK for policy in pooled_policies(trial["policies"]))
     every = [(policy, share) for policy in (*trial["policies"], *pooled, ORACLE) for share in trial["shares"]]
@@ -227,9 +226,6 @@ def summarise_equal_time(runs: Runs, judged: Runs, rig: Runs, trial: Record) -> 
 
 
 def _figures(row: Row, name: str) -> dict[str, Any]:
-    def mean_part(name: str) -> float | None:
-        return mean_or_none([part[name] for part in row.parts if name in part])
-
     return {
         "policy": row.policy,
         name: row.share,
@@ -237,5 +233,8 @@ def _figures(row: Row, name: str) -> dict[str, Any]:
         "miou_of_shown_classes": mean_of(row.over_runs(miou_of_shown_classes)),
         "pixel_accuracy": mean_of(row.over_runs(overall_accuracy)),
         "frames": int(row.judged.sum()),
-        **{part: mean_part(part) for part in ("seconds", "full_s", "lines", "full_lines", "seats")},
+        **{
+            part: mean_or_none([one[part] for one in row.parts if part in one])
+            for part in ("seconds", "full_s", "lines", "full_lines", "seats")
+        },
     }

@@ -20,15 +20,14 @@ ENDS = ("none", "all")
 def print_evaluation(content: dict[str, Any], console: Console) -> None:
     """Print what was judged, accuracy, costs, placement, budgets and classes, and what the figures mean."""
     for line in _head(content):
-        console.print(escape(line), highlight=False, soft_wrap=True)
+        console.print(escape(line), soft_wrap=True)
     tables = (_accuracy(content), *_both_definitions(content), _costs(content), _compute(content), _placement(content))
     for table in (*tables, *budget_tables(content), _classes(content)):
         console.print(table)
-    console.print(escape(_caption(content)), highlight=False, soft_wrap=True, style="dim")
+    console.print(escape(_caption(content)), soft_wrap=True, style="dim")
 
 
 def _head(content: dict[str, Any]) -> list[str]:
-    """What was judged by whom: of several weights or controls, the frames that each covers."""
     frames, weights = content["frames"], content["weights"]
     seeds = f"{len(weights)} sets of weights" if len(weights) > 1 else weights[0]["file"]
     left = f"; left out as seen in training: {len(content['left_out'])}" if content["left_out"] else ""
@@ -124,7 +123,6 @@ def _whole(seconds: float | None) -> str:
 
 
 def _compute(content: dict[str, Any]) -> Table:
-    """Multiply-adds told apart by what they are for."""
     parts = ("glance", "score", "encode", "decode")
     table = _table("multiply-adds", "K", *parts)
     for row in content["rows"]:
@@ -219,7 +217,6 @@ def format_difference(interval: dict[str, float | None] | None, digits: int = 1)
 
 
 def _table(first: str, *columns: str, title: str | None = None, caption: str = "") -> Table:
-    """A table in the evaluation's style: names on the left, figures on the right."""
     table = Table(
         title=title,
         title_justify="left",
@@ -277,7 +274,6 @@ def _rig(content: dict[str, Any]) -> Table:
 
 
 def _left_out(missing: list[dict[str, Any]]) -> str:
-    """Which budgets were left out, on how many frames, and why on the first of them."""
     budgets: dict[float | None, list[str]] = {}
     for one in missing:
         budgets.setdefault(one["budget"], []).append(one["why"])

@@ -6,15 +6,13 @@ import hashlib
 import json
 import time
 import zlib
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from flows.evaluate.costs import capture_seconds, time_frame
-from flows.evaluate.frames import Candidate, Job, Jobs, Look, Show, Sight, look_at, scene_of, sight_of
-from flows.evaluate.request import COST, EvaluateRequest
+from flows.evaluate.frames import COST, Candidate, EvaluateRequest, Jobs, Look, Show, Sight, look_at, scene_of, sight_of
 from flows.evaluate.rig_plans import BUDGETS, judge_equal_time, judge_rig
 from flows.evaluate.rows import (
     Bought,
@@ -30,9 +28,9 @@ from flows.evaluate.rows import (
 )
 from flows.evaluate.series import Record
 from flows.terminal.figures import format_seconds
+from flows.terminal.processes import writing
 from flows.training.data import TrainingData
 from models.weights.files import AnyWeights, Weights, load_any_weights
-from pipeline.errors import ArchiveError
 from pipeline.geometry.camera import LineCamera
 from pipeline.planning.line_blocks import WIDTHS
 from pipeline.simulator.scenes.scene import RasterScene
@@ -49,15 +47,6 @@ UNITS = {  # kinds of results, with rough shares of time
     "pooled": 0.4,
 }
 Made = dict[str, list[list[Record]]]  # kind -> of each file its records; those of "time" and "capture" in one list
-
-
-@contextmanager
-def writing(folder: Path) -> Iterator[None]:
-    """Turn a folder that cannot be written to into an error that says so."""
-    try:
-        yield
-    except OSError as error:
-        raise ArchiveError(f"cannot write to {folder}: {error.strerror}; choose another --out") from error
 
 
 @dataclass(frozen=True)
@@ -139,7 +128,9 @@ class Work:
                 kinds = ("frame", *(kind for kind, wanted in asked.items() if wanted))
                 found += [Task(kind, job.name, index) for kind in kinds]
                 if number < self.request.timed_frames and index == job.weights[0]:
-                    found += [Task("time", job.name, index, self._first_of_each(job)), Task("capture", job.name, index)]
+                    first = {design_of(self.controls[one]): one for one in reversed(job.controls)}  # of each design
+                    found.append(Task("time", job.name, index, tuple(sorted(first.values()))))
+                    found.append(Task("capture", job.name, index))
             found += [Task("control", job.name, index) for index in job.controls]
         return found
 
@@ -149,12 +140,6 @@ class Work:
         if not pooled or len(jobs.frames) < 2:
             return []
         return [Task("pooled", job.name, index) for job in jobs.frames for index in job.weights]
-
-    def _first_of_each(self, job: Job) -> tuple[int, ...]:
-        first: dict[str, int] = {}
-        for index in job.controls:
-            first.setdefault(design_of(self.controls[index]), index)
-        return tuple(first.values())
 
     def _make(self, tasks: Sequence[Task], made: Made, show: Show) -> None:
         for task in tasks:
@@ -170,7 +155,6 @@ class Work:
             self._done += UNITS[task.kind]
 
     def _words(self, task: Task, left: float) -> str:
-        """Frame, file where there are several, and about how long the rest will take."""
         files = self._files(task.kind)
         named = task.name if len(files) == 1 else f"{task.name}, {files[task.index].path.name}"
         what = {"frame": "", "control": "control, "}.get(task.kind, f"{task.kind}, ")
@@ -248,7 +232,6 @@ class Work:
         return self._last[2]
 
     def loaded(self, index: int) -> Weights:
-        """Weights of a candidate, read once."""
         weights = self._load(self.candidates[index])
         assert isinstance(weights, Weights)  # open_candidates
         return weights

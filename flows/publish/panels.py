@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 from matplotlib import patheffects
@@ -21,6 +23,17 @@ from storage.arrays.quicklooks import stretch
 GROUND_IN, GROUND_DPI, GROUND_MOST_PX = 9.0, 130, 1200
 INK = "#22241f"
 MUTED = "#6a6d64"
+STYLE: Any = {
+    "font.size": 12,
+    "text.parse_math": False,  # names of surveys and classes may hold dollar signs
+    "font.family": "DejaVu Sans",
+    "axes.edgecolor": "#b8b8b0",
+    "axes.linewidth": 0.8,
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "figure.facecolor": "#fbfaf7",
+    "savefig.facecolor": "#fbfaf7",
+}
 UNLABELLED_COLOUR = (0.86, 0.86, 0.84)
 HALO: list[patheffects.AbstractPathEffect] = [patheffects.withStroke(linewidth=3, foreground="black")]
 # Okabe and Ito (2008), then Paul Tol's muted scheme (2021) without near twins: told apart by colour-blind readers
@@ -42,6 +55,12 @@ _SAFE = (
     "#88CCEE",
     "#CC6677",
 )
+
+
+def save_png(figure: Figure, file: str | Path | IO[bytes], **choices: Any) -> None:
+    """Write a figure as PNG, into a file or a buffer."""
+    FigureCanvasAgg(figure)
+    figure.savefig(file, format="png", **choices)
 
 
 def grey_of(image: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -90,7 +109,9 @@ def draw_scale(axes: Axes, shape: tuple[int, ...], pixel_mrad: float) -> None:
     """A bar of a round number of px in the lower left corner, with its angle."""
     height, width = shape[:2]
     inch_x, inch_y = (size / inches for size, inches in zip((width, height), panel_inches(axes), strict=True))
-    length = _round_length(width / 4)
+    most = max(width / 4, 1)
+    power = 10 ** int(np.floor(np.log10(most)))
+    length = int(max(step * power for step in (1, 2, 5) if step * power <= most))
     left, bottom = 0.14 * inch_x - 0.5, height - 0.5 - 0.14 * inch_y
     bar = Rectangle((left, bottom - 0.07 * inch_y), length, 0.07 * inch_y, facecolor="white", edgecolor="black")
     axes.add_patch(bar)
@@ -106,23 +127,13 @@ def panel_inches(axes: Axes) -> tuple[float, float]:
     return float(box.width / dpi), float(box.height / dpi)
 
 
-def _round_length(px: float) -> int:
-    """The largest of 1, 2, 5 times a power of ten that is not above ``px`` (at least 1)."""
-    power = 10 ** int(np.floor(np.log10(max(px, 1))))
-    return int(max(step * power for step in (1, 2, 5) if step * power <= max(px, 1)))
-
-
 def draw_ground(found: GroundMap) -> bytes:
-    """Draw picture and class map side by side, PNG: north up, hectares in the legend.
-
-    Axes are metres from the map's lower left corner.
-    """
+    """Picture and class map side by side, PNG: north up, metres from the lower left corner, hectares in the legend."""
     box = found.geobox.boundingbox
     extent = (0.0, box.right - box.left, 0.0, box.top - box.bottom)
     tall = extent[3] / extent[1]
     size = (GROUND_IN, GROUND_IN / 2 * min(max(tall, 0.4), 1.6) + 1.1)
     figure = Figure(figsize=size, dpi=GROUND_DPI, layout="constrained")
-    FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
     thin = slice(None, None, -(-max(found.classes.shape) // GROUND_MOST_PX))
     seen = found.picture[thin, thin].any(axis=-1, keepdims=True)
@@ -148,5 +159,5 @@ def draw_ground(found: GroundMap) -> bytes:
     ]
     figure.legend(handles=patches, loc="outside lower center", ncols=4, fontsize=8, frameon=False)
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
+    save_png(figure, buffer)
     return buffer.getvalue()

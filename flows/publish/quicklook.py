@@ -1,7 +1,4 @@
-"""The quicklook: one PNG with four captioned panels that shows a survey at a glance.
-
-Raw lines against the rectified field, where the camera looked twice, the class map, and the truth (or the confidence).
-"""
+"""The quicklook, a survey at a glance as one PNG: raw lines and field, where it looked twice, class map, truth."""
 
 from __future__ import annotations
 
@@ -13,7 +10,6 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
@@ -22,8 +18,8 @@ from numpy.typing import NDArray
 
 from flows.publish.panels import (
     HALO,
-    INK,
     MUTED,
+    STYLE,
     UNLABELLED_COLOUR,
     class_palette,
     class_rgb,
@@ -31,6 +27,7 @@ from flows.publish.panels import (
     grey_of,
     outline,
     panel_inches,
+    save_png,
 )
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.geometry.scan import Axis
@@ -65,32 +62,12 @@ class QuicklookData:
 
 
 def draw_quicklook(path: str | Path, panels: QuicklookData) -> None:
-    """Draw the four panels as a PNG of about 1800 x 1400 px (flatter or taller for fields that are).
-
-    Raises
-    ------
-    OSError : the file cannot be written.
-    """
+    """Draw the four panels as a PNG of about 1800 x 1400 px (flatter or taller for fields that are); OSError."""
     with mpl.rc_context(_STYLE):
-        figure = _compose(panels)
-        FigureCanvasAgg(figure)
-        figure.savefig(path, format="png")
+        save_png(_compose(panels), path)
 
 
-_STYLE: Any = {
-    "font.size": 12,
-    "text.parse_math": False,  # names of surveys and classes may hold dollar signs
-    "font.family": "DejaVu Sans",
-    "axes.titlesize": 14,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.edgecolor": "#b8b8b0",
-    "axes.linewidth": 0.8,
-    "text.color": INK,
-    "axes.labelcolor": INK,
-    "figure.facecolor": "#fbfaf7",
-    "savefig.facecolor": "#fbfaf7",
-}
+_STYLE: Any = {**STYLE, "axes.titlesize": 14, "axes.titleweight": "bold", "axes.titlelocation": "left"}
 _DPI = 100
 _SEAT_COLOUR = "#7df9ff"
 _BLOCK: dict[str, Any] = {"facecolor": "none", "edgecolor": "white", "linewidth": 1.2, "linestyle": (0, (4, 2))}
@@ -143,8 +120,14 @@ def _arrange(tallness: float) -> tuple[float, list[tuple[float, list[tuple[float
 
 
 def _draw_raw(axes: Axes, data: QuicklookData) -> None:
-    """Panel 1, first half: the sweeps as they came, lying as they looked at the field, stretched to its shape."""
-    image = _side_by_side([_colours(data, np.asarray(sweep)) for sweep in data.raw])
+    """Panel 1, first half: the sweeps as they came, next to each other, stretched to the field's shape."""
+    sweeps = [_colours(data, np.asarray(sweep)) for sweep in data.raw]
+    tall, gap = max(one.shape[0] for one in sweeps), max(1, sum(one.shape[1] for one in sweeps) // 60)
+    image = np.full((tall, sum(one.shape[1] for one in sweeps) + gap * (len(sweeps) - 1), 3), 0.98, np.float32)
+    left = 0
+    for one in sweeps:
+        image[: one.shape[0], left : left + one.shape[1]] = one
+        left += one.shape[1] + gap
     _show(axes, image if data.along == "x" else image.swapaxes(0, 1))
     axes.set_aspect("auto")
     lines, count = sum(sweep.shape[0] for sweep in data.raw), len(data.raw)
@@ -165,18 +148,6 @@ def _colours(data: QuicklookData, image: NDArray[np.generic]) -> NDArray[np.floa
     if words.startswith("true colour"):
         return develop(image[..., chosen], data.rectified[..., chosen])
     return stretch(image[..., chosen])
-
-
-def _side_by_side(images: list[NDArray[np.float32]]) -> NDArray[np.float32]:
-    """Sweeps next to each other with a light gap; shorter ones are filled up below."""
-    tall = max(image.shape[0] for image in images)
-    gap = max(1, sum(image.shape[1] for image in images) // 60)
-    parts: list[NDArray[np.float32]] = []
-    for number, image in enumerate(images):
-        filled = np.full((tall, image.shape[1] + (gap if number else 0), 3), 0.98, np.float32)
-        filled[: image.shape[0], -image.shape[1] :] = image
-        parts.append(filled)
-    return np.concatenate(parts, axis=1)
 
 
 def _draw_attention(axes: Axes, data: QuicklookData) -> None:
@@ -275,7 +246,6 @@ def _show(axes: Axes, image: NDArray[np.float32], *, interpolation: str = "antia
 
 
 def _frame(axes: Axes, shape: tuple[int, ...]) -> None:
-    """No ticks, limits on the scene's own pixels."""
     axes.set(xticks=[], yticks=[], xlim=(-0.5, shape[1] - 0.5), ylim=(shape[0] - 0.5, -0.5))
 
 
@@ -289,7 +259,6 @@ def _caption(axes: Axes, title: str, words: str) -> None:
 
 
 def _heat_key(axes: Axes, image: AxesImage, ends: tuple[str, str] = ("low", "high")) -> None:
-    """A small colour bar inside the panel's lower right corner."""
     wide, tall = panel_inches(axes)
     length = min(1.1, 0.3 * wide)
     box = axes.inset_axes((1 - (length + 0.5) / wide, 0.14 / tall, length / wide, 0.12 / tall))

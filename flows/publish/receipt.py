@@ -145,24 +145,12 @@ def build_receipt(
     simulation: Mapping[str, Any] | None = None,
     findings: Mapping[str, object] | None = None,
 ) -> Receipt:
-    """Put a receipt together in its fixed order and check that nothing is missing.
+    """Put a receipt together in its fixed order and check that nothing is missing (ShapeError names what is).
 
-    Parameters
-    ----------
-    savings
-        `COSTS` and, where measured, ``segment_wall_s``; each a mapping with the fields of `Saving`.
-    accuracy
-        Fields of `Accuracy`, and ``judged``, when they were worked out; None where the map is not judged, or not yet:
-        ``accuracy_is`` says which.
-    simulation
-        ``effects``, rows with name, state, variant, bound, measured, cost_s, why, unit, and ``total``, their sums; None
-        for a source that is not simulated.
-    findings
-        Parts that not every survey has: `FINDINGS`.
-
-    Raises
-    ------
-    ShapeError : a field is missing or not of the design; names it.
+    ``savings`` are `COSTS` and, where measured, ``segment_wall_s``, each with the fields of `Saving`. ``accuracy`` has
+    the fields of `Accuracy`, ``judged`` is when it was worked out; None where the map is not judged, or not yet:
+    ``accuracy_is`` says which. ``simulation`` has ``effects``, rows with name, state, variant, bound, measured, cost_s,
+    why, unit, and ``total``, their sums; None for a source that is not simulated. ``findings``: see `FINDINGS`.
     """
     receipt: dict[str, object] = {**asdict(header), "stages": [asdict(stage) for stage in stages]}
     receipt["savings"] = {name: savings[name] for name in (*COSTS, "segment_wall_s") if name in savings}
@@ -186,20 +174,10 @@ def with_accuracy(
 ) -> Receipt:
     """The receipt of a run once its map is judged; nothing that was spent on the survey itself changes.
 
-    Parameters
-    ----------
-    accuracy
-        Fields of `Accuracy` and, where measured, ``segment_wall_s``, which belongs to the savings.
-    stage
-        Of the judging; it takes the place of an earlier one.
-    address
-        Of the product ``accuracy``.
-    settings
-        By which the map was judged; ``judged`` is when, ISO 8601.
-
-    Raises
-    ------
-    ShapeError : a field is missing or not of the design; names it.
+    ``accuracy`` has the fields of `Accuracy` and, where measured, ``segment_wall_s``, which belongs to the savings.
+    ``stage`` is the judging's, in the place of an earlier one; ``address`` is of the product ``accuracy``; by
+    ``settings`` the map was judged; ``judged`` is when, ISO 8601. Raises ShapeError: a field is missing, or not of the
+    design; names it.
     """
     figures = {name: value for name, value in accuracy.items() if name != "segment_wall_s"}
     walls = {name: accuracy[name] for name in ("segment_wall_s",) if name in accuracy}
@@ -242,7 +220,12 @@ def check_receipt(receipt: Mapping[str, Any]) -> Receipt:
     if receipt.get("accuracy_is") == "judged":
         _need(receipt, ("judged", "accuracy"), "receipt")
     if "accuracy" in receipt:
-        _check_accuracy(receipt["accuracy"])
+        accuracy, place = receipt["accuracy"], "receipt.accuracy"
+        _need(accuracy, ("miou", "per_class_iou", "none", "all", "gap_closed", "controls"), place)
+        for name in ("none", "all"):
+            _need(accuracy[name], ("miou", "per_class_iou"), f"{place}.{name}")
+        for policy, control in accuracy["controls"].items():
+            _need(control, ("miou", "spread"), f"{place}.controls.{policy}")
     for number, effect in enumerate(receipt.get("effects", ())):
         _need(effect, _EFFECT_FIELDS, f"receipt.effects[{number}]")
     if "effects_total" in receipt:
@@ -262,17 +245,7 @@ def areas_on_ground(receipt: Mapping[str, Any]) -> Mapping[str, Any] | None:
     return areas if isinstance(areas, Mapping) else None
 
 
-def _check_accuracy(accuracy: Mapping[str, Any]) -> None:
-    place = "receipt.accuracy"
-    _need(accuracy, ("miou", "per_class_iou", "none", "all", "gap_closed", "controls"), place)
-    for name in ("none", "all"):
-        _need(accuracy[name], ("miou", "per_class_iou"), f"{place}.{name}")
-    for policy, control in accuracy["controls"].items():
-        _need(control, ("miou", "spread"), f"{place}.controls.{policy}")
-
-
 def _need(part: object, names: Iterable[str], place: str) -> None:
-    """Raise unless ``part`` is a mapping with all ``names``."""
     if not isinstance(part, Mapping):
         raise ShapeError(f"{place} must be a table with named fields, got {type(part).__name__}")
     for name in names:

@@ -89,7 +89,6 @@ def print_table(receipt: Receipt, console: Console) -> None:
 
 
 def _table(title: str, *columns: str) -> Table:
-    """A table whose first column is text and whose others are figures."""
     table = Table(title=title, title_justify="left", title_style="bold", header_style="dim", box=SIMPLE_HEAD)
     for number, column in enumerate(columns):
         table.add_column(column, justify="left" if number == 0 else "right", no_wrap=number > 0)
@@ -197,10 +196,7 @@ Row = Mapping[str, Any]
 
 
 def print_effects(effects: Iterable[Row], total: Row, console: Console) -> None:
-    """Print a row for every effect that the rig has, what it has none of, and below what all come to.
-
-    On a narrow terminal the words stand below the table.
-    """
+    """Print a row for every effect of the rig and what all come to; words stand below a narrow terminal's table."""
     rows = list(effects)
     there = [row for row in rows if row["reason"] != "absent"]
     wide = console.width >= WIDE
@@ -211,15 +207,15 @@ def print_effects(effects: Iterable[Row], total: Row, console: Console) -> None:
     for row in there:
         table.add_row(*_figures(row, total), *([escape(_words(row))] if wide else []))
     console.print(table)
-    console.print(escape(_KEY.format(unit=UNIT_WORDS[total["unit"]])), style="dim", highlight=False)
+    console.print(escape(_KEY.format(unit=UNIT_WORDS[total["unit"]])), style="dim")
     if not wide:
         for row in there:
-            console.print(f"[bold]{escape(row['name'])}[/]: {escape(_words(row))}", highlight=False)
+            console.print(f"[bold]{escape(row['name'])}[/]: {escape(_words(row))}")
     absent = [f"{row['name']} ({row['magnitude']})" for row in rows if row["reason"] == "absent"]
     if absent:
-        console.print(f"[bold]Not there[/]: {escape(', '.join(absent))}.", highlight=False)
+        console.print(f"[bold]Not there[/]: {escape(', '.join(absent))}.")
     for sentence in total_words(total):
-        console.print(escape(sentence), highlight=False)
+        console.print(escape(sentence))
 
 
 def _figures(row: Row, total: Row) -> list[str]:

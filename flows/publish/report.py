@@ -96,7 +96,11 @@ def render_report(
         **_scores(receipt.get("accuracy")),
         total_words="" if total is None else " ".join(total_words(total)),
         details={
-            "Settings": _flat(receipt["settings"]),
+            "Settings": {
+                f"{name}.{key}" if key else name: item
+                for name, value in receipt["settings"].items()
+                for key, item in (value.items() if isinstance(value, Mapping) else [("", value)])
+            },
             "Versions": receipt["versions"],
             "Files of this survey": receipt["products"],
         },
@@ -115,11 +119,3 @@ def _scores(accuracy: Accuracy | None) -> dict[str, Any]:
         "shown_words": SHOWN_WORDS,
         "false_classes": false_class_words(accuracy),
     }
-
-
-def _flat(settings: Mapping[str, Any]) -> dict[str, object]:
-    flat: dict[str, object] = {}
-    for name, value in settings.items():
-        table = isinstance(value, Mapping)
-        flat |= {f"{name}.{key}": item for key, item in value.items()} if table else {name: value}
-    return flat

@@ -25,12 +25,10 @@ from flows.survey.run import SurveyRun, now
 from flows.survey.stages.accuracy import load_accuracy
 from flows.survey.stages.attention import load_orientation, load_plan
 from flows.survey.stages.capture import captured
-from flows.survey.stages.class_map import strange_pixels
 from flows.survey.stages.effects import load_manifest
-from flows.survey.stages.ground import STORE
-from flows.survey.stages.placement import SEATS_AT_ONCE, line_facts, seen_shares
-from flows.survey.stages.registration import load_registration
-from flows.survey.survey import Products, StageRunner
+from flows.survey.stages.maps import STORE, strange_pixels
+from flows.survey.stages.placement import SEATS_AT_ONCE, line_facts, load_registration, seen_shares
+from flows.survey.survey import STAGES, Products, StageRunner
 from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.geometry.scan import Sweep
@@ -48,21 +46,6 @@ from storage.arrays.ground_maps import load_ground_map, open_image
 from storage.arrays.mosaics import load_attention, open_patches
 from storage.arrays.quicklooks import choose_bands
 
-IN_STORES = {  # products of a receipt: the stage that leaves them, and where in its store
-    "effects": ("choose_effects", "/effects.json"),
-    "raw_coarse": ("capture_coarse", ""),
-    "lookup": ("locate", "/lookup.zarr"),
-    "mosaic": ("rectify", "/mosaic.zarr"),
-    "attention": ("attend", "/attention.zarr"),
-    "plan": ("attend", "/plan.json"),
-    "raw_fine": ("capture_fine", ""),
-    "patches": ("cut_patches", "/patches.zarr"),
-    "class_map": ("draw_map", "/class_map.zarr"),
-    "coarse_pointing": ("register_coarse", "/registration.json"),
-    "fine_pointing": ("register_fine", "/registration.json"),
-    "ground_map": ("ground", "/ground_map.zarr"),
-    "accuracy": ("evaluate", "/accuracy.json"),
-}
 LIBRARIES = ("spectralzoom", "numpy", "torch", "zarr", "xarray", "prefect")
 
 
@@ -97,7 +80,7 @@ def add_accuracy(run: SurveyRun, draft: RunDraft, products: Products, stage: Sta
         before,
         load_accuracy(products.of("evaluate")),
         stage,
-        _address("accuracy", products.of("evaluate")),
+        STAGES["evaluate"].addresses(products.of("evaluate"))["accuracy"],
         settings={name: asked[name] for name in names},
         judged=now(),
     )
@@ -105,13 +88,7 @@ def add_accuracy(run: SurveyRun, draft: RunDraft, products: Products, stage: Sta
 
 
 def load_receipt(folder: Path) -> Receipt:
-    """Read the receipt of a published run.
-
-    Raises
-    ------
-    IncompleteStoreError : it is not as it was published.
-    ShapeError : it lacks what a receipt has.
-    """
+    """The receipt of a published run; IncompleteStoreError: not as it was published, ShapeError: it lacks a part."""
     found = read_run(folder, {})
     if found.problem is not None:
         raise IncompleteStoreError(f"{found.uri}: {found.problem}; run verify --repair on the archive")
@@ -140,8 +117,9 @@ def make_receipt(runner: StageRunner, products: Products, plan: FinePlan, starte
     simulation = None if not run.source.simulates else load_manifest(products.of("choose_effects"))
     if accuracy is not None and "segment_wall_s" in accuracy:
         savings["segment_wall_s"] = accuracy.pop("segment_wall_s")
-    there = {name: products.get(stage) for name, (stage, _) in IN_STORES.items()}
-    stores = {name: _address(name, ref) for name, ref in there.items() if ref is not None}
+    stores: dict[str, str] = {}
+    for name, ref in products.items():
+        stores |= {} if ref is None else STAGES[name].addresses(ref)
     unjudged: AccuracyIs = "pending" if run.settings.accuracy else "left out"
     accuracy_is = "judged" if accuracy is not None else unjudged if run.scene.labelled else "without labels"
     versions = {"python": platform.python_version()}
@@ -167,10 +145,6 @@ def make_receipt(runner: StageRunner, products: Products, plan: FinePlan, starte
 def asked_settings(run: SurveyRun) -> dict[str, object]:
     """The settings, so that they can be asked for from anywhere, and what was assumed beside them."""
     return {**anchor_paths(run.settings.to_dict(), Path.cwd()), "notes": list(run.notes)}
-
-
-def _address(name: str, ref: StageRef) -> str:
-    return f"{ref.uri}{IN_STORES[name][1]}"
 
 
 def _savings(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, Any]:
@@ -271,10 +245,7 @@ def block_of(sweep: Sweep, run: SurveyRun) -> tuple[int, int, int, int]:
 
 
 def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
-    """Gather ``plan`` and the parts of the receipt that not every survey has.
-
-    These are ``pointing``, ``ground``, ``pixels`` and ``lines``.
-    """
+    """``plan``, and what not every survey has: ``pointing``, ``ground``, ``pixels`` and ``lines``."""
     plan = load_plan(products.of("attend"))
     told: dict[str, Any] = {
         "kind": plan.kind,
@@ -327,10 +298,7 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
 
 
 def _pointing(ref: StageRef) -> dict[str, Any]:
-    """Corrections of one pass, and what its windows say of them.
-
-    Each sweep beside the held one has an offset and a drift: where windows are no more than these, they leave nothing.
-    """
+    """Corrections of one pass; what they leave is told only where windows are more than offsets and drifts."""
     record = load_registration(ref)
     left = np.array([window["residual_px"] for window in record["windows"] if window.get("residual_px")])
     tells = len(left) > 2 * (len(record["sweeps"]) - len(record["untied"]) - 1)

@@ -111,11 +111,9 @@ class FieldSchedule:
 
     @property
     def field(self) -> str:
-        """The field's name."""
         return self.ledger.field
 
     def state(self) -> ScheduleState:
-        """What the ledger says by now."""
         return read_state(self.ledger.lines())
 
     def open(self, first: datetime | None = None) -> None:
@@ -162,10 +160,7 @@ class FieldSchedule:
             return self._pass_over(state, now, why or TOO_LATE, keep=True) if state.serving else []
 
     def begin(self, due: datetime, **facts: object) -> int | None:
-        """Note that a run begins: which attempt it is, or None where the due time is accounted for already.
-
-        A run that began and has not ended is begun again only by whoever knows that it is dead.
-        """
+        """Which attempt begins; None where accounted for. What began is begun again only by who knows it is dead."""
         with self.ledger.held():
             state, now = self._state_now()
             waiting = self._pass_over(state, now, TOO_LATE, keep=True)
@@ -217,10 +212,7 @@ class FieldSchedule:
     def _pass_over(
         self, state: ScheduleState, now: datetime, why: str, *, keep: bool, until: datetime | None = None
     ) -> list[datetime]:
-        """Account for due times until now that have not begun; with ``keep`` those that may begin are given instead.
-
-        With ``until`` only for those until then.
-        """
+        """Account for due times until now (or ``until``) not begun; ``keep``: those that may begin are given back."""
         timetable = state.timetable or self.timetable
         if state.since is None:
             return []

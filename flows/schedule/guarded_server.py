@@ -46,10 +46,7 @@ class OwnPagesOnly:
 
 
 def guarded(app: App, port: int) -> App:
-    """An application that answers requests to its own address alone, from its own pages alone.
-
-    A name that somebody else's DNS points to this machine is another host (400).
-    """
+    """An application for its own address (400 else: another's DNS may point here) and its own pages alone."""
     from starlette.middleware.trustedhost import TrustedHostMiddleware
 
     pages: Any = OwnPagesOnly(app, own_origins(port))

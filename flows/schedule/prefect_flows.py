@@ -1,4 +1,4 @@
-"""The flows that Prefect runs on a schedule or on request: a field's survey, and the reprocessing of an archive.
+"""The flows that Prefect runs on schedule or request, a field's survey and an archive's reprocessing, and their runner.
 
 Their parameters can only name what is served; all else stands in the file of `flows.schedule.served`. What a survey
 needs is imported when it has begun: on a busy machine that takes longer than a run may be late.
@@ -6,20 +6,22 @@ needs is imported when it has begun: on a busy machine that takes longer than a 
 No ``from __future__ import annotations`` here: Prefect reads the signatures. What is done is in plain functions.
 """
 
+import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
-from prefect import State, flow
+from prefect import State, flow, serve
 from prefect.concurrency.sync import concurrency
 from prefect.context import FlowRunContext
 from prefect.states import Cancelled, Completed, Failed
+from prefect.types.entrypoint import EntrypointType
 
-from flows.schedule.due_runs import Outcome, run_due
+from flows.schedule.due_runs import Outcome, ScheduleNews, run_due, send_notice, together
 from flows.schedule.field_schedule import FieldSchedule, read_moment
-from flows.schedule.notices import ScheduleNews, send_notice, together
 from flows.schedule.served import ServedField, ServeRequest, read_served, served_archive, served_field, served_weights
 from flows.schedule.times import WallClock
 from flows.schedule.watcher import LIMIT, REPROCESS_LOCK, SKIPPED
@@ -71,11 +73,11 @@ def _run(one: ServedField, schedule: FieldSchedule, moment: datetime, request: S
 
 
 def _survey(one: ServedField, due: datetime, request: ServeRequest) -> Path:
-    from flows.publish import prefect_artifacts, survey_command  # torch, once the run is noted as begun
+    from flows.publish import survey_command  # torch, once the run is noted as begun
 
     published = survey_command.run_survey(one.settings_of(due, request.timetable), on_stderr())
     with suppress(Exception):  # a server that is gone: the archive has it all
-        prefect_artifacts.publish_artifacts(published, one.name, one.settings.out)
+        survey_command.publish_artifacts(published, one.name, one.settings.out)
     return published.folder
 
 
@@ -137,10 +139,7 @@ def reprocess_archive(
     weights: str | None = None,
     dry_run: bool = False,
 ) -> State:
-    """Survey every field of a served archive again: light is found there, only what has changed is made anew.
-
-    ``weights`` may be those that a served field's settings name.
-    """
+    """Survey every field of a served archive again; ``weights`` may be those that a served field's settings name."""
     from flows.archive.reprocess_command import ReprocessRequest, run_reprocess  # torch
 
     try:
@@ -163,3 +162,52 @@ def reprocess_archive(
     if code == FAILED:
         return Failed(message="no field could be reprocessed; reprocess-TIME.json beside the archive says why")
     return Completed(message="some fields failed: see reprocess-TIME.json" if code == PARTLY else "done")
+
+
+@contextmanager
+def own_temporary_folder() -> Iterator[None]:
+    """Let this process have its temporary files in a folder that is this user's alone.
+
+    Prefect's runner keeps what it starts in /tmp/runner_storage, which belongs to the first user who ever ran one: that
+    one could exchange it, and no other can run one.
+    """
+    usual = tempfile.tempdir
+    with tempfile.TemporaryDirectory(prefix="spectralzoom-runner-", ignore_cleanup_errors=True) as own:
+        tempfile.tempdir = own
+        try:
+            yield
+        finally:
+            tempfile.tempdir = usual
+
+
+def deployments(request: ServeRequest) -> list[Any]:
+    """A deployment for each field and each archive; without schedules: `flows.schedule.watcher` plans each time."""
+    alike: dict[str, Any] = {"version": "1", "entrypoint_type": EntrypointType.MODULE_PATH}
+    surveys = [
+        survey_scheduled.to_deployment(
+            one.name,
+            schedules=[],
+            parameters={"field": one.name},
+            tags=[one.settings.source, one.name],
+            description=f"Surveys of {one.name} by {one.file}, {request.timetable.words()}.",
+            **alike,
+        )
+        for one in request.fields
+    ]
+    archives = [
+        reprocess_archive.to_deployment(
+            "archive" if number == 1 else f"archive-{number}",
+            parameters={"archive": str(out)},
+            description=f"Surveys of {out} again, with newer weights or stages; on request.",
+            **alike,
+        )
+        for number, out in enumerate(dict.fromkeys(one.settings.out for one in request.fields), 1)
+    ]
+    return [*surveys, *archives]
+
+
+def serve_runs() -> None:
+    """Run what is served until told to stop; `serve` starts it anew, for Prefect's runner can lose its server."""
+    request = read_served()
+    with suppress(KeyboardInterrupt), own_temporary_folder():
+        serve(*deployments(request), limit=request.limit, print_starting_message=False)

@@ -42,23 +42,15 @@ class RigLock:
 
     @property
     def held(self) -> bool:
-        """Whether it is held by this object."""
         return self._release is not None
 
     def take(self, words: str = "") -> bool:
-        """Try to take it, without waiting; ``words`` tell others who holds it.
-
-        Raises
-        ------
-        RigError : it cannot be had at all, held or not; the rig is not to be used then.
-        ArchiveError : a link is in the place of its file.
-        """
+        """Try to take it, ``words`` telling who holds it. RigError: it cannot be had at all, ArchiveError: a link."""
         if not self.held:
             self._release = hold_place(self.place, f"{words or 'a survey'} (process {os.getpid()})")
         return self.held
 
     def wait(self, until: datetime, clock: WallClock, words: str = "") -> bool:
-        """Take it, waiting until a moment at most."""
         while not self.take(words):
             if clock.now() >= until:
                 return False
@@ -77,7 +69,6 @@ class RigLock:
             release()
 
     def holder(self) -> str:
-        """Who holds it, as far as is known."""
         with suppress(OSError, UnicodeDecodeError, IndexError):
             if isinstance(self.place, Path):
                 return self.place.read_text().strip() or "another process"
@@ -103,9 +94,7 @@ def rig_lock(settings: Settings, archive: Path) -> RigLock:
 def hold_place(place: Path | str, words: str) -> Callable[[], None] | None:
     """Hold a name in the kernel, or a file, until what is returned is called; None where another holds it.
 
-    Raises
-    ------
-    RigError : it cannot be held by anybody here. ArchiveError : a link is in the place of a file.
+    Raises RigError: it cannot be held by anybody here; ArchiveError: a link is in the place of a file.
     """
     try:
         if isinstance(place, str):
@@ -142,12 +131,7 @@ def _bind(held: ExitStack, name: str) -> None:
 
 @contextmanager
 def rig_to_oneself(settings: Settings, words: str) -> Iterator[None]:
-    """Hold the rig while the block runs; the simulated one needs no holding.
-
-    Raises
-    ------
-    RigError : another survey holds it.
-    """
+    """Hold the rig while the block runs (RigError: another survey holds it); the simulated one needs no holding."""
     if _port(settings) is None:
         yield
         return

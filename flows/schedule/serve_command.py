@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -16,15 +15,14 @@ from rich.console import Console
 from rich.markup import escape
 
 from flows.cli.app import stderr
-from flows.schedule.due_runs import Outcome, Survey, Tell, run_all
+from flows.schedule.due_runs import Outcome, ScheduleNews, Survey, Tell, notice_address, run_all, send_notice, together
 from flows.schedule.field_schedule import FieldSchedule
-from flows.schedule.notices import ScheduleNews, notice_address, send_notice, together
 from flows.schedule.rig_lock import RigLock, hold_place
 from flows.schedule.served import ServedField, ServeRequest, load_field
 from flows.schedule.server import serve_prefect
 from flows.schedule.times import SystemWallClock, Timetable, WallClock, parse_timetable
 from flows.survey.run import open_run
-from flows.terminal.processes import DONE
+from flows.terminal.processes import DONE, terminable
 from pipeline.errors import ArchiveError, PipelineError, RigError, SettingsError
 from storage.archive.staging import take_lock
 from storage.remote.object_stores import is_remote
@@ -105,16 +103,11 @@ def survey_field(one: ServedField, due: datetime, timetable: Timetable, console:
 
 
 def _tell(words: str) -> None:
-    stderr.print(escape(words), highlight=False, soft_wrap=True)
+    stderr.print(escape(words), soft_wrap=True)
 
 
 def load_fields(files: Sequence[Path], out: str | None = None) -> list[ServedField]:
-    """Read the settings of every field, in turn, and see whether they can be surveyed; nothing is captured.
-
-    Raises
-    ------
-    PipelineError : there are none, two are called the same, or the first that cannot be surveyed, named.
-    """
+    """Settings of every field, in turn, each seen to be surveyable; nothing is captured (PipelineError names it)."""
     if not files:
         raise SettingsError("no fields: give the settings file of one or more, such as serve north.toml --every 30m")
     fields = [load_field(file, out) for file in files]
@@ -133,13 +126,7 @@ def load_fields(files: Sequence[Path], out: str | None = None) -> list[ServedFie
 
 @contextmanager
 def alone_on(fields: Sequence[ServedField]) -> Iterator[None]:
-    """Keep another serve off the archives and the rigs of these fields while the block runs.
-
-    Raises
-    ------
-    ArchiveError : another serves one of the archives.
-    RigError : another serves one of the rigs.
-    """
+    """Keep another serve off these fields' archives (ArchiveError) and rigs (RigError) while the block runs."""
     roots: Mapping[Path, str] = {one.archive: str(one.settings.out) for one in fields}
     rigs = {one.lock().of_servers(): one.settings.rig.port for one in fields if one.settings.source == "rig"}
     with ExitStack() as held:
@@ -163,17 +150,11 @@ def alone_on(fields: Sequence[ServedField]) -> Iterator[None]:
 @contextmanager
 def _stopped_cleanly(tell: Tell) -> Iterator[None]:
     """Let Ctrl-C, and a service manager's SIGTERM, be the way to stop: the schedule is closed, and that is no error."""
-
-    def interrupt(number: int, frame: object) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
     try:
-        yield
+        with terminable():
+            yield
     except KeyboardInterrupt:
         tell("stopped: nothing is due any more; the same command serves again, and resumes what was interrupted")
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def serve_plain(
@@ -186,12 +167,7 @@ def serve_plain(
     note: Callable[[Outcome], object] = lambda outcome: None,
     until: datetime | None = None,
 ) -> None:
-    """Serve schedules until ``until``, or until interrupted; then they are closed, and what began is resumed later.
-
-    Raises
-    ------
-    PipelineError : a ledger cannot be written at the start; what was opened until then is closed.
-    """
+    """Serve until ``until`` or interrupted, then close. PipelineError: a ledger cannot be written at the start."""
     watch, news = clock or SystemWallClock(), ScheduleNews(schedules, lambda name, error: tell(f"{name}: {error}"))
     with ExitStack() as opened:
         for name, schedule in schedules.items():

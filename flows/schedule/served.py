@@ -40,22 +40,16 @@ class ServedField:
 
     @property
     def archive(self) -> Path:
-        """Folder of the archive, or of its working copy."""
         return open_archive(self.settings.out).root
 
     def schedule(self, timetable: Timetable, late: float, clock: WallClock | None = None) -> FieldSchedule:
-        """The field's schedule and ledger."""
         return FieldSchedule(Ledger(self.archive, self.name), timetable, late, clock or SystemWallClock())
 
     def lock(self) -> RigLock:
-        """The lock of the rig that looks at it."""
         return rig_lock(self.settings, self.archive)
 
     def settings_of(self, due: datetime, timetable: Timetable) -> Settings:
-        """What the survey of a due time is asked for: a visit of its own; a simulated farm is as on that day.
-
-        What stands before a rig, an emulated one too, is as it is.
-        """
+        """What the survey of a due time is asked for: a visit of its own, a simulated farm as on that day."""
         asked = replace(self.settings, name=self.name, visit=moment_words(due))
         if asked.source == "sim" and asked.scene in FARM_NAMES and asked.day is None:
             asked = replace(asked, day=due.astimezone(timetable.zone).timetuple().tm_yday)
@@ -63,12 +57,7 @@ class ServedField:
 
 
 def load_field(file: Path, out: str | None = None) -> ServedField:
-    """Read one field's settings; ``out`` wins over the file's archive.
-
-    Raises
-    ------
-    SettingsError : the file cannot be used, or says neither what to look at nor that a rig looks.
-    """
+    """One field's settings, ``out`` before the file's own; SettingsError: unusable, or nothing to look at."""
     settings = load_settings(file, {"out": out})
     said = read_toml(file)
     if "scene" not in said and settings.source != "rig":
@@ -93,12 +82,10 @@ class ServeRequest:
 
     @property
     def headline(self) -> str:
-        """What is served, and how that is ended."""
         names = ", ".join(one.name for one in self.fields)
         return f"serving {names}, {self.timetable.words()}; stop with Ctrl-C, the same command goes on"
 
     def schedules(self) -> dict[str, FieldSchedule]:
-        """The schedule of every field, by its name."""
         return {one.name: one.schedule(self.timetable, self.late) for one in self.fields}
 
 
@@ -120,12 +107,7 @@ def write_served(request: ServeRequest, path: Path) -> None:
 
 
 def read_served() -> ServeRequest:
-    """What is served here, by the file that the environment names; fields are read, not yet checked.
-
-    Raises
-    ------
-    SettingsError : no file is named, or it, or a field's settings in it, cannot be used.
-    """
+    """What is served, by the file that the environment names; fields not yet checked (SettingsError: unusable)."""
     path = os.environ.get(NAMED_BY)
     if not path:
         raise SettingsError(
@@ -154,10 +136,10 @@ def read_served() -> ServeRequest:
 
 def served_field(request: ServeRequest, name: str) -> ServedField:
     """The field of that name (SettingsError where it is not served)."""
-    for one in request.fields:
-        if one.name == name:
-            return one
-    raise SettingsError(f"the field {name!r} is not served here: {', '.join(one.name for one in request.fields)} are")
+    found = {one.name: one for one in request.fields}
+    if name not in found:
+        raise SettingsError(f"the field {name!r} is not served here: {', '.join(found)} are")
+    return found[name]
 
 
 def served_archive(request: ServeRequest, name: str) -> str:

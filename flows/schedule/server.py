@@ -65,11 +65,7 @@ def server_for(home: Path, port: int) -> Iterator[LocalServer | None]:
 
     None where PREFECT_API_URL names one, which is left as it is. One of our own wants a password: what the variable
     PREFECT_SERVER_API_AUTH_STRING says, or one that is kept in ``home`` for this user. Nothing outside this machine is
-    asked.
-
-    Raises
-    ------
-    SettingsError : the port is taken, the server did not start, or the one that is named does not answer.
+    asked. Raises SettingsError: the port is taken, the server did not start, or the one that is named does not answer.
     """
     if named := os.environ.get("PREFECT_API_URL"):
         _check_answers(named)
@@ -133,10 +129,8 @@ def _password_in(path: Path) -> str:
 
 def _check_answers(url: str) -> None:
     try:
-        with urllib.request.urlopen(f"{url.rstrip('/')}/health", timeout=PATIENCE_S):
-            return
-    except urllib.error.HTTPError:  # it is there, and wants to know who asks
-        return
+        with suppress(urllib.error.HTTPError):  # it is there, and wants to know who asks
+            urllib.request.urlopen(f"{url.rstrip('/')}/health", timeout=PATIENCE_S).close()
     except NO_ANSWER as error:
         raise SettingsError(
             f"no Prefect server answers at {url}, which PREFECT_API_URL names ({error}): start it, or unset the "
@@ -156,12 +150,7 @@ def _check_free(port: int) -> None:
 
 
 def serve_prefect(request: ServeRequest, tell: Tell) -> None:
-    """Serve until interrupted.
-
-    Raises
-    ------
-    PipelineError : no server, or a ledger cannot be written at the start; what was opened until then is closed.
-    """
+    """Serve until interrupted. PipelineError: no server, or a ledger cannot be written at the start; all is closed."""
     schedules, home = request.schedules(), request.fields[0].archive / ".prefect"
     log = home / "surveys.log"
     with server_for(home, request.port) as server:
@@ -169,7 +158,7 @@ def serve_prefect(request: ServeRequest, tell: Tell) -> None:
         write_served(request, served)
         watcher = Watcher(request, schedules, tell)
         # Of the runs that it starts the log has what they say; they go on by themselves when it ends, or are resumed.
-        command = [sys.executable, "-m", "flows.schedule.runner"]
+        command = [sys.executable, "-c", "from flows.schedule.prefect_flows import serve_runs; serve_runs()"]
         runner = KeptProcess(command, log, RUNNER_ENDS_WITHIN_S, {NAMED_BY: str(served)})
         opened: list[FieldSchedule] = []
         try:

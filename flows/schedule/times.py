@@ -37,7 +37,6 @@ class Timetable:
 
     @cached_property
     def zone(self) -> ZoneInfo:
-        """The time zone of ``cron``."""
         return ZoneInfo(self.timezone)
 
     def due_after(self, moment: datetime) -> Iterator[datetime]:
@@ -58,14 +57,12 @@ class Timetable:
             return
 
     def due_between(self, after: datetime, until: datetime) -> Iterator[datetime]:
-        """Due times later than ``after`` and not later than ``until``."""
         for due in self.due_after(after):
             if due > until:
                 return
             yield due
 
     def next_after(self, moment: datetime) -> datetime | None:
-        """The first due time later than a moment; None where there is none."""
         return next(self.due_after(moment), None)
 
     def interval(self, due: datetime) -> timedelta:
@@ -78,7 +75,6 @@ class Timetable:
         return due + late * self.interval(due)
 
     def words(self) -> str:
-        """As a person gave it."""
         return f'cron "{self.cron}" ({self.timezone})' if self.every is None else f"every {every_words(self.every)}"
 
     def to_dict(self) -> dict[str, Any]:
@@ -88,12 +84,7 @@ class Timetable:
 
 
 def parse_timetable(cron: str | None, every: str | None, timezone: str | None = None) -> Timetable:
-    """Check what was given of a schedule.
-
-    Raises
-    ------
-    SettingsError : not exactly one of both is given, or it, or the time zone, is none.
-    """
+    """Check what was given of a schedule; SettingsError: not exactly one of both, or it, or the time zone, is none."""
     if (cron is None) == (every is None):
         got = "neither" if cron is None else "both"
         raise SettingsError(f"a schedule needs --cron or --every, got {got}; such as --every 30m or --cron '0 6 * * *'")
@@ -184,7 +175,6 @@ class SystemWallClock:
     """The machine's clock."""
 
     def now(self) -> datetime:
-        """The moment in UTC."""
         return datetime.now(UTC)
 
     def sleep(self, seconds: float) -> None:

@@ -14,12 +14,10 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from flows.schedule.due_runs import Tell
+from flows.schedule.due_runs import ScheduleNews, Tell, send_notice, together
 from flows.schedule.field_schedule import FieldSchedule, moment_words, read_moment
-from flows.schedule.notices import ScheduleNews, send_notice, together
 from flows.schedule.rig_lock import RigLock
 from flows.schedule.served import ServedField, ServeRequest
-from flows.schedule.times import Timetable
 from storage.archive.staging import take_lock
 
 LIMIT = "rig"  # a Prefect concurrency limit that shows who waits; the kernel's lock decides
@@ -109,7 +107,6 @@ class FlowRuns:
                 client.set_flow_run_state(run.id, Cancelled(name=SKIPPED, message=why))
 
     def _waiting(self, client: Any) -> dict[datetime, list[Any]]:
-        """Flow runs of the field that have not begun, by the due times that they were made for."""
         from prefect.client.schemas.filters import DeploymentFilter, DeploymentFilterName
 
         named = DeploymentFilter(name=DeploymentFilterName(any_=[self.name]))
@@ -155,10 +152,7 @@ class Watcher:
                 self._alone(one, lambda one=one: self._reap_prefect(one))  # type: ignore[misc]
 
     def tell_news(self) -> None:
-        """Tell how runs ended since the last time, a line each, and give notice where an address was given.
-
-        Of all that ended alike in a field there is one notice.
-        """
+        """Tell how runs ended since the last time, a line each; one notice for all that ended alike in a field."""
         archives, fresh = {one.name: one.settings.out for one in self.request.fields}, self.news.fresh()
         for outcome in fresh:
             self.tell(outcome.words())
@@ -215,10 +209,7 @@ class Watcher:
         return looking == len(rigs) or looking + reprocessing >= self.request.limit
 
     def look(self) -> bool:
-        """Once over all fields: what is too late or dead is accounted for, and Prefect has a run of each due time.
-
-        False where Prefect does not know of a field yet.
-        """
+        """Account for what is too late or dead, plan due times in Prefect; False where it does not know a field yet."""
         for one in self.request.fields:
             with self._errors(one.name):
                 self._look_at(one, self.schedules[one.name])
@@ -229,7 +220,9 @@ class Watcher:
         free = self._alone(one, lambda: resumed.extend(schedule.reap(self._why)))
         waiting = schedule.pending(None if free else f"the rig was in use by {one.lock().holder()}")
         state, now = schedule.state(), schedule.clock.now()
-        wanted = dict.fromkeys((*waiting, *_ahead(schedule.timetable, now)), 0)
+        coming = enumerate(islice(schedule.timetable.due_after(now), MOST_AHEAD))
+        ahead = (due for number, due in coming if number < LEAST_AHEAD or due - now <= AHEAD)
+        wanted = dict.fromkeys((*waiting, *ahead), 0)
         wanted |= {due: len(state.begun.get(due, ())) for due in resumed}
         self._note(one.name, wanted, now)
         cancelled: list[datetime] = []
@@ -297,17 +290,8 @@ class Watcher:
             self.tell(f"{what}: {error}")
 
 
-def _ahead(timetable: Timetable, now: datetime) -> list[datetime]:
-    """The next due times: those of the next minute, and a few more for people to see."""
-    coming = islice(timetable.due_after(now), MOST_AHEAD)
-    return [due for number, due in enumerate(coming) if number < LEAST_AHEAD or due - now <= AHEAD]
-
-
 def reap_flow_runs(client: Any, field: str | None, archive: str | None) -> list[str]:
-    """Set flow runs that Prefect believes alive to Crashed; only for whoever holds their lock. Gives their names.
-
-    Of the survey of ``field``, or of the reprocessing of ``archive``.
-    """
+    """Crash runs that Prefect believes alive, of a field or an archive whose lock is held here; gives their names."""
     from prefect.states import Crashed
 
     flow, parameter, value = ("reprocess", "archive", archive) if field is None else ("survey", "field", field)

@@ -10,7 +10,7 @@ import textwrap
 from collections.abc import Iterator
 from dataclasses import MISSING
 
-from flows.settings.declared import SURVEY, TABLES, Declared
+from flows.settings.load import SURVEY, TABLES, Declared
 
 WIDTH = 120
 COLUMN = 38  # where the words of a line of the example begin

@@ -170,7 +170,6 @@ class Settings:
 
     @property
     def crew(self) -> Crew:
-        """Who does the work that is cut into blocks."""
         return Crew(self.scheduler, self.workers)
 
     @property

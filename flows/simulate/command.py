@@ -15,17 +15,16 @@ from rich.markup import escape
 from flows.publish.receipt_table import print_effects
 from flows.settings.survey_settings import Settings
 from flows.simulate.effect_comparison import Comparison, compare_with_everything
-from flows.survey.capture_plan import lay_out_sweeps
-from flows.survey.run import CaptureRun, make_source
-from flows.survey.scene import farm_refusal, open_scene
-from flows.survey.sources import SimulatedField
+from flows.survey.run import CaptureRun, lay_out_sweeps, make_source
+from flows.survey.scene import SimulatedField, farm_refusal, open_scene
 from flows.survey.stage import Stage, Wanted
 from flows.survey.stages.capture import capture_coarse, sweeps_wanted
 from flows.survey.stages.effects import choose_effects, load_manifest
 from flows.terminal.figures import format_bytes, format_seconds
+from flows.terminal.processes import writing
 from flows.terminal.progress import StageProgress
 from models.network.process import keep_freed_memory, use_one_thread
-from pipeline.errors import ArchiveError, SceneError, SettingsError
+from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.selection.choice import UNIT_WORDS
@@ -54,7 +53,6 @@ class _Maker:
         return ref
 
     def watching(self, name: str) -> CaptureRun:
-        """The run, whose reports are of this stage."""
         return replace(self.run, report=lambda done: self.progress.show(name, done))
 
 
@@ -63,12 +61,9 @@ def run_simulate(
 ) -> dict[str, Any]:
     """Scan a scene into an archive, with progress on ``console``; give the record that --json prints.
 
-    With a ``picture`` (PNG) the scan is held against one with everything on.
-
-    Raises
-    ------
-    BoundError : what would be left out changes the worst part of the scene by more than its bound says.
-    SettingsError, SceneError, ArchiveError : what was asked for cannot be.
+    With a ``picture`` (PNG) the scan is held against one with everything on. Raises BoundError: what would be left out
+    changes the worst part of the scene by more than its bound says; SettingsError, SceneError, ArchiveError: what was
+    asked for cannot be.
     """
     if picture is not None:
         _check_picture(picture)
@@ -78,7 +73,7 @@ def run_simulate(
         run, sweeps, notes = open_simulation(settings, coarse=coarse)
         run.archive.reclaim()  # what a killed scan left half made
     for note in notes:
-        console.print(f"[dim]note: {escape(note)}[/]", highlight=False)
+        console.print(f"[dim]note: {escape(note)}[/]")
     with run.archive.in_use(), StageProgress(console, TITLES) as progress:
         make = _Maker(run, progress)
         effects = make("effects", choose_effects, choose_effects.needed(make.watching("effects")))
@@ -88,7 +83,7 @@ def run_simulate(
         if picture is not None:
 
             def say(words: str) -> None:
-                console.print(f"[dim]everything on, exact: {escape(words)}[/]", highlight=False)
+                console.print(f"[dim]everything on, exact: {escape(words)}[/]")
 
             progress.show("comparison", 0.0)
             found = compare_with_everything(make.watching("comparison"), sweeps, effects, say)
@@ -96,7 +91,10 @@ def run_simulate(
     _print(record, console)
     if picture is None or found is None:
         return record
-    _draw(picture, found, settings)
+    from flows.simulate.effect_picture import Words, draw_comparison  # matplotlib
+
+    with writing(picture, "--compare"):
+        draw_comparison(picture, found, Words(f"{Path(settings.scene).stem}, seed {settings.seed}", settings.effects))
     _print_comparison(found, picture, console)
     return record | {"comparison": {**found.record(), "picture": str(picture)}}
 
@@ -107,27 +105,11 @@ def _check_picture(path: Path) -> None:
         raise SettingsError(f"--compare writes a PNG, got {path}; name a file that ends with .png")
     if path.is_dir():
         raise SettingsError(f"--compare {path} is a folder; name a file in it, such as {path / 'difference.png'}")
-    try:
+    with writing(path, "--compare"):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("ab"):
-            pass
-    except OSError as error:
-        raise _unwritable(path, error) from error
+        path.open("ab").close()
     if not path.stat().st_size:
         path.unlink()
-
-
-def _unwritable(path: Path, error: OSError) -> ArchiveError:
-    return ArchiveError(f"cannot write to {path}: {error.strerror}; choose another --compare")
-
-
-def _draw(path: Path, found: Comparison, settings: Settings) -> None:
-    from flows.simulate.effect_picture import Words, draw_comparison  # matplotlib
-
-    try:
-        draw_comparison(path, found, Words(f"{Path(settings.scene).stem}, seed {settings.seed}", settings.effects))
-    except OSError as error:
-        raise _unwritable(path, error) from error
 
 
 def open_simulation(settings: Settings, *, coarse: bool = False) -> tuple[CaptureRun, list[Sweep], tuple[str, ...]]:
@@ -193,11 +175,10 @@ def _print(record: Mapping[str, Any], console: Console) -> None:
     print_effects(record["effects"], record["effects_total"], console)
     done = "already there" if record["cached"] else f"{format_seconds(record['cpu_s'])} of CPU"
     console.print(
-        f"{record['lines']} lines in {record['sweeps']} sweeps: {done}, {format_bytes(record['bytes_stored'])} stored",
-        highlight=False,
+        f"{record['lines']} lines in {record['sweeps']} sweeps: {done}, {format_bytes(record['bytes_stored'])} stored"
     )
     for name in record["cubes"]:
-        console.print(f"  {escape(str(Path(record['path']) / Path(name).name))}", highlight=False, soft_wrap=True)
+        console.print(f"  {escape(str(Path(record['path']) / Path(name).name))}", soft_wrap=True)
 
 
 def _print_comparison(found: Comparison, picture: Path, console: Console) -> None:
@@ -207,7 +188,6 @@ def _print_comparison(found: Comparison, picture: Path, console: Console) -> Non
     console.print(
         f"Everything on, exact, takes {format_seconds(found.exact_cpu_s)} of CPU for {which} lines, these effects"
         f" {format_seconds(found.cpu_s)}: {found.ratio:.1f} times less. Light differs by {found.measured:.2g} {unit}"
-        f" at most ({bound}).",
-        highlight=False,
+        f" at most ({bound})."
     )
-    console.print(f"  {escape(str(picture))}", highlight=False, soft_wrap=True)
+    console.print(f"  {escape(str(picture))}", soft_wrap=True)

@@ -85,11 +85,9 @@ class Comparison:
 
     @property
     def ratio(self) -> float:
-        """How many times less processor time the effects chosen take."""
         return self.exact_cpu_s / self.cpu_s if self.cpu_s else float("nan")
 
     def record(self) -> dict[str, Any]:
-        """Give the figures as plain values."""
         figures = {name: getattr(self, name) for name in self.__dataclass_fields__ if name not in ("view", "place")}
         return {**figures, "ratio": self.ratio, "place": asdict(self.place)}
 
@@ -130,12 +128,7 @@ def everything(effects: StageRef) -> dict[Effect, str]:
 def compare_with_everything(
     run: CaptureRun, sweeps: Sequence[Sweep], effects: StageRef, say: Callable[[str], None]
 ) -> Comparison:
-    """Take lines of a scan with the effects chosen and with everything on, exact; ``say`` is told how many, and why.
-
-    Raises
-    ------
-    BoundError : expected light differs by more than the bound of the decision; names the place.
-    """
+    """Take lines both ways; ``say`` is told how many. BoundError, with the place: light differs beyond the bound."""
     clock = sweep_starts(sweeps, run.camera, run.settings.cost)
     chosen = source_with(run.simulated, effects, clock)
     total = load_manifest(effects)["total"]
@@ -152,7 +145,13 @@ def compare_with_everything(
         ways.add(sweep, lines, sums)
         run.report((number + 1) / (len(taken) + 1))
     found = _compared(run, ways, sums, taken, blocks, effects)
-    _check(found, sums)
+    if found.bound is not None and sums.unexplained > found.bound:
+        place = found.place
+        raise BoundError(
+            f"against everything on, light differs by {found.measured:.3g} {UNIT_WORDS[found.unit]} at sweep "
+            f"{place.sweep}, line {place.line}, sample {place.sample}, band {place.band}, above the bound of "
+            f"{found.bound:.3g}; simulate with --tol 0 or --effects all, and please report it with the rig's settings"
+        )
     run.report(1.0)
     return found
 
@@ -200,7 +199,6 @@ class _Ways:
     bound: float
 
     def take(self, sweep: Sweep, lines: range) -> _Both:
-        """Render some lines both ways."""
         light, shown, raw, exact_s = _taken(self.exact, self.exact.block(sweep, lines))
         block = self.chosen.block(sweep, lines)
         _, other, other_raw, chosen_s = _taken(self.chosen, block)
@@ -218,7 +216,6 @@ class _Ways:
         return unit_at(both.exact, self.exact.rig, self.unit, sweep.binning)
 
     def add(self, sweep: Sweep, lines: range, sums: _ChangeSums) -> None:
-        """Take some lines both ways and add up how they differ."""
         both = self.take(sweep, lines)
         change = self.change(both, sweep)
         sums.exact_cpu_s += both.exact_cpu_s
@@ -277,7 +274,6 @@ def _compared(
 
 
 def _view(run: CaptureRun, ways: _Ways, sweep: Sweep, place: ViewPlace) -> View:
-    """Take the lines about a place once more and keep what a picture shows of them."""
     binning, camera = sweep.binning, run.camera
     lines = _about(place.line, VIEW_PX // sweep.step, sweep.lines)
     samples = _about(place.sample // binning, VIEW_PX // binning, camera.samples // binning)
@@ -304,14 +300,3 @@ def _about(middle: int, count: int, most: int) -> range:
     count = min(count, most)
     first = max(0, min(middle - count // 2, most - count))
     return range(first, first + count)
-
-
-def _check(found: Comparison, sums: _ChangeSums) -> None:
-    if found.bound is None or sums.unexplained <= found.bound:
-        return
-    place = found.place
-    raise BoundError(
-        f"against everything on, light differs by {found.measured:.3g} {UNIT_WORDS[found.unit]} at sweep {place.sweep},"
-        f" line {place.line}, sample {place.sample}, band {place.band}, above the bound of {found.bound:.3g}; simulate"
-        " with --tol 0 or --effects all, and please report it with the rig's settings"
-    )

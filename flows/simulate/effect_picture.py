@@ -10,14 +10,13 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
-from flows.publish.panels import INK, MUTED
+from flows.publish.panels import INK, MUTED, STYLE, save_png
 from flows.simulate.effect_comparison import Comparison, View
 from flows.terminal.figures import format_count, format_seconds
 from pipeline.simulator.effects.probe import Unit
@@ -31,17 +30,6 @@ _MARGIN_IN, _HEAD_IN, _CAPTION_IN, _FOOT_IN = 0.4, 0.82, 0.92, 0.98
 _LETTERS_IN = 13.4  # of the smallest words, on an inch
 _TITLE: Any = {"loc": "left", "size": 15, "weight": "bold", "pad": 30}
 _LINEAR = 0.01  # of the range, below which colours are even; beyond by its logarithm
-_STYLE: Any = {
-    "font.size": 12,
-    "text.parse_math": False,
-    "font.family": "DejaVu Sans",
-    "axes.edgecolor": "#b8b8b0",
-    "axes.linewidth": 0.8,
-    "text.color": INK,
-    "axes.labelcolor": INK,
-    "figure.facecolor": "#fbfaf7",
-    "savefig.facecolor": "#fbfaf7",
-}
 
 
 @dataclass(frozen=True)
@@ -53,16 +41,9 @@ class Words:
 
 
 def draw_comparison(path: str | Path, found: Comparison, words: Words) -> None:
-    """Draw the three panels as a PNG, 1600 px wide.
-
-    Raises
-    ------
-    OSError : the file cannot be written.
-    """
-    with mpl.rc_context(_STYLE):
-        figure = _compose(found, words)
-        FigureCanvasAgg(figure)
-        figure.savefig(path, format="png", dpi=_DPI, pil_kwargs={"optimize": True})
+    """Draw the three panels as a PNG, 1600 px wide. Raises OSError: the file cannot be written."""
+    with mpl.rc_context(STYLE):
+        save_png(_compose(found, words), path, dpi=_DPI, pil_kwargs={"optimize": True})
 
 
 def _compose(found: Comparison, words: Words) -> Figure:
@@ -100,7 +81,6 @@ def _compose(found: Comparison, words: Words) -> Figure:
 
 
 def _draw_lines(axes: Axes, image: NDArray[np.float32], view: View) -> None:
-    """Three bands of raw lines, one scale for both panels."""
     tones = stretch(image) if view.bands.startswith("grey") else develop(image, view.exact)
     axes.imshow(tones, interpolation="nearest", aspect="auto", extent=_extent(view))
     axes.set(xticks=[], yticks=[])
@@ -149,7 +129,6 @@ def _caption(axes: Axes, title: str, words: str) -> None:
 
 
 def _draw_key(figure: Figure, axes: Axes, image: AxesImage, found: Comparison) -> None:
-    """The colour bar below the difference, from minus to plus the tolerance."""
     box = axes.get_position()
     height = figure.get_figheight()
     place = figure.add_axes((box.x0, box.y0 - 0.3 / height, box.width, 0.16 / height))
@@ -164,7 +143,6 @@ def _draw_key(figure: Figure, axes: Axes, image: AxesImage, found: Comparison) -
 
 
 def _draw_foot(figure: Figure, found: Comparison, page: float) -> None:
-    """What was left out, what becomes of the raw numbers, and where the view is."""
     view = found.view
     lines, samples = view.lines, view.samples
     shown = (

@@ -12,6 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from flows.settings.load import load_settings
+from flows.terminal.processes import DONE, FAILED, PARTLY
 from flows.terminal.progress import on_stdout, print_json
 from pipeline.errors import SettingsError
 from pipeline.geometry.scan import CostModel
@@ -21,7 +22,6 @@ from pipeline.rig.emulator.fault_names import fault_table
 from pipeline.rig.mirror.mirror_controller import open_mirror
 from pipeline.rig.rig_check import CheckRow, Device, check_camera, check_mirror, works
 
-DONE, FAILED, PARTLY = 0, 1, 3
 LIST = "list"
 _COLOURS = {"ok": "green", "warn": "yellow", "fail": "bold red"}
 
@@ -51,12 +51,7 @@ class CheckRequest:
 
 
 def check_request(settings: Path | None, port: str | None, camera: str | None, *, move: bool = False) -> CheckRequest:
-    """Say what to check: both devices of the settings, or those that are named where there are none.
-
-    Raises
-    ------
-    SettingsError : the settings, or the camera's address, cannot be used.
-    """
+    """What to check: both devices of the settings, or those that are named (SettingsError: they cannot be used)."""
     wanted = load_settings(settings)
     rig = wanted.rig
     if port is not None:
@@ -107,9 +102,9 @@ def _print(rows: Sequence[CheckRow], console: Console) -> None:
     mend = [row for row in rows if row.mend]
     for row in mend:
         say = f"[{_COLOURS[row.verdict]}]{row.verdict}[/] {row.device}, {escape(row.asked)}: {escape(row.mend)}"
-        console.print(say, highlight=False, soft_wrap=True)
+        console.print(say, soft_wrap=True)
     if not mend:
-        console.print("nothing to mend", highlight=False)
+        console.print("nothing to mend")
 
 
 def _at(rig: SurveyRig, camera: str) -> SurveyRig:

@@ -43,12 +43,7 @@ class EmulateRequest:
     out: Path | None = None  # a survey's TOML to write
 
     def check(self) -> None:
-        """Refuse what cannot be, before minutes are spent on the scene.
-
-        Raises
-        ------
-        SettingsError : a fault, a speed or a file that cannot be.
-        """
+        """Refuse a fault, a speed or a file that cannot be (SettingsError), before minutes are spent on the scene."""
         read_faults(self.faults)
         FastClock(self.speed)
         if self.baud < 0:
@@ -58,12 +53,7 @@ class EmulateRequest:
 
 
 def emulated_settings(path: Path | None, flags: Mapping[str, object]) -> Settings:
-    """Read the settings of what is emulated; a built-in scene is small where nothing says how large.
-
-    Raises
-    ------
-    SettingsError : a key or a flag cannot be used.
-    """
+    """Settings of what is emulated (SettingsError: one cannot be used); a built-in scene is small unless told."""
     wanted = load_settings(path, flags)
     small = wanted.scene in BUILT_IN_SCENES and wanted.size is None
     return replace(wanted, size=USUAL_SIZE) if small else wanted
@@ -72,18 +62,13 @@ def emulated_settings(path: Path | None, flags: Mapping[str, object]) -> Setting
 def run_emulate(
     request: EmulateRequest, console: Console, *, as_json: bool = False, ended: threading.Event | None = None
 ) -> int:
-    """Emulate a rig until Ctrl-C, a SIGTERM or ``ended``; how to connect goes to stdout, its state to ``console``.
-
-    Raises
-    ------
-    PipelineError : what was asked for cannot be.
-    """
+    """Emulate a rig until Ctrl-C, SIGTERM or ``ended``; how to connect goes to stdout, its state to ``console``."""
     request.check()
     mirror_faults, camera_faults = read_faults(request.faults)
     with console.status("drawing the scene"):
         source, notes = emulated_source(request.settings)
     for note in notes:
-        console.print(f"[dim]note: {escape(note)}[/]", highlight=False)
+        console.print(f"[dim]note: {escape(note)}[/]")
     rig = EmulatedRig(
         source,
         FastClock(request.speed),
@@ -97,7 +82,7 @@ def run_emulate(
         with console.status(_state(rig)) as line:
             while not end.wait(EVERY_S):
                 line.update(_state(rig))
-        console.print(f"closed: {_state(rig)}", highlight=False, soft_wrap=True)
+        console.print(f"closed: {_state(rig)}", soft_wrap=True)
     return 0
 
 
@@ -105,21 +90,31 @@ def _tell(request: EmulateRequest, served: ServedRig, console: Console, *, as_js
     table = _rig_table(served, request.settings.rig)
     if request.out is not None:
         try:
-            request.out.write_text(_survey_toml(request.settings, table), encoding="utf-8")
+            settings = request.settings
+            size = None if settings.size is None else f"{settings.size[0]}x{settings.size[1]}"
+            names = ("scene", "size", "day", "hour", "bands", "wavelengths", "seed", "effects", "tol", "source")
+            wanted = {name: getattr(settings, name) for name in names}
+            wanted |= {"size": size, "tol": str(settings.tol), "source": "rig"}
+            given = [f"{key} = {_toml_value(value)}" for key, value in wanted.items() if value is not None]
+            request.out.write_text(
+                "\n".join(
+                    ["# A survey of an emulated rig, for as long as that runs.", *given, "", _toml_table("rig", table)]
+                ),
+                encoding="utf-8",
+            )
         except OSError as error:
             raise SettingsError(f"cannot write {request.out}: {error.strerror}; choose another --out") from error
-        console.print(f"survey it with: spectralzoom survey {escape(str(request.out))}", highlight=False)
+        console.print(f"survey it with: spectralzoom survey {escape(str(request.out))}")
     if as_json:
         faults = list(request.faults)
         print_json({"rig": table, "speed": request.speed, "faults": faults, "toml": request.out and str(request.out)})
     else:
         sys.stdout.write(f"{_toml_table('rig', table)}\n")
     sys.stdout.flush()
-    console.print("emulating a rig; Ctrl-C ends it", highlight=False)
+    console.print("emulating a rig; Ctrl-C ends it")
 
 
 def _rig_table(served: ServedRig, rig: SurveyRig) -> dict[str, object]:
-    """How to reach it, and how the mirror is mounted, where that is not straight."""
     panel = served.rig.camera.view.source.scene.panel
     mounted = ("mirror_axes", "mirror_clocking_deg", "mirror_offset_x", "mirror_offset_y")
     return {
@@ -132,18 +127,6 @@ def _rig_table(served: ServedRig, rig: SurveyRig) -> dict[str, object]:
         "provenance": "emulated",
         **{name: getattr(rig, name) for name in mounted if rig.mounting != STRAIGHT},
     }
-
-
-def _survey_toml(settings: Settings, table: dict[str, object]) -> str:
-    """A survey of the emulated rig: the scene says how large the field is, and what is true there."""
-    size = None if settings.size is None else f"{settings.size[0]}x{settings.size[1]}"
-    names = ("scene", "size", "day", "hour", "bands", "wavelengths", "seed", "effects", "tol", "source")
-    wanted = {name: getattr(settings, name) for name in names}
-    wanted |= {"size": size, "tol": str(settings.tol), "source": "rig"}
-    given = [f"{key} = {_toml_value(value)}" for key, value in wanted.items() if value is not None]
-    return "\n".join(
-        ["# A survey of an emulated rig, for as long as that runs.", *given, "", _toml_table("rig", table)]
-    )
 
 
 def _toml_table(name: str, values: dict[str, object]) -> str:
@@ -166,7 +149,6 @@ def _state(rig: EmulatedRig) -> str:
 
 @contextmanager
 def _ending(event: threading.Event) -> Iterator[threading.Event]:
-    """Set an event at Ctrl-C and SIGTERM, instead of breaking off."""
     if threading.current_thread() is not threading.main_thread():
         yield event
         return
@@ -179,12 +161,7 @@ def _ending(event: threading.Event) -> Iterator[threading.Event]:
 
 
 def emulated_source(settings: Settings) -> tuple[SimulatedSource, tuple[str, ...]]:
-    """Give the scene through the simulated rig, and what was assumed of it. Nothing is kept.
-
-    Raises
-    ------
-    PipelineError : the scene or the effects cannot be used.
-    """
+    """The scene through the simulated rig, and what was assumed of it (PipelineError); nothing is kept."""
     with tempfile.TemporaryDirectory(prefix="spectralzoom-") as folder:
         apart = replace(settings, source="sim", out=str(Path(folder) / "effects"))
         run, _, notes = open_simulation(apart)

@@ -130,20 +130,13 @@ def seat_columns(
         part = slice(kept, kept := kept + int(some.sum()))
         seats[part] = numbers[entries][some]
         columns[part] = weights.columns(values[some], wavelength_nm)
-        _fill_unseen(columns[part], seats[part], reached[some], seen)
+        pixel = np.arange(p)
+        for patch, seat, there in zip(columns[part], seats[part], reached[some], strict=True):
+            if not there.all():  # where no line reached a pixel of a seat
+                y, x = seen.grid.seat_origin(seat)[..., None] + pixel
+                coarse = seen.columns[np.ix_(y // seen.grid.factor, x // seen.grid.factor)]
+                patch[~there] = coarse[~there]
     return seats[:kept], columns[:kept]
-
-
-def _fill_unseen(
-    columns: NDArray[np.float32], seats: NDArray[np.int64], reached: NDArray[np.bool_], seen: CoarseLook
-) -> None:
-    """Put the columns of the coarse look, in place, where no line reached a pixel of a seat."""
-    pixel = np.arange(seen.grid.patch)
-    for patch, seat, there in zip(columns, seats, reached, strict=True):
-        if not there.all():
-            y, x = seen.grid.seat_origin(seat)[..., None] + pixel
-            coarse = seen.columns[np.ix_(y // seen.grid.factor, x // seen.grid.factor)]
-            patch[~there] = coarse[~there]
 
 
 SHARD = (SHARD_ROWS, SHARD_COLUMNS)
@@ -174,11 +167,8 @@ class FieldWork:
     def score(self, policy: str, mosaic: Path, report: Callable[[float], None]) -> NDArray[np.float64]:
         """Score every seat of the padded grid by the coarse mosaic alone, (seat_y, seat_x).
 
-        A policy that sees the image as a whole gets the field as one region, whatever its size.
-
-        Raises
-        ------
-        SettingsError : not even one region at a time, or not the whole image that such a policy needs, fits the memory.
+        A policy that sees the image as a whole gets the field as one region, whatever its size. Raises SettingsError:
+        not even one region at a time, or not the whole image that such a policy needs, fits the memory.
         """
         if policy in IMAGE_POLICIES:
             return self._score_image(policy, mosaic.resolve(), report)
@@ -212,11 +202,8 @@ class FieldWork:
     def draw(self, mosaic: Path, patches: Path, out: Path, report: Callable[[float], None]) -> Strange:
         """Draw the class map into the store that was created at ``out``; count pixels that were left out.
 
-        These are the coarse pixels, and the fine ones, with a value that the weights take for no reading.
-
-        Raises
-        ------
-        SettingsError : not even one region at a time fits the memory.
+        These are the coarse pixels, and the fine ones, with a value that the weights take for no reading. Raises
+        SettingsError: not even one region at a time fits the memory.
         """
         store = open_patches(patches)
         crew = self.crew_for(store.seats, len(store.wavelength_nm))
@@ -227,11 +214,8 @@ class FieldWork:
     def crew_for(self, seats: NDArray[np.integer], bands: int, *, beside: int = 0) -> Crew:
         """Give the crew, no larger than memory holds regions with their parts of these seats of the field.
 
-        ``beside`` each region lie so many bytes more.
-
-        Raises
-        ------
-        SettingsError : not even one region at a time fits the memory; names the least that does.
+        ``beside`` each region lie so many bytes more. Raises SettingsError: not even one region at a time fits the
+        memory; names the least that does.
         """
         if self.crew.elsewhere:
             return self.crew

@@ -45,11 +45,8 @@ def survey_with_prefect(runner: StageRunner, finish: Callable[[Step, Products], 
     """Run the survey as a Prefect flow on an ephemeral server, or on the one that PREFECT_API_URL names.
 
     ``finish`` is called in the flow once the map is drawn, with what runs a stage as a task; what it gives is given.
-
-    Raises
-    ------
-    EngineUnavailable : the server did not start; nothing of the survey has run.
-    PipelineError : from a stage, as with the plain engine.
+    Raises EngineUnavailable: the server did not start; nothing of the survey has run; PipelineError: from a stage, as
+    with the plain engine.
     """
     if inside_flow():
         step = _task_step(runner)
@@ -109,7 +106,8 @@ def _task_step(runner: StageRunner) -> Step:
             persist_result=False,
             retries=STAGES[name].retries,
             retry_delay_seconds=RETRY_DELAY_S,
-            retry_condition_fn=_may_help,
+            # a device or disk may answer the second time; wrong input will not
+            retry_condition_fn=lambda task, run, state: isinstance(state.result(raise_on_failure=False), OSError),
         )(stage)
         found = one(name, {ref.uri: ref.key for ref in inputs}, before)
         if found is None:
@@ -166,11 +164,6 @@ def _stopping(stopped: list[KeyboardInterrupt]) -> Iterator[None]:
             raise
 
 
-def _may_help(task: Any, run: Any, state: Any) -> bool:
-    """A device or disk may answer the second time; wrong input will not."""
-    return isinstance(state.result(raise_on_failure=False), OSError)
-
-
 @contextmanager
 def _guarded_server() -> Iterator[None]:
     """Let a server started meanwhile end with this process, also when it is killed: Prefect ends it at exit alone."""
@@ -198,10 +191,7 @@ def _guarded_server() -> Iterator[None]:
 
 @contextmanager
 def _prefect_home(archive: Path) -> Iterator[None]:
-    """Keep Prefect's own files in the archive; a second survey of it at the same time takes a home of its own.
-
-    A server that PREFECT_API_URL names, and a PREFECT_HOME of the user's, are left as they are.
-    """
+    """Keep Prefect's files in the archive (a second survey: a home of its own); a user's server and home are left."""
     home = archive / ".prefect"
     release = take_lock(archive / ".locks" / "prefect.lock", wait=False)
     if release is None:

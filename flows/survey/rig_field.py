@@ -52,13 +52,7 @@ class RigField:
 
 
 def rig_field(scene: RasterScene, settings: Settings, planned: Sequence[Sweep]) -> RigField:
-    """Give the rig; nothing is connected before its first line.
-
-    Raises
-    ------
-    SettingsError : exposure and frame period are nothing that the camera takes.
-    PoseError : the mirror, as mounted, does not reach all of the planned sweeps.
-    """
+    """The rig, not yet connected; SettingsError: times the camera does not take, PoseError: beyond the mirror."""
     camera, rig = settings.camera, settings.rig
     check_times(camera.exposure_ms, camera.frame_ms, CameraLimits(most_rate_hz=camera.max_rate_hz))
     if rig.mounting != STRAIGHT:
@@ -79,10 +73,8 @@ def rig_field(scene: RasterScene, settings: Settings, planned: Sequence[Sweep]) 
 def open_devices(settings: Settings, clock: Clock = SYSTEM_CLOCK) -> RigDevices:
     """Connect to mirror and camera; nothing moves.
 
-    Raises
-    ------
-    DeviceGone : no such port, in use, not permitted, or the camera is not there. DeadlinePassed : nothing answers.
-    RigError : another device does.
+    Raises DeviceGone: no such port, in use, not permitted, or the camera is not there; DeadlinePassed: nothing answers;
+    RigError: another device does.
     """
     rig = settings.rig
     mirror = open_mirror(rig.mirror(settings.cost.vector_pairs), clock, known=True)

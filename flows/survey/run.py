@@ -1,10 +1,10 @@
-"""One survey's context: scene, source, weights, grid and archive, opened and checked before anything runs."""
+"""One survey's context: scene, source, weights, grid, plan of captures and archive, checked before anything runs."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
@@ -14,9 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
-from flows.survey.capture_plan import CapturePlan, check_memory, plan_capture
-from flows.survey.scene import check_labels, check_mask, farm_refusal, judged_labels, open_scene
-from flows.survey.sources import FieldSource, field_source, for_rig
+from flows.survey.scene import (
+    FieldSource,
+    check_labels,
+    check_mask,
+    farm_refusal,
+    field_source,
+    for_rig,
+    judged_labels,
+    open_scene,
+)
 from models.policies.vgg_file import VggFile
 from models.weights.files import (
     Description,
@@ -30,19 +37,104 @@ from models.weights.files import (
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import Sweep
+from pipeline.geometry.scan import Axis, Sweep
 from pipeline.ground.map_grid import ground_grid
 from pipeline.ground.view import GroundView
 from pipeline.lazy import Once
+from pipeline.planning.coverage import cheapest_full, coarse_sweeps, with_margin
+from pipeline.planning.prices import check_budget
+from pipeline.rectify.placed import PixelGrid, place
+from pipeline.rectify.region import plan_tiles
+from pipeline.rectify.registration.overlaps import LEAST_OVERLAP_PX
 from pipeline.simulator.effects.pointing import PointingErrors
 from pipeline.simulator.scenes.scene import RasterScene
-from pipeline.simulator.simulated import SimulatedSource
+from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
+from pipeline.source import References
 from storage.archive.archive import Archive
-from storage.arrays.layout import AngularGrid
+from storage.arrays.layout import AngularGrid, image_spec
+from storage.arrays.tile_work import MosaicWork, tile_budget
 from storage.readers.raster_files import load_raster
 from storage.remote.opening import open_archive
 
-SHIPPED = "farm.safetensors"
+
+@dataclass(frozen=True)
+class CapturePlan:
+    """What every survey of this field has in common: orientation, coarse and full sweeps, and their seconds."""
+
+    along: Axis
+    coarse: list[Sweep]
+    full: list[Sweep]
+    coarse_s: float
+    full_s: float
+    fine_s: float  # left by the budget for the fine pass
+    overlap_px: float  # of neighbouring coarse strips, at least
+    margin_px: float  # by which sweeps begin earlier and end later
+
+
+def plan_capture(settings: Settings, grid: SceneGrid) -> CapturePlan:
+    """Lay out coarse and full sweeps; where the mirror may look beside the plan, with overlaps and margins.
+
+    Either pass overlaps by what its own registration needs. Its map lies as the sweep that is held does, which another
+    may lie beside by twice the mirror's error: so much earlier sweeps begin, and later they end. Raises SettingsError:
+    the mirror may be so far off that overlaps take whole lines; BudgetError: the budget does not pay for the coarse
+    pass; PoseError: the field is beyond the mirror's range.
+    """
+    camera, cost = settings.camera, settings.cost
+    along, coarse, full = lay_out_sweeps(settings, grid)
+    full_s, coarse_s = cost.seconds(full, camera), cost.seconds(coarse, camera)
+    fine_s = check_budget(settings.budget, coarse_s, full_s)
+    overlap = _overlap(settings, grid.factor)
+    return CapturePlan(along, coarse, full, coarse_s, full_s, fine_s, overlap, 2 * settings.pointing_px)
+
+
+def lay_out_sweeps(settings: Settings, grid: SceneGrid) -> tuple[Axis, list[Sweep], list[Sweep]]:
+    """Give the axis that lines lie along, the coarse sweeps, and those of the full scan.
+
+    Raises SettingsError: the mirror may be so far off that overlaps take whole lines; PoseError: the field is beyond
+    the mirror's range.
+    """
+    camera, cost, apart = settings.camera, settings.cost, 2 * settings.pointing_px
+    coarse_overlap = _overlap(settings, grid.factor)
+    along, full, _ = cheapest_full(grid, camera, cost, overlap_px=_overlap(settings, 1))
+    coarse = with_margin(coarse_sweeps(grid, camera, along, overlap_px=coarse_overlap), camera, apart)
+    return along, coarse, with_margin(full, camera, apart)
+
+
+def _overlap(settings: Settings, step: int) -> float:
+    """What neighbouring sweeps of a pass have to share, so that 64 of its pixels are left when they lie apart [px]."""
+    off, samples = settings.pointing_px, settings.camera.samples
+    if not off:
+        return 0.0
+    rest, line = LEAST_OVERLAP_PX * step, samples // step * step
+    overlap = 2 * off + rest
+    if overlap >= line:
+        raise SettingsError(
+            f"--pointing-px {off:g}: sweeps would have to overlap by {overlap:g} px (twice that, and "
+            f"{LEAST_OVERLAP_PX:.0f} pixels of {step} px), all of a line of {line} px; "
+            f"give less than {(line - rest) / 2:g}"
+        )
+    return overlap
+
+
+def check_memory(settings: Settings, source: SimulatedSource, grid: SceneGrid, plan: CapturePlan) -> None:
+    """Refuse memory for not one tile of the mosaic, before anything is captured (SettingsError, with the least)."""
+    pixels = PixelGrid.of_scene(grid, grid.factor)
+    placed = [place(_PlannedSweep(source, sweep), settings.camera) for sweep in plan.coarse]
+    rows, columns = image_spec(("y", "x"), pixels.shape, "<f4").shard or pixels.shape
+    tiles = plan_tiles(placed, settings.camera, pixels, (rows, columns))
+    work = MosaicWork(placed, settings.camera, pixels)
+    tile_budget(work, tiles, (rows, columns), memory=settings.memory, crew=replace(settings.crew, workers=1))
+
+
+class _PlannedSweep(SimulatedSweep):
+    """The path of a sweep and the size of its lines, which is all that memory depends on; no light is asked for."""
+
+    @property
+    def references(self) -> References:
+        """Frames of a detector without a fault, as the simulated one is."""
+        white = np.ones((self.source.camera.samples // self.sweep.binning, len(self.source.wavelength_nm)), np.float32)
+        return References(dark=np.zeros_like(white), white=white, panel=white[0])
+
 
 Report = Callable[[float], None]  # how far a stage is, 0..1
 
@@ -122,11 +214,8 @@ class SurveyRun(CaptureRun):
 def open_run(settings: Settings, *, planning: bool = False) -> SurveyRun:
     """Open everything that a survey needs; the archive last, so that bad input leaves no trace of itself.
 
-    With ``planning`` a scene that this machine cannot hold is no error: ``refused`` of the run says so.
-
-    Raises
-    ------
-    PipelineError : the first thing that cannot be used; see `pipeline.errors` for the kinds.
+    With ``planning`` a scene that this machine cannot hold is no error: ``refused`` of the run says so. Raises
+    PipelineError: the first thing that cannot be used; see `pipeline.errors` for the kinds.
     """
     settings = for_rig(settings)
     path = weights_path(settings)
@@ -178,10 +267,7 @@ def open_run(settings: Settings, *, planning: bool = False) -> SurveyRun:
 
 
 def make_source(scene: RasterScene, settings: Settings) -> SimulatedSource:
-    """Give the simulated rig before a scene, with no effect on: `flows.survey.stages.effects` decides on them.
-
-    Where a rig takes the lines it stands for the plan of them alone: sizes, paths and memory.
-    """
+    """The simulated rig before a scene, without effects; beside a rig it stands for the plan: sizes, paths, memory."""
     pointing = None
     if settings.source == "sim" and settings.pointing_px:
         pointing = PointingErrors(offset_px=settings.pointing_px, jitter_px=0.0, seed=settings.seed)
@@ -195,12 +281,7 @@ def _vgg_file(settings: Settings) -> VggFile | None:
 
 
 def weights_path(settings: Settings) -> Path:
-    """Where the weights of a survey lie: those that come with the house for its own scenes.
-
-    Raises
-    ------
-    SettingsError : none were given for a scene of one's own.
-    """
+    """Where a survey's weights lie; the house's own for its scenes (SettingsError: none given for one's own scene)."""
     if settings.weights is not None:
         return Path(settings.weights)
     if settings.scene not in BUILT_IN_SCENES:
@@ -208,7 +289,12 @@ def weights_path(settings: Settings) -> Path:
             f"--weights is missing: the weights that come with SpectralZoom know the built-in farm only;"
             f" train some for {settings.scene} with: spectralzoom train DATASET -o my.safetensors"
         )
-    return Path(str(resources.files("models") / "shipped" / SHIPPED))
+    return shipped_weights()
+
+
+def shipped_weights() -> Path:
+    """The weights that come with the house."""
+    return Path(str(resources.files("models") / "shipped" / "farm.safetensors"))
 
 
 def _check_bands(scene: RasterScene, weights: Description, path: Path) -> tuple[str, ...]:

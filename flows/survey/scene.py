@@ -1,9 +1,14 @@
-"""What a survey looks at: its scene, opened by the settings, with the labels and the mask that lie on its pixels."""
+"""What a survey looks at, with the labels and the mask on its pixels, and who looks: the simulator or a rig."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from datetime import UTC, timedelta
+import re
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +18,13 @@ from flows.training.data import scene_of_file, unpack_mask
 from models.weights.files import Description
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.grid import UNLABELLED
+from pipeline.geometry.scan import Sweep
 from pipeline.lazy import Once
+from pipeline.simulator.effects.effect import Effect
 from pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE, farm_scene, law_of_key
 from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
+from pipeline.simulator.simulated import SimulatedSource
+from pipeline.source import Source
 from storage.readers.cube_sources import machine_bytes
 from storage.readers.raster_files import load_raster
 from storage.readers.scene_files import load_scene_file
@@ -26,17 +35,16 @@ SAME_HOUR = 0.5  # by which true solar time is at most off mean solar time, and 
 
 
 def open_scene(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
-    """Open the settings' scene, and say what was assumed of it.
-
-    Raises
-    ------
-    SceneError, WavelengthError : the file cannot be used.
-    SettingsError : what was given does not go with a built-in scene.
-    """
+    """Open the scene, say what was assumed; SceneError, WavelengthError: its file, SettingsError: not for a farm."""
     if settings.scene == RIG_FIELD:
         return _field_before_rig(settings), ()
     if settings.scene in BUILT_IN_SCENES:
-        return _open_farm(settings), _notes_of_moment(settings)
+        for name, value in {"labels": settings.labels, "wavelengths": settings.wavelengths}.items():
+            if value is not None:
+                raise SettingsError(f"--{name} is for scene files; the scene '{settings.scene}' brings its own")
+        shape = settings.shape or FARM_SHAPE
+        farm = farm_scene(settings.seed, shape, camera=settings.camera, day=settings.day, hour=settings.hour)
+        return farm if settings.bands is None else _some_bands(farm, settings.bands), _notes_of_moment(settings)
     file = load_scene_file(
         settings.scene, labels=settings.labels, bands=settings.bands, wavelengths=settings.wavelengths
     )
@@ -50,12 +58,7 @@ def open_scene(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
 
 
 def _field_before_rig(settings: Settings) -> RasterScene:
-    """Give a field of which only size and bands are known.
-
-    Raises
-    ------
-    SettingsError : they are not given.
-    """
+    """Give a field of which only size and bands are known. Raises SettingsError: they are not given."""
     for name, value in {"size": settings.size, "wavelengths": settings.wavelengths}.items():
         if value is None:
             raise SettingsError(
@@ -76,15 +79,6 @@ def _field_before_rig(settings: Settings) -> RasterScene:
         panel=np.full(bands, settings.rig.panel, np.float32),
         wavelength_nm=np.array(settings.wavelengths, np.float64),
     )
-
-
-def _open_farm(settings: Settings) -> RasterScene:
-    for name, value in {"labels": settings.labels, "wavelengths": settings.wavelengths}.items():
-        if value is not None:
-            raise SettingsError(f"--{name} is for scene files; the scene '{settings.scene}' brings its own")
-    shape = settings.shape or FARM_SHAPE
-    farm = farm_scene(settings.seed, shape, camera=settings.camera, day=settings.day, hour=settings.hour)
-    return farm if settings.bands is None else _some_bands(farm, settings.bands)
 
 
 def _notes_of_moment(settings: Settings) -> tuple[str, ...]:
@@ -147,7 +141,14 @@ def check_labels(scene: RasterScene, weights: Description) -> tuple[str, ...]:
     missing = [name for name in scene.class_names if name not in weights.class_names]
     if missing:
         known = ", ".join(weights.class_names)
-        raise SceneError(f"the labels have the class {missing[0]!r}, the weights know {known}; use weights for these")
+        told = "use weights for these"
+        if (found := re.fullmatch(r"class_(\d+)|colour_([0-9a-f]{6})", missing[0])) is not None:  # nobody named it
+            value = found[1] or list(bytes.fromhex(found[2]))
+            told += (
+                ", or say which class each value of the label file is, in a table [classes] of the scene.toml beside "
+                f"the scene's file: {weights.class_names[0]} = {value}"
+            )
+        raise SceneError(f"the labels have the class {missing[0]!r}, the weights know {known}; {told}")
     law, learnt = law_of_key(scene.key), law_of_key(str(weights.record.get("data")))
     if None not in (law, learnt) and law != learnt:
         return (f"the weights were trained on {learnt}, the scene is of {law}: expect a poorer map",)
@@ -170,3 +171,69 @@ def judged_labels(scene: RasterScene, weights: Description) -> NDArray[np.uint8]
     if trained is not None:
         labels[unpack_mask(trained, scene.shape)] = UNLABELLED
     return labels
+
+
+class FieldSource(Protocol):
+    """Who looks at the field for a survey: the one seam between what is simulated and what is there."""
+
+    @property
+    def name(self) -> str:
+        """What the receipt calls it."""
+
+    @property
+    def simulates(self) -> bool:
+        """Whether effects are chosen for it, which then stand in what is stored of its lines."""
+
+    def key(self, field: str) -> dict[str, Any]:
+        """What its light depends on, beside scene, camera, seed, sweeps and effects."""
+
+    def saying(self, say: Callable[[str], None]) -> FieldSource:
+        """The same, telling somebody what it is at while no line comes."""
+
+    def lit(self, chosen: Mapping[Effect, str], clock: Mapping[str, float]) -> FieldSource:
+        """The same with the effects that were decided, and when sweeps start by name [s]."""
+
+    def opened(self, spool: Path) -> AbstractContextManager[Source]:
+        """What lines come from, held on to; what it keeps on the way goes beside the lines in ``spool``."""
+
+
+@dataclass(frozen=True)
+class SimulatedField:
+    """The simulated rig before a scene."""
+
+    source: SimulatedSource
+    simulates = True
+
+    @property
+    def name(self) -> str:
+        return self.source.name
+
+    def key(self, field: str) -> dict[str, Any]:
+        return {}
+
+    def saying(self, say: Callable[[str], None]) -> SimulatedField:
+        return self  # lines come all the time
+
+    def lit(self, chosen: Mapping[Effect, str], clock: Mapping[str, float]) -> SimulatedField:
+        return SimulatedField(replace(self.source, chosen=chosen, clock=clock))
+
+    def opened(self, spool: Path) -> AbstractContextManager[Source]:
+        return nullcontext(self.source)
+
+
+def field_source(
+    scene: RasterScene, settings: Settings, simulated: SimulatedSource, planned: Sequence[Sweep]
+) -> FieldSource:
+    """Give who looks, as the settings say; raises what `flows.survey.rig_field.rig_field` does."""
+    if settings.source != "rig":
+        return SimulatedField(simulated)
+    from flows.survey.rig_field import rig_field  # drivers load pyserial and scipy, which others do without
+
+    return rig_field(scene, settings, planned)
+
+
+def for_rig(settings: Settings) -> Settings:
+    """Give the settings of a survey through a rig: this look at the field has a name, and no control is simulated."""
+    if settings.source != "rig":
+        return settings
+    return replace(settings, visit=settings.visit or f"{datetime.now(UTC):%Y-%m-%d}", controls=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from flows.terminal.figures import format_count, format_points
+from flows.terminal.figures import format_count, format_points, known_number
 
 JUDGING = "evaluate"  # the stage that judges the map
 SHOWN = "of shown"  # the column of the mean by the definition of before
@@ -33,8 +33,8 @@ def score_of(receipt: Mapping[str, Any]) -> dict[str, float | None]:
     accuracy = receipt.get("accuracy")
     if not isinstance(accuracy, Mapping):
         return {"miou": None, "overall_accuracy": None}
-    miou = _number(accuracy.get("miou")) if "miou_of_shown_classes" in accuracy else _miou_of_before(accuracy)
-    return {"miou": miou, "overall_accuracy": _number(accuracy.get("overall_accuracy"))}
+    miou = known_number(accuracy.get("miou")) if "miou_of_shown_classes" in accuracy else _miou_of_before(accuracy)
+    return {"miou": miou, "overall_accuracy": known_number(accuracy.get("overall_accuracy"))}
 
 
 def _miou_of_before(accuracy: Mapping[str, Any]) -> float | None:
@@ -59,7 +59,7 @@ def judged_maps(accuracy: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
 
 def _by_class(one: Mapping[str, Any]) -> dict[str, float | None]:
     table = one.get("per_class_iou")
-    return {str(name): _number(iou) for name, iou in table.items()} if isinstance(table, Mapping) else {}
+    return {str(name): known_number(iou) for name, iou in table.items()} if isinstance(table, Mapping) else {}
 
 
 def worst_class(accuracy: Mapping[str, Any]) -> WorstClass | None:
@@ -98,7 +98,3 @@ def false_class_words(accuracy: Mapping[str, Any]) -> str:
 def definitions_differ(rows: Sequence[Mapping[str, Any]]) -> bool:
     """Whether the mean over the classes that a map shows, which was the score before, is another for any row."""
     return any(row.get("miou_of_shown_classes", row.get("miou")) != row.get("miou") for row in rows)
-
-
-def _number(value: object) -> float | None:
-    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None

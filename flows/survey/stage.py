@@ -38,14 +38,12 @@ Unit = Literal[
 
 @dataclass(frozen=True)
 class Product:
-    """What a stage stores: the folder of such stores, and the version of what is written; raise it when that changes.
-
-    ``by_weights``: the weights are one of its parameters.
-    """
+    """What a stage stores: the folder of such stores, and the version of what is written, raised when that changes."""
 
     name: str
     version: int
-    by_weights: bool = False
+    files: tuple[str, ...] = ()  # in a store, that receipts name, by their stems
+    by_weights: bool = False  # the weights are one of its parameters
 
 
 @dataclass(frozen=True)
@@ -73,6 +71,7 @@ class Stage:
     inputs: int | None  # of its stores, where another stage has the same product
     retries: int  # by Prefect, where a device or a disk failed
     judges: bool  # no part of the survey and of its cost: runs once the map is published
+    named: str | None  # what receipts call its store, or the file in it, where another stage has the same product
 
     def __call__(self, *args: Any) -> Wanted | None:
         """What the stage wants stored, for a run and the stores that it is made of."""
@@ -83,6 +82,12 @@ class Stage:
         wanted = self.wants(*args)
         assert wanted is not None, self.name
         return wanted
+
+    def addresses(self, ref: StageRef) -> dict[str, str]:
+        """Where its store lies, or the files in it, by the names in receipts: the stage's own by default."""
+        if self.named is not None or not self.product.files:
+            return {self.named or self.name: "/".join((ref.uri, *self.product.files))}
+        return {Path(file).stem: f"{ref.uri}/{file}" for file in self.product.files}
 
     def key(self, wanted: Wanted) -> str:
         """The address of what is wanted: a hash of the version, the parameters and the inputs' keys."""
@@ -117,11 +122,12 @@ def stage(
     inputs: int | None = None,
     retries: int = 0,
     judges: bool = False,
+    named: str | None = None,
 ) -> Callable[[Callable[..., Wanted | None]], Stage]:
     """Make a function a stage; see `Stage` for what is said of it. Its module lies in `flows.survey.stages`."""
 
     def record(wants: Callable[..., Wanted | None]) -> Stage:
-        return Stage(name, title, product, wants, of, unit, size, after, inputs, retries, judges)
+        return Stage(name, title, product, wants, of, unit, size, after, inputs, retries, judges, named)
 
     return record
 

@@ -30,7 +30,6 @@ class Products(dict[str, StageRef | None]):
     """The stores that a survey leaves, by stage; None where a stage had nothing to do."""
 
     def of(self, stage: str) -> StageRef:
-        """The store of a stage that always has something to do."""
         ref = self[stage]
         assert ref is not None, stage
         return ref
@@ -41,10 +40,7 @@ class Products(dict[str, StageRef | None]):
 
 
 def survey(step: Step) -> Products:
-    """Sweep the field coarsely, decide where detail changes the map, look there again, and draw the map.
-
-    Each stage of `STAGES` runs once those that it is made of have. How good the map is `judge` tells.
-    """
+    """Sweep coarsely, decide where detail changes the map, look there again, draw the map; `judge` says how good."""
     return _run_all(step, Products(), judging=False)
 
 
@@ -106,7 +102,6 @@ class _Meter:
         self._wall, self._cpu = time.perf_counter(), time.process_time()
 
     def read(self) -> tuple[float, float, int]:
-        """Wall seconds, CPU seconds, bytes."""
         return time.perf_counter() - self._wall, time.process_time() - self._cpu, peak_bytes()
 
 

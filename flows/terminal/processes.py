@@ -18,7 +18,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 
-from pipeline.errors import SettingsError
+from pipeline.errors import ArchiveError, SettingsError
 from storage.archive.staging import disk_advice
 
 DONE, FAILED, PARTLY = 0, 1, 3  # exit codes
@@ -72,6 +72,15 @@ def refusal_words(error: BaseException) -> str | None:
     return None
 
 
+@contextmanager
+def writing(out: Path, flag: str = "--out") -> Iterator[None]:
+    """Turn a place that cannot be written to into an error that says so (ArchiveError)."""
+    try:
+        yield
+    except OSError as error:
+        raise ArchiveError(f"cannot write to {out}: {error.strerror}; choose another {flag}") from error
+
+
 NO_HOME = "/nonexistent"  # as Debian calls the home of users that have none
 OF_LIBRARIES = {"NUMBA_CACHE_DIR": "numba", "MPLCONFIGDIR": "matplotlib"}  # those that ask for more than XDG's folder
 
@@ -81,15 +90,8 @@ def place_caches(environment: MutableMapping[str, str] | None = None) -> Path | 
 
     It is `spectralzoom-UID` in the temporary folder, so that the next process finds what this one compiled: where it
     is not ours alone, a new one that goes with this process. What is in it is run as code, so nobody else may write it.
-    ``environment`` is this process's own unless given.
-
-    Returns
-    -------
-    The folder, or None where the usual one (XDG_CACHE_HOME, or ~/.cache) can be written.
-
-    Raises
-    ------
-    SettingsError : nothing can be written, the temporary folder included.
+    ``environment`` is this process's own unless given. None where the usual one (XDG_CACHE_HOME, or ~/.cache) can be
+    written. Raises SettingsError: nothing can be written, the temporary folder included.
     """
     environment = os.environ if environment is None else environment
     try:
@@ -207,18 +209,15 @@ class KeptProcess:
         return True
 
     def runs(self) -> bool:
-        """Whether it was started and has not ended."""
         if self._process is not None and self._process.poll() is not None:
             self._forget()
         return self._process is not None
 
     def restart(self) -> None:
-        """End it and start it again; processes that it has started go on by themselves."""
         self.stop()
         self.keep_up()
 
     def stop(self) -> None:
-        """End it."""
         if self._process is not None and self.runs():
             self._process.terminate()
             try:

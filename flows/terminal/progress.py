@@ -25,7 +25,6 @@ class Terminal(Console):
     """A console on which control characters and marks of direction stand as escapes."""
 
     def render_str(self, text: str, **choices: Any) -> Text:
-        """Text of a string, before it is measured."""
         return super().render_str(visible(text), **choices)
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
@@ -36,12 +35,12 @@ class Terminal(Console):
 
 def on_stderr() -> Terminal:
     """Where progress and messages go."""
-    return Terminal(stderr=True)
+    return Terminal(stderr=True, highlight=False)
 
 
 def on_stdout() -> Terminal:
     """Where results go."""
-    return Terminal(file=sys.stdout, width=None if sys.stdout.isatty() else PIPED_WIDTH)
+    return Terminal(file=sys.stdout, highlight=False, width=None if sys.stdout.isatty() else PIPED_WIDTH)
 
 
 def print_json(content: Mapping[str, object]) -> None:
@@ -112,7 +111,7 @@ class StageProgress:
         due = time.monotonic() - self._said[stage] > LINE_EVERY_S
         if not self.console.is_terminal and (ended or due):
             self._said[stage] = time.monotonic()
-            self.console.print(f"{title}: {done:.0%} {escape(words)}".rstrip(), highlight=False, soft_wrap=True)
+            self.console.print(f"{title}: {done:.0%} {escape(words)}".rstrip(), soft_wrap=True)
 
     def watch(self, stage: str, state: str, done: float) -> None:
         """Show how far a stage of a survey is that runs, or how it ended: ran, cached, skipped, failed."""

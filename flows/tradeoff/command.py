@@ -1,20 +1,15 @@
-"""What `spectralzoom tradeoff` shows: for each stage a table (to be right to X you pay Y), JSON and a plot.
-
-Plots are of error against time, with the floors that apply: noise, half a step, memory.
-"""
+"""What `spectralzoom tradeoff` shows: tables (to be right to X you pay Y), JSON, plots of error against time."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from itertools import cycle
 from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
@@ -27,13 +22,12 @@ from rich.table import Table
 
 import flows.tradeoff.farm
 import flows.tradeoff.rectify
-import flows.tradeoff.simulate
-import flows.tradeoff.simulate_light
-import flows.tradeoff.simulate_noise  # noqa: F401 - each registers its entries
-from flows.publish.panels import INK, MUTED
+import flows.tradeoff.simulate  # noqa: F401 - each registers its entries
+from flows.publish.panels import INK, MUTED, save_png
 from flows.terminal.figures import format_seconds
+from flows.terminal.processes import writing
 from flows.tradeoff.entries import Point, Result, cheapest_within, find_tradeoffs, measure_tradeoff, registered
-from pipeline.errors import ArchiveError, SettingsError
+from pipeline.errors import SettingsError
 
 
 def print_tradeoff(result: Result, console: Console) -> None:
@@ -70,7 +64,6 @@ def _row(point: Point) -> list[str]:
 
 
 def _short(seconds: float) -> str:
-    """A time with three figures in the unit that suits it."""
     for size, unit in ((1e-3, "ms"), (1e-6, "µs"), (1e-9, "ns")):
         if size <= seconds < 1:
             return f"{seconds / size:.3g} {unit}"
@@ -102,7 +95,7 @@ def run_tradeoff(stage: str | None, out: Path, repeats: int, seed: int, console:
     if seed < 0:
         raise SettingsError(f"--seed must be 0 or more, got {seed}")
     wanted = find_tradeoffs(stage) if stage else sorted(registered().values(), key=lambda one: one.stage)
-    with _writing(out):
+    with writing(out):
         out.mkdir(parents=True, exist_ok=True)  # before minutes are spent on what cannot be kept
     results = []
     for tradeoff in wanted:
@@ -111,19 +104,11 @@ def run_tradeoff(stage: str | None, out: Path, repeats: int, seed: int, console:
         print_tradeoff(result, console)
         results.append(result)
     content = {"tradeoffs": [result.to_dict() for result in results]}
-    with _writing(out):
+    with writing(out):
         (out / "tradeoff.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
         draw_tradeoffs(out / "tradeoff.png", results)
-    console.print(f"{out / 'tradeoff.json'}\n{out / 'tradeoff.png'}", highlight=False, soft_wrap=True)
+    console.print(f"{out / 'tradeoff.json'}\n{out / 'tradeoff.png'}", soft_wrap=True)
     return content
-
-
-@contextmanager
-def _writing(out: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise ArchiveError(f"cannot write to {out}: {error.strerror}; choose another --out") from error
 
 
 _FRONT: Any = {"marker": "o", "color": "#0072B2", "markersize": 9, "label": "no other setting beats it"}
@@ -139,9 +124,7 @@ _ROOM, _RIGHT_ROOM = 0.18, 0.28  # of the range of the logarithms, beyond points
 
 def draw_tradeoffs(path: str | Path, results: Sequence[Result]) -> None:
     """Draw one panel for each trade-off into a PNG file."""
-    figure = tradeoff_figure(results)
-    FigureCanvasAgg(figure)
-    figure.savefig(path, format="png")
+    save_png(tradeoff_figure(results), path)
 
 
 def tradeoff_figure(results: Sequence[Result]) -> Figure:
@@ -240,7 +223,6 @@ def _draw_levels(axes: Axes, result: Result, places: Sequence[tuple[float, float
 
 
 def _draw_memory_floor(axes: Axes, floor: float) -> None:
-    """An upright line at the time of copying the bytes, shaded where nothing can be."""
     axes.axvspan(axes.get_xlim()[0], floor, color=_FLOOR, alpha=0.07, linewidth=0, zorder=0)
     axes.axvline(floor, color=_FLOOR, linewidth=1.1, zorder=1)
     axes.annotate(

@@ -127,7 +127,6 @@ class Point:
 
     @property
     def ns_per_unit(self) -> float:
-        """The price for one unit of work [ns]."""
         return 1e9 * self.price_s / self.work
 
 
@@ -171,6 +170,12 @@ def register(tradeoff: Tradeoff[State, Output]) -> Tradeoff[State, Output]:
     return tradeoff
 
 
+def register_all(*tradeoffs: Tradeoff[Any, Any]) -> None:
+    """Add a module's trade-offs, in the order in which a stage shows them."""
+    for one in tradeoffs:
+        register(one)
+
+
 def registered() -> dict[tuple[str, str], Tradeoff[Any, Any]]:
     """Give the trade-offs registered so far, by stage and knob."""
     return dict(_REGISTRY)
@@ -186,12 +191,7 @@ def find_tradeoffs(stage: str) -> tuple[Tradeoff[Any, Any], ...]:
 
 
 def measure_tradeoff(tradeoff: Tradeoff[State, Output], *, repeats: int = 5, seed: int = 0) -> Result:
-    """Run every setting ``repeats`` times in turn, on one thread, after one run of each that warms up and is judged.
-
-    Raises
-    ------
-    SettingsError : ``repeats`` is below 1.
-    """
+    """Judge every setting by one run, then time ``repeats`` (1 or more: SettingsError) of each in turn, one thread."""
     if repeats < 1:
         raise SettingsError(f"repeats must be at least 1, got {repeats}")
     state = tradeoff.prepare(seed)
@@ -207,7 +207,6 @@ def measure_tradeoff(tradeoff: Tradeoff[State, Output], *, repeats: int = 5, see
 
 
 def _judge(tradeoff: Tradeoff[State, Output], state: State, setting: Setting) -> Point:
-    """One setting without its times."""
     output = tradeoff.run(state, setting)
     return Point(
         setting,
@@ -219,10 +218,7 @@ def _judge(tradeoff: Tradeoff[State, Output], state: State, setting: Setting) ->
 
 
 def _time_in_turn(tradeoff: Tradeoff[State, Output], state: State, repeats: int) -> tuple[list[Clocks], float | None]:
-    """Seconds by setting and round, and the least time of copying a unit's bytes [ns].
-
-    Every round starts at another setting, with one copy of memory before it.
-    """
+    """Seconds by setting and round, each round from another setting on; least time of copying a unit's bytes [ns]."""
     count, moved = len(tradeoff.settings), tradeoff.moved_bytes
     source: NDArray[np.uint8] = np.ones(0 if moved is None else COPIED_BYTES, np.uint8)
     target, copies = np.zeros_like(source), []

@@ -4,28 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib import resources
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.survey.run import SHIPPED
+from flows.survey.run import shipped_weights
 from flows.survey.stages.accuracy import columns_of_all_seats
-from flows.tradeoff.entries import Level, Setting, Tradeoff, register
+from flows.tradeoff.entries import Level, Setting, Tradeoff, register_all
 from models.evaluation.metrics import confusion, mean_iou
 from models.network.process import keep_freed_memory
 from models.policies.policies import score_seats
-from models.reading.inference import (
-    CoarseLook,
-    DrawnMap,
-    Glance,
-    Precision,
-    glance,
-    look_coarsely,
-    read_glance,
-    segment,
-)
+from models.reading.inference import CoarseLook, DrawnMap, Glance, glance, look_coarsely, read_glance, segment
 from models.weights.files import Weights, load_weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
@@ -59,17 +48,15 @@ class FarmLook:
 
     @property
     def labels(self) -> NDArray[np.uint8]:
-        """Class of each pixel, (y, x)."""
         return np.asarray(self.scene.labels, np.uint8)
 
     def miss(self, drawn: DrawnMap) -> float:
-        """1 - mIoU of a map."""
         return 1 - mean_iou(confusion(self.labels, drawn.classes, self.weights.config.classes))
 
 
 def look_at_farm(seed: int, shape: tuple[int, int], *, noise_seed: int | None = None) -> FarmLook:
     """Sweep a farm of (y, x) px coarsely with the shipped weights at hand; ``noise_seed`` draws other noise on it."""
-    weights = load_weights(Path(str(resources.files("models") / "shipped" / SHIPPED)))
+    weights = load_weights(shipped_weights())
     camera, scene = LineCamera(), farm_scene(seed, shape)
     grid = SceneGrid(*shape, weights.config.patch, weights.config.factor)
     source = SimulatedSource(scene, Rig(camera), seed if noise_seed is None else noise_seed)
@@ -105,20 +92,18 @@ def _spend(state: FarmToSpendOn, budget: Setting) -> tuple[FinePlan, DrawnMap]:
     return plan, segment(farm.weights, state.seen, state.columns[plan.seats], plan.seats)
 
 
-BUDGET = register(
-    Tradeoff(
-        stage="plan",
-        knob="budget",
-        error="1 - mIoU",
-        unit="scene px",
-        reference=f"labels of a farm of {BUDGET_SHAPE[1]} x {BUDGET_SHAPE[0]} px; policy entropy, line blocks",
-        settings=(1.0, 0.8, 0.65, 0.5, 0.4, 0.33),
-        prepare=_prepare_budget,
-        run=_spend,
-        judge=lambda state, _budget, made: state.farm.miss(made[1]),
-        work=lambda state, _budget: float(state.farm.labels.size),
-        modelled_s=lambda state, _budget, made: state.farm.coarse_s + made[0].seconds,
-    )
+BUDGET = Tradeoff(
+    stage="plan",
+    knob="budget",
+    error="1 - mIoU",
+    unit="scene px",
+    reference=f"labels of a farm of {BUDGET_SHAPE[1]} x {BUDGET_SHAPE[0]} px; policy entropy, line blocks",
+    settings=(1.0, 0.8, 0.65, 0.5, 0.4, 0.33),
+    prepare=_prepare_budget,
+    run=_spend,
+    judge=lambda state, _budget, made: state.farm.miss(made[1]),
+    work=lambda state, _budget: float(state.farm.labels.size),
+    modelled_s=lambda state, _budget, made: state.farm.coarse_s + made[0].seconds,
 )
 
 
@@ -170,7 +155,6 @@ def _prepare_segment(seed: int) -> Farm:
 
 
 def _fine_values(farm: FarmLook) -> Values:
-    """Scene values of every valid seat, (seat, p, p, band)."""
     sweeps = [SimulatedSweep(farm.source, sweep) for sweep in farm.full]
     values, _ = read_seats(sweeps, farm.source.camera, farm.grid, farm.grid.valid_seats(), "catmull-rom")
     return np.asarray(values, np.float32)
@@ -186,11 +170,6 @@ def _with_seats(state: Farm, share: Setting) -> DrawnMap:
     return segment(weights, seen, state.columns[np.searchsorted(state.seats, chosen)], chosen)
 
 
-def _in_precision(state: Farm, precision: Setting) -> DrawnMap:
-    chosen: Precision = "bfloat16" if precision == "bfloat16" else "float32"
-    return segment(state.farm.weights, state.look, state.columns, state.seats, precision=chosen)
-
-
 def _with_bands(state: Farm, bands: Setting) -> DrawnMap:
     """From scene values on: fewer bands are fewer values to bring to spectral columns."""
     weights, pixels = state.farm.weights, state.pixels[bands]
@@ -203,48 +182,52 @@ def _disagreement(state: Farm, _setting: Setting, drawn: DrawnMap) -> float:
 
 
 _PX = f"a farm of {SEGMENT_SHAPE[1]} x {SEGMENT_SHAPE[0]} px"
-SEATS = register(
-    Tradeoff(
-        stage="segment",
-        knob="share of seats",
-        error="1 - mIoU",
-        unit="scene px",
-        reference=f"labels of {_PX}; policy {POLICY}, seats free of each other, glance and scores included",
-        settings=SHARES,
-        prepare=_prepare_segment,
-        run=_with_seats,
-        judge=lambda state, _setting, drawn: state.farm.miss(drawn),
-        work=lambda state, _share: float(state.farm.labels.size),
-        levels=lambda state: (
-            Level("every seat and band in float32", state.farm.miss(state.reference)),
-            Level("the same, noise drawn anew", state.farm.miss(state.again)),
-        ),
-        moved_bytes=float(COLUMN_BYTES + MAP_BYTES),
-    )
+SEATS = Tradeoff(
+    stage="segment",
+    knob="share of seats",
+    error="1 - mIoU",
+    unit="scene px",
+    reference=f"labels of {_PX}; policy {POLICY}, seats free of each other, glance and scores included",
+    settings=SHARES,
+    prepare=_prepare_segment,
+    run=_with_seats,
+    judge=lambda state, _setting, drawn: state.farm.miss(drawn),
+    work=lambda state, _share: float(state.farm.labels.size),
+    levels=lambda state: (
+        Level("every seat and band in float32", state.farm.miss(state.reference)),
+        Level("the same, noise drawn anew", state.farm.miss(state.again)),
+    ),
+    moved_bytes=float(COLUMN_BYTES + MAP_BYTES),
 )
-PRECISION = register(
-    replace(SEATS, knob="precision", reference=f"labels of {_PX}; every seat", settings=PRECISIONS, run=_in_precision)
+PRECISION = replace(
+    SEATS,
+    knob="precision",
+    reference=f"labels of {_PX}; every seat",
+    settings=PRECISIONS,
+    run=lambda state, kind: segment(
+        state.farm.weights,
+        state.look,
+        state.columns,
+        state.seats,
+        precision="bfloat16" if kind == "bfloat16" else "float32",
+    ),
 )
-BAND_COUNT = register(
-    replace(
-        SEATS,
-        knob="bands",
-        reference=f"labels of {_PX}; every seat, from scene values to the map",
-        settings=BANDS,
-        run=_with_bands,
-        moved_bytes=4 * min(BANDS) + MAP_BYTES,
-    )
+BAND_COUNT = replace(
+    SEATS,
+    knob="bands",
+    reference=f"labels of {_PX}; every seat, from scene values to the map",
+    settings=BANDS,
+    run=_with_bands,
+    moved_bytes=4 * min(BANDS) + MAP_BYTES,
 )
 AGREEMENT = tuple(
-    register(
-        replace(
-            entry,
-            knob=f"{entry.knob}, agreement",
-            error="share of pixels whose class changes",
-            judge=_disagreement,
-            reference=f"the map of every seat and band of {_PX} in float32",
-            levels=lambda state: (Level("everything captured again", _disagreement(state, 1.0, state.again)),),
-        )
+    replace(
+        entry,
+        knob=f"{entry.knob}, agreement",
+        error="share of pixels whose class changes",
+        judge=_disagreement,
+        reference=f"the map of every seat and band of {_PX} in float32",
+        levels=lambda state: (Level("everything captured again", _disagreement(state, 1.0, state.again)),),
     )
     for entry in (SEATS, PRECISION, BAND_COUNT)
 )
@@ -283,49 +266,41 @@ def _bytes_a_sample(state: CapturedToStore, _codec: Setting, made: Stored) -> fl
     return size / state.raw.size
 
 
-def _write_rounded(state: CapturedToStore, bits: Setting) -> Stored:
-    kept, mosaic = int(bits), state.farm.mosaic
-    return store_in_memory(round_bits(mosaic, kept) if kept < 23 else mosaic, "zstd-3")
-
-
 def _classes_changed(state: CapturedToStore, _bits: Setting, made: Stored) -> float:
     return float(np.mean(_map_of(state.farm, np.asarray(made[1], np.float32)) != state.classes))
 
 
-CODEC = register(
-    Tradeoff(
-        stage="store",
-        knob="codec",
-        error="bytes stored a sample",
-        unit="sample",
-        reference=f"{RAW_LINES} raw lines of a farm, uint16, given back exactly",
-        settings=CODECS,
-        prepare=_prepare_store,
-        run=lambda state, codec: store_in_memory(state.raw, str(codec)),
-        judge=_bytes_a_sample,
-        work=lambda state, _codec: float(state.raw.size),
-    )
+CODEC = Tradeoff(
+    stage="store",
+    knob="codec",
+    error="bytes stored a sample",
+    unit="sample",
+    reference=f"{RAW_LINES} raw lines of a farm, uint16, given back exactly",
+    settings=CODECS,
+    prepare=_prepare_store,
+    run=lambda state, codec: store_in_memory(state.raw, str(codec)),
+    judge=_bytes_a_sample,
+    work=lambda state, _codec: float(state.raw.size),
 )
-BITS = register(
-    Tradeoff(
-        stage="store",
-        knob="kept bits",
-        error="share of pixels whose class changes",
-        unit="px*band",
-        reference=f"the map that the coarse mosaic of a farm of {STORE_SHAPE[1]} x {STORE_SHAPE[0]} px gives unrounded",
-        settings=(23.0, 13.0, 11.0, 9.0, 7.0, 5.0),
-        prepare=_prepare_store,
-        run=_write_rounded,
-        judge=_classes_changed,
-        work=lambda state, _bits: float(state.farm.mosaic.size),
-    )
+BITS = Tradeoff(
+    stage="store",
+    knob="kept bits",
+    error="share of pixels whose class changes",
+    unit="px*band",
+    reference=f"the map that the coarse mosaic of a farm of {STORE_SHAPE[1]} x {STORE_SHAPE[0]} px gives unrounded",
+    settings=(23.0, 13.0, 11.0, 9.0, 7.0, 5.0),
+    prepare=_prepare_store,
+    run=lambda state, bits: store_in_memory(
+        state.farm.mosaic if int(bits) >= 23 else round_bits(state.farm.mosaic, int(bits)), "zstd-3"
+    ),
+    judge=_classes_changed,
+    work=lambda state, _bits: float(state.farm.mosaic.size),
 )
-SIZE = register(
-    replace(
-        BITS,
-        knob="kept bits, size",
-        error="bytes stored a sample",
-        reference="the coarse mosaic, float32, rounded to so many bits",
-        judge=lambda state, _bits, made: made[0] / state.farm.mosaic.size,
-    )
+SIZE = replace(
+    BITS,
+    knob="kept bits, size",
+    error="bytes stored a sample",
+    reference="the coarse mosaic, float32, rounded to so many bits",
+    judge=lambda state, _bits, made: made[0] / state.farm.mosaic.size,
 )
+register_all(BUDGET, SEATS, PRECISION, BAND_COUNT, *AGREEMENT, CODEC, BITS, SIZE)

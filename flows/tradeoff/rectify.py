@@ -8,7 +8,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.tradeoff.entries import Level, Setting, Tradeoff, register
+from flows.tradeoff.entries import Level, Setting, Tradeoff, register_all
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_normal, scene_to_direction
 from pipeline.geometry.paper_equations import LINE_MODELS, LineModel, line_points, unlimited_position
@@ -58,30 +58,26 @@ def _ends(along: Floats, scan: Floats) -> tuple[Floats, Floats]:
     return along[:, [0, -1]], scan[:, [0, -1]]
 
 
-def _model_lines(state: Strips, model: Setting) -> Lines:
-    return [line_points(cast("LineModel", model), strip, scan, state.camera) for strip, scan in state.centres]
-
-
 def _error_at_ends(state: Strips, _model: Setting, out: Lines) -> float:
     pairs = zip(map(_ends, *zip(*out, strict=True)), state.ends, strict=True)
     return max(float(np.hypot(a - exact_a, b - exact_b).max()) for (a, b), (exact_a, exact_b) in pairs)
 
 
-LINE_MODEL = register(
-    Tradeoff(
-        stage="rectify",
-        knob="line model",
-        error="greatest error at a line's end [px]",
-        unit="px",
-        reference=f"exact rays over {FIELD_PX} x {FIELD_PX} px, as far as the mirror reaches",
-        settings=LINE_MODELS,
-        prepare=_prepare_strips,
-        run=_model_lines,
-        judge=_error_at_ends,
-        work=lambda state, _model: float(sum(len(scan) for _, scan in state.centres) * state.camera.samples),
-        levels=lambda _state: (Level("half a pixel", 0.5),),
-        moved_bytes=16.0,
-    )
+LINE_MODEL = Tradeoff(
+    stage="rectify",
+    knob="line model",
+    error="greatest error at a line's end [px]",
+    unit="px",
+    reference=f"exact rays over {FIELD_PX} x {FIELD_PX} px, as far as the mirror reaches",
+    settings=LINE_MODELS,
+    prepare=_prepare_strips,
+    run=lambda state, model: [
+        line_points(cast("LineModel", model), strip, scan, state.camera) for strip, scan in state.centres
+    ],
+    judge=_error_at_ends,
+    work=lambda state, _model: float(sum(len(scan) for _, scan in state.centres) * state.camera.samples),
+    levels=lambda _state: (Level("half a pixel", 0.5),),
+    moved_bytes=16.0,
 )
 
 
@@ -143,34 +139,29 @@ def _prepare_seams(seed: int) -> Seams:
     return Seams(pairs, shifts)
 
 
-def _find_shifts(state: Seams, overlap: Setting) -> list[PairShift]:
-    part = slice(0, int(overlap))
-    return [pair_shift(first[:, part], second[:, part], prior_px=PRIOR_PX) for first, second in state.pairs]
-
-
 def _median_miss(state: Seams, _overlap: Setting, found: list[PairShift]) -> float:
     """A pair that is not decided counts as infinitely far."""
     off = np.linalg.norm([pair.shift for pair in found] - state.shifts, axis=1)
     return float(np.median(np.where(np.isnan(off), np.inf, off)))
 
 
-OVERLAP = register(
-    Tradeoff(
-        stage="rectify",
-        knob="overlap",
-        error="median error of the shift [px]",
-        unit="pair",
-        reference=(
-            f"{PAIRS} known shifts of waves of {SEAM_PERIODS_PX[0]:g} to {SEAM_PERIODS_PX[1]:g} px, "
-            f"{SEAM_PX} px of seam, SNR {SNR:g}"
-        ),
-        settings=OVERLAPS_PX,
-        prepare=_prepare_seams,
-        run=_find_shifts,
-        judge=_median_miss,
-        work=lambda _state, _overlap: float(PAIRS),
-        levels=lambda _state: (Level("goal of 0.1 px", 0.1),),
-    )
+OVERLAP = Tradeoff(
+    stage="rectify",
+    knob="overlap",
+    error="median error of the shift [px]",
+    unit="pair",
+    reference=(
+        f"{PAIRS} known shifts of waves of {SEAM_PERIODS_PX[0]:g} to {SEAM_PERIODS_PX[1]:g} px, "
+        f"{SEAM_PX} px of seam, SNR {SNR:g}"
+    ),
+    settings=OVERLAPS_PX,
+    prepare=_prepare_seams,
+    run=lambda state, overlap: [
+        pair_shift(one[:, : int(overlap)], other[:, : int(overlap)], prior_px=PRIOR_PX) for one, other in state.pairs
+    ],
+    judge=_median_miss,
+    work=lambda _state, _overlap: float(PAIRS),
+    levels=lambda _state: (Level("goal of 0.1 px", 0.1),),
 )
 
 
@@ -198,11 +189,6 @@ def _prepare_points(seed: int) -> Scattered:
     return Scattered(samples, coordinates, waves.at(coordinates))
 
 
-def _resample(state: Scattered, kernel: Setting) -> Values:
-    valid = np.ones(state.samples.shape[:2], bool)
-    return resample(state.samples, valid, state.coordinates, cast("Kernel", kernel))[0]
-
-
 def noise_levels(camera: LineCamera) -> tuple[Level, ...]:
     """A tenth of the noise and half a step of the converter, over the scene's standard deviation."""
     electrons = camera.full_well_e / 2
@@ -214,21 +200,21 @@ def noise_levels(camera: LineCamera) -> tuple[Level, ...]:
     )
 
 
-RESAMPLE = register(
-    Tradeoff(
-        stage="rectify",
-        knob="kernel",
-        error="rmse / standard deviation",
-        unit="px*band",
-        reference=f"waves of {PERIODS_PX[0]:g} to {PERIODS_PX[1]:g} px, evaluated at the output pixels",
-        settings=("nearest", "bilinear", "catmull-rom"),
-        prepare=_prepare_points,
-        run=_resample,
-        judge=lambda state, _kernel, out: float(np.sqrt(np.mean((out - state.truth) ** 2)) / np.std(state.truth)),
-        work=lambda state, _kernel: float(state.truth.size),
-        levels=lambda _state: noise_levels(LineCamera()),
-        moved_bytes=6.0,  # a uint16 read and a float32 written
-    )
+RESAMPLE = Tradeoff(
+    stage="rectify",
+    knob="kernel",
+    error="rmse / standard deviation",
+    unit="px*band",
+    reference=f"waves of {PERIODS_PX[0]:g} to {PERIODS_PX[1]:g} px, evaluated at the output pixels",
+    settings=("nearest", "bilinear", "catmull-rom"),
+    prepare=_prepare_points,
+    run=lambda state, kernel: resample(
+        state.samples, np.ones(state.samples.shape[:2], bool), state.coordinates, cast("Kernel", kernel)
+    )[0],
+    judge=lambda state, _kernel, out: float(np.sqrt(np.mean((out - state.truth) ** 2)) / np.std(state.truth)),
+    work=lambda state, _kernel: float(state.truth.size),
+    levels=lambda _state: noise_levels(LineCamera()),
+    moved_bytes=6.0,  # a uint16 read and a float32 written
 )
 
 
@@ -270,21 +256,19 @@ def _rectify(camera: LineCamera, lines: SimulatedSweep, values: Values) -> Value
     return seen.reshape(*SHAPE, -1)
 
 
-SCAN_STEP = register(
-    Tradeoff(
-        stage="rectify",
-        knob="scan step",
-        error="rmse / standard deviation",
-        unit="scene px",
-        reference=f"full scan without noise of a farm of {SHAPE[1]} x {SHAPE[0]} px",
-        settings=STEPS,
-        prepare=_prepare_steps,
-        run=lambda state, step: _rectify(state.camera, *state.sweeps[int(step)]),
-        judge=lambda state, _step, out: float(np.sqrt(np.nanmean((out - state.full) ** 2)) / np.nanstd(state.full)),
-        work=lambda _state, _step: float(SHAPE[0] * SHAPE[1]),
-        modelled_s=lambda state, step, _out: CostModel().seconds([state.sweeps[int(step)][0].sweep], state.camera),
-        levels=lambda state: (Level("σ of noise", state.noise), Level("0.1 σ of noise", 0.1 * state.noise)),  # noqa: RUF001
-    )
+SCAN_STEP = Tradeoff(
+    stage="rectify",
+    knob="scan step",
+    error="rmse / standard deviation",
+    unit="scene px",
+    reference=f"full scan without noise of a farm of {SHAPE[1]} x {SHAPE[0]} px",
+    settings=STEPS,
+    prepare=_prepare_steps,
+    run=lambda state, step: _rectify(state.camera, *state.sweeps[int(step)]),
+    judge=lambda state, _step, out: float(np.sqrt(np.nanmean((out - state.full) ** 2)) / np.nanstd(state.full)),
+    work=lambda _state, _step: float(SHAPE[0] * SHAPE[1]),
+    modelled_s=lambda state, step, _out: CostModel().seconds([state.sweeps[int(step)][0].sweep], state.camera),
+    levels=lambda state: (Level("σ of noise", state.noise), Level("0.1 σ of noise", 0.1 * state.noise)),  # noqa: RUF001
 )
 
 
@@ -325,19 +309,18 @@ def _look_up(state: TiesLookedUp, spacing: Setting) -> list[Floats]:
     return [table.coordinates(slice(row, min(row + ROWS, rows)), slice(0, columns)) for row in range(0, rows, ROWS)]
 
 
-TIE_SPACING = register(
-    Tradeoff(
-        stage="rectify",
-        knob="tie spacing",
-        error="greatest error of line and sample [px]",
-        unit="px",
-        reference=f"closed form over {TIED_SHAPE[1]} x {TIED_SHAPE[0]} px; 1: no ties",
-        settings=(1, 8, 16, 32, 64),
-        prepare=_prepare_ties,
-        run=_look_up,
-        judge=lambda state, _spacing, out: float(np.abs(np.concatenate(out) - state.exact).max()),
-        work=lambda state, _spacing: float(state.exact.size / 2),
-        levels=lambda _state: (Level("goal of 0.002 px", 2e-3),),
-        moved_bytes=16.0,
-    )
+TIE_SPACING = Tradeoff(
+    stage="rectify",
+    knob="tie spacing",
+    error="greatest error of line and sample [px]",
+    unit="px",
+    reference=f"closed form over {TIED_SHAPE[1]} x {TIED_SHAPE[0]} px; 1: no ties",
+    settings=(1, 8, 16, 32, 64),
+    prepare=_prepare_ties,
+    run=_look_up,
+    judge=lambda state, _spacing, out: float(np.abs(np.concatenate(out) - state.exact).max()),
+    work=lambda state, _spacing: float(state.exact.size / 2),
+    levels=lambda _state: (Level("goal of 0.002 px", 2e-3),),
+    moved_bytes=16.0,
 )
+register_all(LINE_MODEL, OVERLAP, RESAMPLE, SCAN_STEP, TIE_SPACING)

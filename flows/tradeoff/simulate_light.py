@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from flows.tradeoff.entries import Setting, Tradeoff, register
+from flows.tradeoff.entries import Setting, Tradeoff, register_all
 from flows.tradeoff.simulate import FOOTPRINT, Against, FarmLines, Light, Seen, look_at_lines, prepare_footprint
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.lazy import Once
@@ -37,12 +37,10 @@ class Shared:
 
     @property
     def name(self) -> str:
-        """Of the blur."""
         return str(self.blur.name)
 
     @property
     def variants(self) -> tuple[str, ...]:
-        """Of the blur."""
         return tuple(self.blur.variants)
 
     def moments(self, rig: Rig, wavelength_nm: Floats, variant: str, normal: Floats | None = None) -> Moments:
@@ -68,14 +66,12 @@ def _in_groups(state: Seen, groups: Setting) -> Light:
     return state.lines.light(chosen)
 
 
-GROUP_COUNT = register(
-    replace(
-        FOOTPRINT,
-        knob="blurs of all bands",
-        reference="each band's own blur, summed of few kernels; n: as many groups of bands share one each",
-        settings=(EACH, *GROUPS),
-        run=_in_groups,
-    )
+GROUP_COUNT = replace(
+    FOOTPRINT,
+    knob="blurs of all bands",
+    reference="each band's own blur, summed of few kernels; n: as many groups of bands share one each",
+    settings=(EACH, *GROUPS),
+    run=_in_groups,
 )
 
 
@@ -129,15 +125,13 @@ def _in_bands(state: InBands, count: Setting) -> Light:
     return made
 
 
-BAND_COUNT: Tradeoff[InBands, Light] = register(
-    replace(
-        FOOTPRINT,
-        knob="bands",
-        reference="light of all bands; between fewer of them splines",
-        settings=BANDS,
-        prepare=_prepare_bands,
-        run=_in_bands,
-    )
+BAND_COUNT: Tradeoff[InBands, Light] = replace(
+    FOOTPRINT,
+    knob="bands",
+    reference="light of all bands; between fewer of them splines",
+    settings=BANDS,
+    prepare=_prepare_bands,
+    run=_in_bands,
 )
 
 RAY_LINES = 2  # of each block
@@ -184,7 +178,6 @@ def _box_alone(lines: FarmLines, variant: str) -> dict[Any, str]:
 
 
 def _as_components(scene: RasterScene) -> RasterScene:
-    """A scene whose light is that of its components, one a band: rays are summed before bands are mixed."""
     count = scene.electrons.shape[0]
     ones = np.ones(count, np.float32)
     light = SceneLight(np.eye(count, dtype=np.float32), ones)
@@ -199,7 +192,6 @@ def _run_rays(state: Rough, setting: Setting) -> Light:
 
 
 def _by_rays(state: Rough, per_px: int) -> Light:
-    """Light of evenly spaced rays, each as much as the others."""
     lines, width = state.lines, state.lines.rig.camera.slit_px
     turns, runs = _middles(width, per_px), _middles(1.0, per_px)
     rays: dict[Any, str] = {effect: its for effect, its in lines.exact.items() if effect in RAYS}
@@ -224,13 +216,12 @@ def _middles(width: float, per_px: int) -> list[float]:
     return [float(place) for place in ((np.arange(count) + 0.5) / count - 0.5) * width]
 
 
-SUPERSAMPLING = register(
-    replace(
-        FOOTPRINT,
-        knob="supersampling",
-        reference=f"slit and pixel alone as {SLIT.variants[0]} boxes in closed form",
-        settings=(*SLIT.variants, *(f"{count} ray{'s' * (count > 1)}/px" for count in RAYS_PER_PX)),
-        prepare=_prepare_rays,
-        run=_run_rays,
-    )
+SUPERSAMPLING = replace(
+    FOOTPRINT,
+    knob="supersampling",
+    reference=f"slit and pixel alone as {SLIT.variants[0]} boxes in closed form",
+    settings=(*SLIT.variants, *(f"{count} ray{'s' * (count > 1)}/px" for count in RAYS_PER_PX)),
+    prepare=_prepare_rays,
+    run=_run_rays,
 )
+register_all(GROUP_COUNT, BAND_COUNT, SUPERSAMPLING)

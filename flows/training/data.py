@@ -41,7 +41,6 @@ class TrainingData:
     files: DataSet | None = None
 
     def scenes(self, names: tuple[str, ...]) -> Iterator[RasterScene]:
-        """Make the named scenes in order."""
         for name in names:
             if self.files is None:
                 seed, day, hour = read_farm_name(name)
@@ -119,11 +118,8 @@ def open_training_data(
 ) -> TrainingData:
     """Name the data: a built-in farm, or a path with the choices of `load_data_set`.
 
-    Without a number, one scene in eight (4 at most) goes to validation; a data set of one scene has none.
-
-    Raises
-    ------
-    SettingsError : a choice that is for files was made for a farm, or the other way round; the farm was removed.
+    Without a number, one scene in eight (4 at most) goes to validation; a data set of one scene has none. Raises
+    SettingsError: a choice that is for files was made for a farm, or the other way round; the farm was removed.
     """
     refuse_removed(dataset)
     if dataset in FARM_NAMES:

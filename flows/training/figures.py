@@ -31,7 +31,12 @@ def validate(weights: AnyWeights, examples: Iterable[Example], seed: int, show: 
     all; `upsampled` sees none and stands as `none`; `dense` and `coarser` see all of the scene and stand as `all`.
     """
     if not isinstance(weights.network, Segmenter):
-        return _validate_control(weights, examples, seed, show)
+        scenes = [_control_rows(weights, one, seed, show) for one in examples]
+        told: dict[str, Any] = {"scenes": len(scenes), "share_of_seats": CONTROL_SHARE}
+        for name in scenes[0] if scenes else ():
+            draws = [_added(list(parts)) for parts in zip(*(scene[name] for scene in scenes), strict=True)]
+            told[name] = agreement(draws[0]) if name in ("none", "all") else agreement_of_draws(draws)
+        return told if scenes else None
     two_scale = Weights(
         weights.network, weights.basis, weights.normalisation, weights.class_names, weights.class_colours
     )
@@ -40,15 +45,6 @@ def validate(weights: AnyWeights, examples: Iterable[Example], seed: int, show: 
         grid, cells, labels = _parts(two_scale, example)
         seen = glance_of_columns(two_scale, example.coarse, grid)
         rows.append(run_controls(two_scale, seen, cells, labels, share=CONTROL_SHARE, seed=seed, report=show))
-    return _summary(rows)
-
-
-def _parts(weights: AnyWeights, example: Example) -> tuple[SceneGrid, Patches, NDArray[np.uint8]]:
-    grid = SceneGrid(*example.shape, weights.config.patch, weights.config.factor)
-    return grid, patches_of(example.fine, grid.patch).astype(np.float32), example.labels[: grid.height, : grid.width]
-
-
-def _summary(rows: list[Controls]) -> dict[str, Any] | None:
     if not rows:
         return None
     whole = Controls(
@@ -68,15 +64,9 @@ def _summary(rows: list[Controls]) -> dict[str, Any] | None:
     }
 
 
-def _validate_control(weights: AnyWeights, examples: Iterable[Example], seed: int, show: Show) -> dict[str, Any] | None:
-    scenes = [_control_rows(weights, example, seed, show) for example in examples]
-    if not scenes:
-        return None
-    figures: dict[str, Any] = {"scenes": len(scenes), "share_of_seats": CONTROL_SHARE}
-    for name in scenes[0]:
-        draws = [_added(list(parts)) for parts in zip(*(scene[name] for scene in scenes), strict=True)]
-        figures[name] = agreement(draws[0]) if name in ("none", "all") else agreement_of_draws(draws)
-    return figures
+def _parts(weights: AnyWeights, example: Example) -> tuple[SceneGrid, Patches, NDArray[np.uint8]]:
+    grid = SceneGrid(*example.shape, weights.config.patch, weights.config.factor)
+    return grid, patches_of(example.fine, grid.patch).astype(np.float32), example.labels[: grid.height, : grid.width]
 
 
 def _control_rows(weights: AnyWeights, example: Example, seed: int, show: Show) -> dict[str, list[Counts]]:

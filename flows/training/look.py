@@ -42,30 +42,20 @@ class _Taken(SimulatedSweep):
 
     @cached_property
     def raw(self) -> NDArray[np.uint16]:
-        """All lines, (line, sample, band)."""
         return self.source.render(self.sweep, range(self.sweep.lines))
 
     @cached_property
     def references(self) -> References:
-        """Dark and white frames."""
         return self.source.references(self.sweep)
 
     def read(self, start: int, stop: int) -> NDArray[np.uint16]:
-        """Give the lines ``start`` to ``stop``, (line, sample, band) uint16."""
         return self.raw[start:stop]
 
 
 def observe_scene(
     scene: RasterScene, camera: LineCamera, grid: SceneGrid, basis: SpectralBasis, rng: np.random.Generator
 ) -> Observation:
-    """Look at a labelled scene, and project what was seen onto the basis; the noise follows from ``rng``.
-
-    A built-in farm is surveyed with every line there is, by a seed that ``rng`` draws.
-
-    Raises
-    ------
-    SceneError : the scene has no labels, or a pixel that no line reached.
-    """
+    """Look at a labelled scene on the basis, noise by ``rng``; a farm by all lines. SceneError: no labels, or a gap."""
     if law_of_key(scene.key) is None:
         return observe(scene, camera, grid, basis, rng)
     seed = int(rng.integers(2**31))

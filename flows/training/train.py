@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -10,7 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
+from rich.table import Table
 
+from flows.terminal.progress import StageProgress
 from flows.training.data import TrainingData, either_mask, open_training_data, pack_mask, trained_pixels
 from flows.training.figures import validate
 from flows.training.look import observe_scene
@@ -60,10 +64,8 @@ Report = Callable[[str, float, str], None]  # what is done, how far 0..1, a figu
 def train_weights(request: TrainRequest, report: Report = lambda what, done, figure: None) -> dict[str, Any]:
     """Train, validate and save; give the record that stands in the file.
 
-    Raises
-    ------
-    SceneError : no labels, one class only, or scenes whose bands or classes differ.
-    SettingsError : a folder to write to that does not exist, a folder in the place of a file, or sizes that do not fit.
+    Raises SceneError: no labels, one class only, or scenes whose bands or classes differ; SettingsError: a folder to
+    write to that does not exist, a folder in the place of a file, or sizes that do not fit.
     """
     checkpoint = request.out.with_name(request.out.name + ".checkpoint")
     _check_places(request.out, checkpoint)
@@ -119,7 +121,6 @@ def train_weights(request: TrainRequest, report: Report = lambda what, done, fig
 
 
 def _check_places(out: Path, checkpoint: Path) -> None:
-    """Refuse places that the weights, or the state of the run beside them, cannot be written to."""
     if not out.parent.is_dir():
         raise SettingsError(f"-o {out}: the folder {out.parent} does not exist; make it first")
     if out.is_dir():
@@ -220,13 +221,7 @@ Split = dict[str, Any]
 
 
 def open_start(init: Path | None, tokens: Mapping[str, Any], preset: Preset) -> StartFile | None:
-    """Open the file to begin from; None without one.
-
-    Raises
-    ------
-    SettingsError : no such file, tokens of other sizes than ``tokens`` and the usual ones, or another network.
-    WeightsError : a file of no kind that is known.
-    """
+    """The file to begin from, if any. SettingsError: not there, or another network; WeightsError: no known kind."""
     if init is None:
         return None
     if preset != "two-scale":
@@ -278,6 +273,80 @@ def print_start(begun: Mapping[str, Any], console: Console) -> None:
         shown = f"{names[0]} and {len(names) - 1} more" if len(names) > 1 else names[0]
         console.print(f"  skipped {shown}: {why}")
     if "unsealed" in begun:
-        console.print(f"  note: {begun['unsealed']}", highlight=False, markup=False, soft_wrap=True)
+        console.print(f"  note: {begun['unsealed']}", markup=False, soft_wrap=True)
     if begun["licence"]:
         console.print(f"  its licence: {begun['licence']}")
+
+
+def run_train(request: TrainRequest, console: Console) -> dict[str, Any]:
+    """Train with a progress bar on ``console``; give the record kept in the weights."""
+    _check_counts(request)
+    request = replace(request, command=_command())
+    last = ""
+    with StageProgress(console) as progress:
+
+        def report(what: str, done: float, figure: str) -> None:
+            nonlocal last
+            if last not in ("", what):
+                progress.show(last, 1.0, ended=True)
+            last = what
+            progress.show(what, done, figure)
+
+        record = train_weights(request, report)
+        progress.show(last, 1.0, ended=True)
+    if "begun_from" in record:
+        print_start(record["begun_from"], console)
+    _print_figures(record, request, console)
+    return record
+
+
+def _check_counts(request: TrainRequest) -> None:
+    settings = request.settings
+    counts = {
+        "--steps": settings.steps,
+        "--minutes": settings.minutes,
+        "--batch": settings.batch,
+        "--crop": settings.crop,
+        "--scenes": request.scenes,
+        "--patch": request.patch,
+        "--factor": request.factor,
+        "--columns": request.columns,
+        **{"--" + name.replace("_", "-"): size for name, size in request.tokens.items()},
+    }
+    for name, value in counts.items():
+        if value is not None and not value > 0:
+            raise SettingsError(f"{name} must be above 0, got {value}")
+    for name, number in {"--validation": request.validation, "--seed": settings.seed}.items():
+        if number is not None and number < 0:
+            raise SettingsError(f"{name} must be 0 or more, got {number}")
+    if request.positions == "paper" and request.preset not in ("two-scale", "paper"):
+        raise SettingsError(
+            f"--positions paper is not for --preset {request.preset}, which reads one scale; leave it out"
+        )
+
+
+def _command() -> str:
+    """The command without folders: a machine's paths do not belong in weights."""
+    words = [Path(word).name if "/" in word else word for word in sys.argv[1:]]
+    return shlex.join(["spectralzoom", *words])
+
+
+def _print_figures(record: dict[str, Any], request: TrainRequest, console: Console) -> None:
+    out = request.out
+    console.print(f"weights: {out} ({out.stat().st_size / 1e6:.1f} MB), {record['training']['steps']} steps")
+    figures = record["validation"]
+    if figures is None:
+        given = "--weights" if request.preset == "two-scale" else "--weights OTHERS --control"
+        console.print(
+            "no scene was kept for validation; to judge the weights on scenes that they were not trained on: "
+            f"spectralzoom evaluate {request.dataset} {given} {out}",
+            soft_wrap=True,
+        )
+        return
+    title = f"{figures['scenes']} scene{'s' if figures['scenes'] > 1 else ''} kept for validation"
+    caption = f"none: the coarse pass alone; all: fine everywhere; else fine at {figures['share_of_seats']:.0%}"
+    table = Table("placement", "mIoU", "overall", title=title, caption=caption)
+    for name in ("none", "random", "sobel", "entropy", "gain", "all"):
+        if name in figures:  # a control has some of them
+            table.add_row(name, *(f"{figures[name][figure]:.1%}" for figure in ("miou", "overall_accuracy")))
+    console.print(table)

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from flows.survey.run import SurveyRun
 from flows.survey.stage import Product, Wanted, stage
-from flows.survey.stages.class_map import glance_at, patch_columns
 from flows.survey.stages.effects import source_with
-from flows.survey.stages.registration import load_registration
+from flows.survey.stages.maps import glance_at, patch_columns
+from flows.survey.stages.placement import load_registration
 from models.evaluation.metrics import (
     agreement,
     average_accuracy,
@@ -48,8 +48,8 @@ from storage.archive.manifests import read_table
 from storage.archive.whole_files import to_json
 from storage.arrays.class_maps import load_class_map
 
-ACCURACY = Product("evaluate", version=7, by_weights=True)
 RECORD = "accuracy.json"
+ACCURACY = Product("evaluate", version=7, files=(RECORD,), by_weights=True)
 
 
 @stage(
@@ -65,10 +65,7 @@ RECORD = "accuracy.json"
 def evaluate(
     run: SurveyRun, mosaic: StageRef, patches: StageRef, class_map: StageRef, effects: StageRef, *pointing: StageRef
 ) -> Wanted | None:
-    """Judge the map by the labels, and what other placements would have given. Not part of the survey's own cost.
-
-    What controls see has the effects of the survey.
-    """
+    """Judge the map by the labels, and other placements, with the survey's effects; no part of the survey's cost."""
     if not run.scene.labelled or not run.settings.accuracy:
         return None
     inputs = [mosaic, patches, class_map, effects, *pointing]
@@ -246,21 +243,15 @@ def columns_of_all_seats(
     sweeps = [SimulatedSweep(source, sweep) for sweep in full]
     p, valid = grid.patch, grid.valid_seats()
     columns = np.zeros((int(np.prod(grid.seat_shape)), p, p, weights.basis.columns), np.float32)
-    band_bytes = memory // MEMORY_SHARE
+    row, column = np.divmod(valid, grid.seat_shape[1])
+    place = row if full[0].along == "x" else column  # bands lie across the scan, as deep as fits
+    one = int(np.count_nonzero(place == 0)) * p**2 * len(source.wavelength_nm) * 4
+    deep = max(1, memory // MEMORY_SHARE // one)
     done = 0
-    for seats in _bands_of_seats(grid, full[0].along == "x", band_bytes, len(source.wavelength_nm)):
+    for band in range(int(place.max()) // deep + 1):
+        seats = valid[place // deep == band]
         values, _ = read_seats(sweeps, source.camera, grid, seats, kernel)
         columns[seats] = weights.columns(values, source.wavelength_nm)
         done += len(seats)
         report(done / len(valid))
     return columns
-
-
-def _bands_of_seats(grid: SceneGrid, rows: bool, most_bytes: int, bands: int) -> list[NDArray[np.intp]]:
-    """Valid seats in bands across the scan, as many rows (or columns) a band as fit."""
-    valid = grid.valid_seats()
-    row, column = np.divmod(valid, grid.seat_shape[1])
-    place = row if rows else column
-    one = int(np.count_nonzero(place == 0)) * grid.patch**2 * bands * 4
-    deep = max(1, most_bytes // one)
-    return [valid[place // deep == band] for band in range(int(place.max()) // deep + 1)]

@@ -21,7 +21,7 @@ from storage.archive.keys import StageRef, array_digest
 from storage.archive.manifests import read_table, write_table
 from storage.arrays.mosaics import Attention, load_attention, mosaic_brightness, write_attention
 
-ATTENTION = Product("attend", version=7, by_weights=True)
+ATTENTION = Product("attend", version=7, files=("attention.zarr", "plan.json"), by_weights=True)
 
 
 @stage("attend", "attention and plan", ATTENTION, of=("rectify",), unit="pixels")
@@ -48,7 +48,9 @@ def attend(run: SurveyRun, mosaic: StageRef) -> Wanted:
         rank[plan.seats[np.argsort(-scores[plan.seats], kind="stable")]] = np.arange(len(plan.seats))
         shape = run.grid.seat_shape
         write_attention(path / "attention.zarr", Attention(scores.reshape(shape), rank.reshape(shape), settings.policy))
-        write_plan(path, plan)
+        content = asdict(plan) | {"seats": plan.seats.tolist()}
+        absent = [name for name in ("threshold", "spared_s") if content[name] is None]
+        write_table(path / "plan.json", {name: value for name, value in content.items() if name not in absent})
 
     params = {
         "weights": run.weights_key,
@@ -78,13 +80,6 @@ def _scores(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> NDArray[np.flo
     return score_seats(policy, Glance(run.grid, nothing, nothing), seed=run.settings.seed, mask=run.mask)
 
 
-def write_plan(folder: Path, plan: FinePlan) -> None:
-    """Write the plan of an attention store; of a threshold only where there was one."""
-    content = asdict(plan) | {"seats": plan.seats.tolist()}
-    absent = [name for name in ("threshold", "spared_s") if content[name] is None]
-    write_table(folder / "plan.json", {name: value for name, value in content.items() if name not in absent})
-
-
 def load_plan(attention: StageRef) -> FinePlan:
     """Read the plan of an attention store."""
     plan = read_table(attention.path / "plan.json")
@@ -92,8 +87,8 @@ def load_plan(attention: StageRef) -> FinePlan:
     return FinePlan(**(plan | kept))
 
 
-TURNED = Product("turned", version=1)
 FILE = "orientation.json"
+TURNED = Product("turned", version=1, files=(FILE,))
 
 
 @stage(

@@ -26,13 +26,31 @@ RAW = Product("capture", version=4)
 RIG_RECORD = "rig.json"  # beside the cubes: what a rig's captures were like
 
 
-@stage("capture_coarse", "coarse sweep", RAW, of=("choose_effects",), inputs=1, unit="coarse values", retries=2)
+@stage(
+    "capture_coarse",
+    "coarse sweep",
+    RAW,
+    of=("choose_effects",),
+    inputs=1,
+    unit="coarse values",
+    retries=2,
+    named="raw_coarse",
+)
 def capture_coarse(run: SurveyRun, effects: StageRef) -> Wanted:
     """Sweep the whole field once, fast."""
     return sweeps_wanted(run, run.plan.coarse, [effects])
 
 
-@stage("capture_fine", "fine sweeps", RAW, of=("attend", "choose_effects"), inputs=2, unit="fine values", retries=2)
+@stage(
+    "capture_fine",
+    "fine sweeps",
+    RAW,
+    of=("attend", "choose_effects"),
+    inputs=2,
+    unit="fine values",
+    retries=2,
+    named="raw_fine",
+)
 def capture_fine(run: SurveyRun, attention: StageRef, effects: StageRef) -> Wanted:
     """Go back for the places that the plan chose."""
     return sweeps_wanted(run, load_plan(attention).sweeps, [attention, effects], begins_s=run.plan.coarse_s)
@@ -112,13 +130,9 @@ def take_lines(
     """Give ``take`` the sweep's lines one by one, in order, from line ``first`` on.
 
     ``take`` is called in this thread while others render. Beside one block of ``at_once`` lines for each worker there
-    is one more, so that nobody waits while lines are taken. Where ``take`` raises, what was rendered ahead is lost.
-    A source that is no simulation gives its lines when it has them.
-    Neither the number of workers nor the size of blocks changes a line.
-
-    Raises
-    ------
-    What ``take`` raises; what the first block that cannot be rendered does, once the lines before it are taken.
+    is one more, so that nobody waits while lines are taken. Where ``take`` raises, what was rendered ahead is lost;
+    what the first block that cannot be rendered raises comes once the lines before it are taken. A source that is no
+    simulation gives its lines when it has them. Neither the number of workers nor the size of blocks changes a line.
     """
     workers = Crew("threads", crew.workers)  # whoever else makes blocks, for the scene lies in this process's memory
     if workers.count == 1 or not isinstance(source, SimulatedSource):

@@ -28,8 +28,8 @@ from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table
 from storage.archive.whole_files import to_json
 
-MANIFEST = Product("effects", version=2)
 RECORD = "effects.json"
+MANIFEST = Product("effects", version=2, files=(RECORD,))
 LOOK = {
     ROTATION: ROTATION.variants[0],
     SLIT: SLIT.variants[-1],
@@ -41,12 +41,8 @@ DRAFT, VERIFIED = 0.3, 1.0
 def choose_effects(run: CaptureRun) -> Wanted:
     """Decide for scene and rig which effects to simulate, and check it on the worst lines of the scene.
 
-    Where a rig takes the lines there is nothing to decide.
-
-    Raises
-    ------
-    BoundError : what would be left out changes light by more than its bound says.
-    SceneError : the scene holds a number that is not finite.
+    Where a rig takes the lines there is nothing to decide. Raises BoundError: what would be left out changes light by
+    more than its bound says; SceneError: the scene holds a number that is not finite.
     """
     tolerance, asked = run.settings.tol, run.settings.effects
 
@@ -85,12 +81,7 @@ def load_manifest(effects: StageRef) -> dict[str, Any]:
 
 
 def chosen_effects(effects: StageRef) -> dict[Effect, str]:
-    """Read the effects that are on with their variants, in the order of the chain.
-
-    Raises
-    ------
-    IncompleteStoreError : the store names an effect that this version does not know.
-    """
+    """Effects that are on, with variants, in the chain's order (IncompleteStoreError: one that is not known here)."""
     chosen: dict[Effect, str] = {}
     for row in load_manifest(effects)["effects"]:
         if row["state"] != "on":

@@ -39,6 +39,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, scene_files: Path, weights:
         shutil.copy(path, here)
     shutil.copy(weights, here / "w.safetensors")
     shutil.copy(make_weights((1500.0, 1700.0, 2000.0)), here / "infrared.safetensors")
+    shutil.copy(make_weights(names=("soil", "crop", "tree")), here / "named.safetensors")
     (here / "corrupt.safetensors").write_bytes(weights.read_bytes()[:5000])
     (here / "corrupt.png").write_bytes((here / "scene.png").read_bytes()[:300])
     (here / "a_file").write_text("no folder")
@@ -77,6 +78,11 @@ REFUSED = {
     "folder": (1, "--scene .", "is a folder, expected a file"),
     "labels of another size": (1, "--labels small.png", "small.png are 50 x 128 px, the scene is 96 x 128"),
     "labels missing": (1, "--labels none.png", "there is no file none.png"),
+    "labels without names": (
+        1,
+        "--labels labels.png --weights named.safetensors",
+        r"class 'class_0', .* table \[classes\] of the scene.toml beside the scene's file: soil = 0$",
+    ),
     "micrometres": (2, "--scene cube.npy --wavelengths 0.46,0.5,0.55,0.6,0.62,0.64", "micrometres.* then write 460"),
     "too few wavelengths": (1, "--scene cube.npy --wavelengths 460,550", "expected 6 wavelengths.* got 2"),
     "no wavelengths": (1, "--scene cube.npy", "nothing says their wavelengths; give --wavelengths in nm"),

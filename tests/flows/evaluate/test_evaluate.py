@@ -15,8 +15,7 @@ from flows.cli.main import main
 from flows.evaluate import work as benchmark_work
 from flows.evaluate.command import ends, evaluate_weights, run_evaluate
 from flows.evaluate.costs import Prices, cpu_seconds, row_seconds
-from flows.evaluate.frames import open_candidates
-from flows.evaluate.request import EvaluateRequest
+from flows.evaluate.frames import EvaluateRequest, open_candidates
 from flows.evaluate.rows import ORACLE, Trial, captured_px, judge_frame, placings
 from flows.evaluate.series import collect_row
 from flows.evaluate.summary import summarise

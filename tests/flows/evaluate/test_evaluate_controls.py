@@ -12,9 +12,8 @@ import pytest
 from rich.console import Console
 
 from flows.evaluate.command import evaluate_weights, run_evaluate
-from flows.evaluate.frames import open_candidates
+from flows.evaluate.frames import EvaluateRequest, open_candidates
 from flows.evaluate.plots import evaluation_figure
-from flows.evaluate.request import EvaluateRequest
 from flows.evaluate.rows import open_controls
 from flows.evaluate.series import Row
 from flows.evaluate.summary import choose_baseline

@@ -15,8 +15,8 @@ from rich.console import Console
 
 from flows.evaluate import work as benchmark_work
 from flows.evaluate.command import evaluate_weights, run_evaluate
+from flows.evaluate.frames import EvaluateRequest
 from flows.evaluate.plots import evaluation_figure
-from flows.evaluate.request import EvaluateRequest
 from flows.evaluate.rows import (
     Trial,
     buy_by_seed,

@@ -13,7 +13,7 @@ from safetensors.torch import load_file, save_file
 from flows.cli import main as cli
 from flows.evaluate import command as evaluate_command
 from flows.evaluate.command import run_evaluate
-from flows.evaluate.request import EvaluateRequest
+from flows.evaluate.frames import EvaluateRequest
 from flows.settings.load import load_settings
 from flows.survey.run import open_run
 from models.weights.files import UNSEALED, describe_weights

@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from flows.publish.panels import class_palette, class_rgb, grey_of, outline
+from flows.publish.panels import class_palette, class_rgb, draw_scale, grey_of, outline
 from flows.publish.quicklook import QuicklookData, _draw_attention, _draw_raw, draw_quicklook
 from storage.arrays.quicklooks import choose_bands, stretch
 
@@ -159,3 +159,24 @@ def test_unlabelled_pixels_are_grey():
     picture = class_rgb(np.array([[0, 9, 255]], np.uint8), class_palette(2))
     np.testing.assert_array_equal(picture[0, 1], picture[0, 2])
     assert (picture[0, 0] != picture[0, 1]).any()
+
+
+@pytest.mark.parametrize(("width", "length"), [(1, 1), (7, 1), (39, 5), (640, 100), (1280, 200), (2400, 500)])
+def test_scale_bar_is_a_round_number_of_at_most_a_quarter(width, length):
+    """The largest of 1, 2, 5 times a power of ten, one pixel at least."""
+    axes = Figure().subplots()
+    draw_scale(axes, (100, width), 0.1)
+    assert axes.patches[0].get_width() == length
+    assert axes.texts[0].get_text().startswith(f"{length} px = ")
+
+
+def test_sweeps_stand_apart_and_shorter_ones_are_filled_up():
+    """Between two sweeps there is a light gap; below a shorter one as well."""
+    data = replace(make_data(60, 60), raw=(np.zeros((30, 40, 5), np.uint16), np.zeros((20, 80, 5), np.uint16)))
+    axes = Figure().subplots()
+    _draw_raw(axes, data)
+    image = np.asarray(axes.images[0].get_array())
+    assert image.shape[:2] == (30, 40 + 2 + 80)
+    np.testing.assert_allclose(image[:, 40:42], 0.98)
+    np.testing.assert_allclose(image[20:, 42:], 0.98)
+    assert (image[:20, 42:] < 0.9).all()

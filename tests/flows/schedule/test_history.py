@@ -10,8 +10,15 @@ from typing import Any
 
 import pytest
 
-from flows.schedule.field_history import FieldHistory, read_histories
-from flows.schedule.history_page import COLOURS, line_chart, render_history, render_index, way_to
+from flows.schedule.history import (
+    COLOURS,
+    FieldHistory,
+    line_chart,
+    read_histories,
+    render_history,
+    render_index,
+    way_to,
+)
 from storage.archive.archive import Archive
 from storage.archive.ledger import Ledger
 from storage.arrays.class_maps import load_class_map

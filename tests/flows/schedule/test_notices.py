@@ -13,8 +13,7 @@ from typing import Any
 
 import pytest
 
-from flows.schedule.due_runs import Outcome
-from flows.schedule.notices import NAMED_BY, ScheduleNews, Several, notice_address, send_notice, together
+from flows.schedule.due_runs import NAMED_BY, Outcome, ScheduleNews, Several, notice_address, send_notice, together
 from flows.schedule.rig_lock import RigLock
 from flows.schedule.serve_command import serve_plain
 from pipeline.errors import PipelineError, SettingsError

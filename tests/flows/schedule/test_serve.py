@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from flows.publish.prefect_artifacts import MOST_BYTES, artifact_key, savings_rows, small_jpeg, survey_markdown
+from flows.publish.survey_command import MOST_BYTES, artifact_key, savings_rows, small_jpeg, survey_markdown
 from flows.schedule import serve_command
 from flows.schedule import server as serve_prefect
 from flows.schedule.serve_command import alone_on, load_fields, serve_plain

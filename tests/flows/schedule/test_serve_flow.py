@@ -191,7 +191,7 @@ def test_deployments_of_the_file_fit_the_flows(prefect_home: Path, field_file: C
 
 def test_deployments_of_serve_fit_the_flows(prefect_home: Path, field_file: Callable[..., Path]) -> None:
     """A deployment for each field, and one to reprocess the archive; Prefect schedules none, and names no file."""
-    from flows.schedule.runner import deployments
+    from flows.schedule.prefect_flows import deployments
     from flows.schedule.served import ServeRequest
 
     fields = load_fields([field_file("north"), field_file("south")])

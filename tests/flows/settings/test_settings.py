@@ -12,9 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flows.settings.declared import SURVEY, TABLES
 from flows.settings.documents import example_toml, settings_table
-from flows.settings.load import load_settings, of_this_version, parse_settings
+from flows.settings.load import SURVEY, TABLES, load_settings, of_this_version, parse_settings
 from flows.settings.survey_settings import MapChoice, Settings
 from flows.settings.values import Tolerance
 from pipeline.errors import BudgetError, SettingsError

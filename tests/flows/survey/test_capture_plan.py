@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from flows.settings.load import parse_settings
-from flows.survey.capture_plan import plan_capture
+from flows.survey.run import plan_capture
 from pipeline.errors import SettingsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from flows.survey.stages import accuracy as evaluation
-from flows.survey.stages import registration as placement
-from flows.survey.stages import registration as pointing_stage
+from flows.survey.stages import placement
 from models.evaluation.metrics import confusion
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED
@@ -73,11 +72,11 @@ def test_controls_look_where_the_map_does(tmp_path: Path) -> None:
 def test_brighter_sweep_is_turned_down(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of two sweeps one of which was lit four times as much, either gain is what its values are multiplied by."""
     ratio = LightRatio(0, 1, np.log([4.0, 4.0]), np.zeros(2))
-    monkeypatch.setattr(pointing_stage, "overlap_light", lambda *_: [ratio])
+    monkeypatch.setattr(placement, "overlap_light", lambda *_: [ratio])
     placed: Any = [SimpleNamespace(lines=SimpleNamespace(sweep=SimpleNamespace(name=name))) for name in "ab"]
     run: Any = SimpleNamespace(camera=None, scene=SimpleNamespace(wavelength_nm=np.array([500.0, 600.0])))
     found: Any = SimpleNamespace(windows=[SimpleNamespace(window=None, measured=True)])
-    gains = pointing_stage._gains(run, found, placed)
+    gains = placement._gains(run, found, placed)
     np.testing.assert_allclose(gains["a"], 2.0, rtol=1e-6)
     np.testing.assert_allclose(gains["b"], 0.5, rtol=1e-6)
 

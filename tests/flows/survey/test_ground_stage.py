@@ -13,7 +13,7 @@ import xarray as xr
 
 from flows.settings.survey_settings import MapChoice, Settings
 from flows.survey.run import SurveyRun
-from flows.survey.stages.ground import STORE, coarse_colours, ground, survey_grid
+from flows.survey.stages.maps import STORE, coarse_colours, ground, survey_grid
 from pipeline.errors import PoseError
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.ground.map_grid import GroundGrid

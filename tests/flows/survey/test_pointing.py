@@ -14,7 +14,7 @@ from rich.console import Console
 from flows.publish.receipt_table import sentences
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
-from flows.survey.stages.class_map import patch_columns
+from flows.survey.stages.maps import patch_columns
 from models.network.spectral import SpectralBasis
 from models.reading.inference import Glance
 from pipeline.geometry.grid import SceneGrid

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from importlib import resources
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from flows.survey.run import SHIPPED
+from flows.survey.run import shipped_weights
 from flows.survey.stages.accuracy import columns_of_all_seats
 from models.evaluation.metrics import mean_iou
 from models.evaluation.placement import Controls, run_controls
@@ -23,7 +20,7 @@ from pipeline.simulator.scenes.farm.farm_plan import CLASSES
 from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, farm_scene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 
-PATH = Path(str(resources.files("models") / "shipped" / SHIPPED))
+PATH = shipped_weights()
 SHAPE = (512, 640)  # smaller farms hold too few pixels of rare classes to rank placements by them
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from flows.survey import stages
 from flows.survey.stage import all_stages
+from storage.archive.keys import StageRef
 
 ADDED = """
 from flows.survey.stage import Product, Wanted, stage
@@ -31,7 +32,15 @@ def test_a_module_is_all_that_a_stage_takes(tmp_path: Path, monkeypatch: pytest.
     """It is found and stands after what it names; nothing else had to know of it."""
     (tmp_path / "counting.py").write_text(ADDED)
     monkeypatch.setattr(stages, "__path__", [*stages.__path__, str(tmp_path)])
-    found = list(all_stages.__wrapped__())
+    found = all_stages.__wrapped__()
     monkeypatch.delitem(sys.modules, "flows.survey.stages.counting")
     assert set(found) - set(all_stages()) == {"count_pixels"}
-    assert found.index("count_pixels") > found.index("ground")
+    assert list(found).index("count_pixels") > list(found).index("ground")
+    assert found["count_pixels"].addresses(StageRef("count", "abc", tmp_path)) == {"count_pixels": "stages/count/abc"}
+
+
+def test_every_stage_says_once_what_receipts_call_its_store() -> None:
+    """No two stages share a name in receipts, and each has one at least."""
+    named = [one.addresses(StageRef(one.product.name, "abc", Path())) for one in all_stages().values()]
+    assert all(named)
+    assert len({name for one in named for name in one}) == sum(map(len, named))

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from flows.schedule.runner import own_temporary_folder
+from flows.schedule.prefect_flows import own_temporary_folder
 from flows.terminal.processes import place_caches, place_pages
 from pipeline.errors import SettingsError
 

@@ -17,8 +17,7 @@ from rich.table import Table
 from rich.tree import Tree
 
 from flows.publish.report import render_markdown
-from flows.schedule.field_history import FieldHistory
-from flows.schedule.history_page import render_history, render_index
+from flows.schedule.history import FieldHistory, render_history, render_index
 from flows.terminal.progress import Terminal
 from pipeline.errors import is_visible
 from storage.archive.whole_files import to_json

@@ -13,23 +13,24 @@ from rich.console import Console
 
 from flows.tradeoff import simulate as tradeoff_simulate
 from flows.tradeoff import simulate_light as tradeoff_simulate_light
-from flows.tradeoff import simulate_noise as tradeoff_simulate_noise
 from flows.tradeoff.command import print_tradeoff, tradeoff_figure
 from flows.tradeoff.entries import Level, Point, Tradeoff, find_tradeoffs, mark_pareto, measure_tradeoff
 from flows.tradeoff.simulate import (
     ALL_CHEAP,
+    DIM_NOISE,
     EXACT,
     FOOTPRINT,
+    NOISE,
     TOLERANCE,
     TOLERANCES,
     Against,
     FarmLines,
     Seen,
+    law_of_numbers,
     look_at_lines,
     with_variant,
 )
 from flows.tradeoff.simulate_light import BAND_COUNT, EACH, GROUP_COUNT, SUPERSAMPLING, InBands, Shared, some_bands
-from flows.tradeoff.simulate_noise import DIM_NOISE, NOISE, law_of_numbers
 from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.effects.blurs import KEYSTONE
 from pipeline.simulator.effects.counting import SHOT
@@ -162,8 +163,8 @@ def test_the_law_of_numbers_has_the_moments_of_its_parts(electrons: float):
 @pytest.mark.parametrize("entry", [NOISE, DIM_NOISE])
 def test_cheap_noise_is_told_from_exact_noise_by_no_test_and_none_at_all_by_every_one(entry, lines, monkeypatch):
     """Variants of the shot noise vary from the law as chance does, keep mean and variance; no noise keeps the mean."""
-    monkeypatch.setattr(tradeoff_simulate_noise, "look_at_lines", lambda seed: lines)
-    monkeypatch.setattr(tradeoff_simulate_noise, "LINES", 100)
+    monkeypatch.setattr(tradeoff_simulate, "look_at_lines", lambda seed: lines)
+    monkeypatch.setattr(tradeoff_simulate, "DRAWN_LINES", 100)
     state = entry.prepare(0)
     (chance,) = entry.levels(state)
     for variant in SHOT.variants:

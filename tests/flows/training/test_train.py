@@ -16,8 +16,7 @@ from flows.cli.main import main
 from flows.settings.load import load_settings
 from flows.survey.run import open_run
 from flows.training import train as flow
-from flows.training.command import run_train
-from flows.training.train import TrainRequest, suggested_patch, train_weights, usual_crop
+from flows.training.train import TrainRequest, run_train, suggested_patch, train_weights, usual_crop
 from models.network.sizes import PRESETS, Preset
 from models.training.train import TrainingSettings
 from models.weights.files import load_any_weights, load_weights

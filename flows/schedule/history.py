@@ -1,12 +1,11 @@
-"""What `spectralzoom report` does: histories of an archive's fields, with charts, as pages that open from disk.
-
-Links lead to reports in the archive, beside the page.
-"""
+"""What `spectralzoom report` does: histories of fields (runs and ledgers, oldest first) as pages with charts."""
 
 from __future__ import annotations
 
+import difflib
 import io
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,17 +22,130 @@ from matplotlib.ticker import Formatter, FuncFormatter, MaxNLocator, StrMethodFo
 from numpy.typing import NDArray
 from rich.markup import escape
 
+from flows.archive.stale_runs import called
 from flows.cli.app import ArchiveName, AsJson, OutFile, check_outside, stderr
+from flows.publish.receipt import areas_on_ground
 from flows.publish.receipt_table import LEAST_HECTARES, area_words
 from flows.publish.report import render_page
-from flows.schedule.field_history import FieldHistory, day_of, read_histories
-from flows.schedule.field_schedule import read_moment
-from flows.terminal.figures import DASH, counted, format_percent
+from flows.schedule.field_schedule import ENDINGS, read_moment
+from flows.survey.scores import score_of
+from flows.terminal.figures import DASH, counted, format_percent, known_number
 from flows.terminal.processes import DONE
 from flows.terminal.progress import print_json
-from pipeline.errors import SettingsError
+from pipeline.errors import ArchiveError, SettingsError
+from storage.archive.archive import Archive
+from storage.archive.ledger import Ledger, ledgers
+from storage.archive.lineage import Catalogue
+from storage.archive.records import Run
 from storage.archive.whole_files import write_whole
+from storage.arrays.class_maps import load_class_map, load_class_names
 from storage.remote.opening import open_archive
+
+
+@dataclass(frozen=True)
+class FieldHistory:
+    """What is known of one field. ``events``: endings and passed-over times of its ledger; ``runs``: rows by run."""
+
+    field: str
+    archive: str
+    runs: Sequence[Mapping[str, Any]]
+    events: Sequence[Mapping[str, Any]]
+
+    @property
+    def counts(self) -> dict[str, int]:
+        found = dict.fromkeys(ENDINGS, 0)
+        for event in self.events:
+            if event["event"] == "passed":
+                found["skipped"] += event.get("count") or 0
+            else:
+                found[event["event"]] += 1
+        return found
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "field": self.field,
+            "archive": self.archive,
+            "counts": self.counts,
+            "runs": list(self.runs),
+            "events": list(self.events),
+        }
+
+
+def read_histories(archive: Archive, field: str | None = None) -> list[FieldHistory]:
+    """The histories of all fields by name, or of one. Raises ArchiveError: no field is called so."""
+    catalogue = Catalogue.read(archive.root)
+    kept = {ledger.field: ledger for ledger in ledgers(archive.root)}
+    names = sorted({*kept, *(called(run) for run in catalogue.runs)})
+    if field is not None and field not in names:
+        near = difflib.get_close_matches(field, names, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(names) or 'none'}"
+        raise ArchiveError(f"no field of {archive.name} is called {field!r}; {hint}")
+    wanted = names if field is None else [field]
+    return [_history(archive, catalogue, name, kept.get(name)) for name in wanted]
+
+
+def _history(archive: Archive, catalogue: Catalogue, name: str, ledger: Ledger | None) -> FieldHistory:
+    lines = [] if ledger is None else ledger.lines()
+    events = [line for line in lines if line.get("event") in (*ENDINGS, "passed")]
+    by_run = {line["run"]: line for line in events if isinstance(line.get("run"), str)}
+    rows = [
+        _row(archive, catalogue, run, by_run.get(run.uri, {}))
+        for run in catalogue.runs
+        if run.uri in by_run or called(run) == name
+    ]
+    return FieldHistory(name, archive.name, rows, events)
+
+
+def _row(archive: Archive, catalogue: Catalogue, run: Run, line: Mapping[str, Any]) -> dict[str, Any]:
+    receipt = run.receipt
+    savings = found if isinstance(found := receipt.get("savings"), Mapping) else {}
+    shares, unit = _covered(archive, catalogue, run)
+    colours: dict[str, str] = {}  # in which the run's map shows its classes, as CSS writes them
+    if (address := run.products.get("class_map")) is not None:
+        with suppress(OSError, LookupError, ValueError):
+            shown = load_class_names(archive.locate(address))
+            hexes = [f"#{bytes(map(int, rgb)).hex()}" for rgb in shown.colours]
+            colours = dict(zip(shown.names, hexes, strict=False))
+    return {
+        "run": run.uri,
+        "created": run.created,
+        "due": line.get("due"),
+        "attempts": line.get("attempts"),
+        **score_of(receipt),
+        "savings": {
+            name: known_number(entry.get("ratio")) if isinstance(entry := savings.get(name), Mapping) else None
+            for name in ("capture_s", "lines", "bytes_stored", "multiply_adds")
+        },
+        "areas": shares,
+        "colours": colours,
+        "unit": unit,
+        "problem": run.problem,
+    }
+
+
+def _covered(archive: Archive, catalogue: Catalogue, run: Run) -> tuple[dict[str, float], str]:
+    """What each class covers: hectares where the survey was put on the ground, else shares of the map."""
+    hectares = areas_on_ground(run.receipt)
+    if hectares is not None:
+        return {str(name): float(area) for name, area in hectares.items() if known_number(area) is not None}, "ha"
+    address = run.products.get("class_map")
+    store = None if address is None else catalogue.stores.get("/".join(address.split("/")[:3]))
+    if address is None or store is None or store.problem is not None:
+        return {}, "share"
+    try:
+        found = load_class_map(archive.locate(address))
+    except (OSError, LookupError, ValueError):
+        return {}, "share"
+    counts = {name: int((found.classes == number).sum()) for number, name in enumerate(found.names)}
+    total = sum(counts.values()) or 1
+    return {name: count / total for name, count in counts.items()}, "share"
+
+
+def day_of(row: Mapping[str, Any]) -> float | None:
+    """When a row's run was due or else published, in seconds since 1970; None where that is not known."""
+    moment = read_moment(row.get("due")) or read_moment(row.get("created"))
+    return None if moment is None else moment.timestamp()
+
 
 COLOURS = ("#2f7d4f", "#c2571a", "#3465a4", "#8e6bb0", "#b58900", "#5b8a8a", "#a04050", "#777777")  # told apart by most
 MOST_DOTS = 500  # of a series; longer ones are a line alone
@@ -80,7 +192,7 @@ def report(archive: ArchiveName, *, field: str | None = None, out: OutFile, as_j
     if not field:
         write_whole(page, render_index(histories, opened.name, names))
         written.append(page)
-    stderr.print(f"  {escape(str(written[-1]))}", highlight=False, soft_wrap=True)
+    stderr.print(f"  {escape(str(written[-1]))}", soft_wrap=True)
     if as_json:
         print_json({**content, "pages": [str(path) for path in written]})
     return DONE
@@ -218,10 +330,7 @@ class Chart:
 def line_chart(
     series: Mapping[str, Points], title: str, unit: str = "", colours: Mapping[str, str] | None = None
 ) -> Chart:
-    """Draw series from 0 upwards, shares in percent for the unit "%"; the same points are the same bytes.
-
-    ``colours`` of series by their names; others take `COLOURS` in turn.
-    """
+    """Draw series from 0 up, "%" as shares; same points, same bytes. ``colours`` by name, others in turn."""
     legend = {name: COLOURS[number % len(COLOURS)] for number, name in enumerate(series)}
     legend |= {name: colour for name, colour in (colours or {}).items() if name in series}
     lines = {name: np.array(sorted(points)).reshape(-1, 2) for name, points in series.items()}
@@ -260,7 +369,6 @@ def _days(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _inline(svg: str) -> Markup:
-    """A drawing as it stands within a page: without namespaces, its own size and style, and names of its parts."""
     root = ElementTree.fromstring(svg)
     for part in root.iter():
         part.tag = part.tag.partition("}")[2]
