@@ -44,6 +44,13 @@ DISTRIBUTIONS = {
 FILE_MODULES = {"pathlib", "shutil", "tempfile", "glob", "io", "fileinput"}
 READS = {"open", "read_text", "read_bytes", "getenv", "load_dotenv", "read_csv", "loadtxt", "load_file"}
 MOST_FILES = 25  # in a folder
+IN_FUNCTIONS = {  # file -> packages that a function of it imports, and why no file's head does
+    "flows/publish/survey_command.py": ("PIL", "for Prefect's pages alone"),
+    "flows/survey/prefect_engine.py": ("prefect", "that it cannot be imported is told, and the survey runs plain"),
+    "storage/arrays/ground_maps.py": ("odc xarray", "the import registers the accessor, for maps on the ground alone"),
+    "storage/parallel/cluster_work.py": ("dask", "half a second, for crews of processes alone"),
+    "storage/remote/object_stores.py": ("obstore", "an extra: that it is missing is told"),
+}
 
 
 @cache
@@ -152,6 +159,16 @@ def test_no_file_imports_itself_in_a_circle() -> None:
             circles.append(" -> ".join(reversed(circle)))
             graph[circle[1]].discard(circle[0])
     assert circles == []
+
+
+def test_files_say_at_their_heads_what_they_need() -> None:
+    """What takes long to load is deferred at the head of a file; functions import only what the table gives a reason."""
+    found: dict[str, set[str]] = {}
+    for path, tree in source().items():
+        inner = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+        if names := {name.split(".")[0] for function in inner for name in imported(function)}:
+            found[path.as_posix()] = names
+    assert found == {path: set(packages.split()) for path, (packages, _) in IN_FUNCTIONS.items()}
 
 
 def test_folders_can_be_held_in_mind() -> None:

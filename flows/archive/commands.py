@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
@@ -21,6 +21,7 @@ from flows.terminal.processes import DONE, FAILED, PARTLY
 from flows.terminal.progress import StageProgress, put_out
 from models.weights.files import seal_weights
 from pipeline.errors import SettingsError
+from pipeline.lazy import deferred
 from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue, changes_between, find_product, version_before
 from storage.archive.records import Run, Store
@@ -28,6 +29,11 @@ from storage.maintenance.garbage import clear_up
 from storage.maintenance.repair import Rerun, plan_repair
 from storage.maintenance.verification import Finding
 from storage.remote.opening import open_archive, put_back_archive, repair_archive, verify_archive
+
+if TYPE_CHECKING:
+    import flows.archive.reprocess_command as reprocess_command
+else:
+    reprocess_command = deferred("flows.archive.reprocess_command")
 
 DEEPEST = 60  # levels of a lineage that are shown
 
@@ -142,9 +148,7 @@ def run_verify(
         show_verdict(content, console)
 
     def survey_again(settings: dict[str, Any]) -> None:
-        from flows.archive.reprocess_command import survey_as_before  # torch, which nobody needs where all is whole
-
-        survey_as_before(settings, opened.name, console)
+        reprocess_command.survey_as_before(settings, opened.name, console)
 
     done = repair_archive(opened, bad, rerun or survey_again, versions=versions())
     content["repair"] = {

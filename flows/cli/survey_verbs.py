@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import asdict, make_dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
@@ -15,7 +15,19 @@ from flows.settings.documents import flag_help
 from flows.settings.load import SURVEY, TABLES, load_settings
 from flows.settings.survey_settings import REPLACED
 from flows.terminal.progress import print_json
+from pipeline.lazy import deferred
 from pipeline.rig.device_settings import SurveyRig
+
+if TYPE_CHECKING:
+    import flows.publish.survey_command as survey_command
+    import flows.simulate.command as simulate_command
+    import flows.simulate.rig_check_command as rig_check_command
+    import flows.simulate.rig_emulation as rig_emulation
+else:
+    survey_command = deferred("flows.publish.survey_command")
+    simulate_command = deferred("flows.simulate.command")
+    rig_check_command = deferred("flows.simulate.rig_check_command")
+    rig_emulation = deferred("flows.simulate.rig_emulation")
 
 removed.update(REPLACED)
 IN_TABLES = {"exposure_ms": "camera.exposure_ms"}  # flags of what a settings file has in a table
@@ -71,11 +83,9 @@ def survey(settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_js
     settings
         A survey's TOML file; flags win over it. Without one, flags and defaults alone.
     """
-    from flows.publish.survey_command import run_survey  # torch: what can be refused is refused before
-
     asked = load_settings(settings, by_setting(flags))
     with rig_to_oneself(asked, "a survey by hand"):
-        published = run_survey(asked, stderr)
+        published = survey_command.run_survey(asked, stderr)
     if as_json:
         print_json(published.receipt)
     return 0
@@ -111,10 +121,8 @@ def simulate(
         A PNG to write: lines with everything on and exact, the same as simulated, and where they differ, with the times
         of both. Takes all lines once more both ways, or as many as about a minute allows.
     """
-    from flows.simulate.command import run_simulate  # torch
-
     given = {"scene": scene, "out": out, **by_setting(flags)}
-    record = run_simulate(load_settings(settings, given), stderr, coarse=coarse, picture=compare)
+    record = simulate_command.run_simulate(load_settings(settings, given), stderr, coarse=coarse, picture=compare)
     if as_json:
         print_json(record)
     return 0
@@ -144,9 +152,9 @@ def check(
         Also send the mirror round a small square, within 0.05 of the middle of its range, and read back where it went.
         It ends at 0; 0.
     """
-    from flows.simulate.rig_check_command import check_request, run_check  # the rig's drivers, and scipy
-
-    return run_check(check_request(settings, port, camera, move=move), stderr, as_json=as_json)
+    return rig_check_command.run_check(
+        rig_check_command.check_request(settings, port, camera, move=move), stderr, as_json=as_json
+    )
 
 
 def emulate(
@@ -183,8 +191,6 @@ def emulate(
     out
         A survey's TOML file to write, ready for `survey` and `rig check`.
     """
-    from flows.simulate import rig_check_command, rig_emulation  # torch and scipy
-
     words = split_list(faults)
     if words == (rig_check_command.LIST,):
         return rig_check_command.show_faults(as_json=as_json)

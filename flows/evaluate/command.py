@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console
@@ -34,7 +34,15 @@ from models.evaluation.bootstrap import LEVEL
 from models.evaluation.metrics import agreement, false_pixels, iou_per_class, mean_iou
 from models.network.process import keep_freed_memory
 from models.weights.files import describe_weights, unsealed_note
+from pipeline.lazy import deferred
 from storage.archive.whole_files import to_json
+
+if TYPE_CHECKING:
+    import flows.evaluate.plots as plots
+    import flows.publish.panels as panels
+else:
+    plots = deferred("flows.evaluate.plots")
+    panels = deferred("flows.publish.panels")
 
 
 def run_evaluate(request: EvaluateRequest, console: Console, *, as_json: bool = False) -> dict[str, Any]:
@@ -162,24 +170,21 @@ def publish_evaluation(work: Work, content: dict[str, Any], runs: list[list[Reco
     out = work.request.out
     if out is None:
         return []
-    from flows.evaluate.plots import evaluation_figure, frame_figure, rig_figure  # matplotlib
-    from flows.publish.panels import save_png  # matplotlib
-
     policies, shares = work.trial.policies, work.trial.shares
     shown = ("none", 0.0)
     if policies and shares:
         shown = policies[0], min(shares, key=lambda share: abs(share - SHOWN_SHARE))
     files = [out / "evaluation.json", out / "evaluation.png"]
     with writing(out):
-        save_png(evaluation_figure(content), files[1])
+        panels.save_png(plots.evaluation_figure(content), files[1])
         if content["rig"]["rows"]:
             files.append(out / "rig.png")
-            save_png(rig_figure(content), files[-1])
+            panels.save_png(plots.rig_figure(content), files[-1])
         for title, name, index in ends(runs, *shown):
             show("drawing", len(files) / 6, title)
             path, scene = out / f"{title}.png", scene_of(work.data, name)
             look = work.look(scene, name, index)
-            save_png(frame_figure(f"{title} frame", look, work.loaded(index), *shown), path)
+            panels.save_png(plots.frame_figure(f"{title} frame", look, work.loaded(index), *shown), path)
             files.append(path)
         content["files"] = [str(path) for path in files]
         temporary = files[0].with_name("evaluation.json.part")

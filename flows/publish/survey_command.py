@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -29,11 +29,17 @@ from flows.survey.survey import STAGES, TITLES, Products, StageRunner, Step, jud
 from flows.terminal.figures import format_percent
 from flows.terminal.progress import StageProgress
 from models.network.process import keep_freed_memory, use_one_thread
+from pipeline.lazy import deferred
 from storage.archive.archive import Archive
 from storage.archive.keys import canonical_json
 from storage.archive.records import Run, read_run
 from storage.archive.run_folders import RunDraft
 from storage.archive.whole_files import to_json
+
+if TYPE_CHECKING:
+    import prefect.artifacts as prefect_artifacts
+else:
+    prefect_artifacts = deferred("prefect.artifacts")
 
 
 def run_survey(settings: Settings, console: Console) -> Published:
@@ -162,12 +168,10 @@ WIDTHS_PX = (1200, 1000, 800, 600, 400, 200)
 
 def publish_artifacts(published: Published, field: str, archive: str) -> None:
     """Give a survey's text and table to the Prefect server of the flow that this is called in."""
-    from prefect.artifacts import create_markdown_artifact, create_table_artifact
-
     key, where = artifact_key(field), f"{archive}/runs/{published.folder.name}"
     text = survey_markdown(published, where)
-    create_markdown_artifact(text, key=f"survey-{key}", description=where)
-    create_table_artifact(savings_rows(published.receipt), key=f"savings-{key}", description=where)
+    prefect_artifacts.create_markdown_artifact(text, key=f"survey-{key}", description=where)
+    prefect_artifacts.create_table_artifact(savings_rows(published.receipt), key=f"savings-{key}", description=where)
 
 
 def artifact_key(field: str) -> str:
@@ -223,8 +227,6 @@ def progress_shown(field: str) -> Callable[[str, str, float], None]:
     """What shows on Prefect's pages how far stages are, every two seconds at most: nothing outside of a flow."""
     if not inside_flow():
         return lambda stage, state, done: None
-    from prefect.artifacts import create_progress_artifact, update_progress_artifact
-
     shown: dict[str, Any] = {}
     last: dict[str, float] = {}
 
@@ -235,9 +237,9 @@ def progress_shown(field: str) -> Callable[[str, str, float], None]:
         last[stage] = now
         with suppress(Exception):
             if stage in shown:
-                update_progress_artifact(shown[stage], progress=round(100 * done, 1))
+                prefect_artifacts.update_progress_artifact(shown[stage], progress=round(100 * done, 1))
             else:
                 key = f"{stage.replace('_', '-')}-{artifact_key(field)}"
-                shown[stage] = create_progress_artifact(100 * done, key=key, description=stage)
+                shown[stage] = prefect_artifacts.create_progress_artifact(100 * done, key=key, description=stage)
 
     return show

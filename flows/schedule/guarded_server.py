@@ -7,7 +7,18 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Awaitable, Callable, MutableMapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from pipeline.lazy import deferred
+
+if TYPE_CHECKING:
+    import prefect.server.api.server as prefect_server
+    import starlette.middleware.trustedhost as trustedhost
+    import uvicorn
+else:
+    prefect_server = deferred("prefect.server.api.server")
+    trustedhost = deferred("starlette.middleware.trustedhost")
+    uvicorn = deferred("uvicorn")
 
 Scope = MutableMapping[str, Any]
 App = Callable[[Scope, Callable[[], Awaitable[Any]], Callable[[Any], Awaitable[None]]], Awaitable[None]]
@@ -47,18 +58,13 @@ class OwnPagesOnly:
 
 def guarded(app: App, port: int) -> App:
     """An application for its own address (400 else: another's DNS may point here) and its own pages alone."""
-    from starlette.middleware.trustedhost import TrustedHostMiddleware
-
     pages: Any = OwnPagesOnly(app, own_origins(port))
-    return TrustedHostMiddleware(pages, allowed_hosts=list(NAMES), www_redirect=False)
+    return trustedhost.TrustedHostMiddleware(pages, allowed_hosts=list(NAMES), www_redirect=False)
 
 
 def main(port: int) -> None:
     """Serve until told to stop."""
-    import uvicorn
-    from prefect.server.api.server import create_app
-
-    app: Any = guarded(create_app(final=True), port)
+    app: Any = guarded(prefect_server.create_app(final=True), port)
     uvicorn.run(app, host=HOST, port=port, log_level="warning")
 
 

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from prefect import State, flow, serve
 from prefect.concurrency.sync import concurrency
@@ -28,8 +28,16 @@ from flows.schedule.watcher import LIMIT, REPROCESS_LOCK, SKIPPED
 from flows.terminal.processes import FAILED, PARTLY
 from flows.terminal.progress import on_stderr
 from pipeline.errors import PipelineError, RigError
+from pipeline.lazy import deferred
 from storage.archive.staging import take_lock
 from storage.remote.opening import open_archive
+
+if TYPE_CHECKING:
+    import flows.archive.reprocess_command as reprocess_command
+    import flows.publish.survey_command as survey_command
+else:
+    reprocess_command = deferred("flows.archive.reprocess_command")
+    survey_command = deferred("flows.publish.survey_command")  # torch, once the run is noted as begun
 
 A_LOOK_S = 1.0
 AHEAD = timedelta(minutes=2)  # a run that is begun earlier than this was begun by hand
@@ -73,8 +81,6 @@ def _run(one: ServedField, schedule: FieldSchedule, moment: datetime, request: S
 
 
 def _survey(one: ServedField, due: datetime, request: ServeRequest) -> Path:
-    from flows.publish import survey_command  # torch, once the run is noted as begun
-
     published = survey_command.run_survey(one.settings_of(due, request.timetable), on_stderr())
     with suppress(Exception):  # a server that is gone: the archive has it all
         survey_command.publish_artifacts(published, one.name, one.settings.out)
@@ -140,12 +146,12 @@ def reprocess_archive(
     dry_run: bool = False,
 ) -> State:
     """Survey every field of a served archive again; ``weights`` may be those that a served field's settings name."""
-    from flows.archive.reprocess_command import ReprocessRequest, run_reprocess  # torch
-
     try:
         served = read_served()
         archive = served_archive(served, archive)
-        request = ReprocessRequest(archive, since, stage, field, failed, served_weights(served, weights), dry_run)
+        request = reprocess_command.ReprocessRequest(
+            archive, since, stage, field, failed, served_weights(served, weights), dry_run
+        )
         lock = open_archive(archive, create=False, write=False).root / ".locks" / REPROCESS_LOCK
         release = take_lock(lock, wait=False)
         if release is None:  # it may be but the watcher's look
@@ -154,7 +160,7 @@ def reprocess_archive(
         if release is None:
             return _skipped("this archive is being reprocessed already")
         try:
-            code = run_reprocess(request, on_stderr())
+            code = reprocess_command.run_reprocess(request, on_stderr())
         finally:
             release()
     except PipelineError as error:

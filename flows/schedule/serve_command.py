@@ -9,7 +9,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from rich.console import Console
 from rich.markup import escape
@@ -24,8 +24,14 @@ from flows.schedule.times import SystemWallClock, Timetable, WallClock, parse_ti
 from flows.survey.run import open_run
 from flows.terminal.processes import DONE, terminable
 from pipeline.errors import ArchiveError, PipelineError, RigError, SettingsError
+from pipeline.lazy import deferred
 from storage.archive.staging import take_lock
 from storage.remote.object_stores import is_remote
+
+if TYPE_CHECKING:
+    import flows.publish.survey_command as survey_command
+else:
+    survey_command = deferred("flows.publish.survey_command")
 
 LOOK_AGAIN = timedelta(seconds=30)  # a clock that jumps, or a run that died, is seen after this at the latest
 
@@ -97,9 +103,7 @@ def serve(
 
 def survey_field(one: ServedField, due: datetime, timetable: Timetable, console: Console) -> Path:
     """Survey a field for a due time; gives the folder of the published run."""
-    from flows.publish.survey_command import run_survey  # torch, which a schedule by Prefect leaves to its runs
-
-    return run_survey(one.settings_of(due, timetable), console).folder
+    return survey_command.run_survey(one.settings_of(due, timetable), console).folder
 
 
 def _tell(words: str) -> None:

@@ -12,13 +12,27 @@ from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from flows.schedule.due_runs import ScheduleNews, Tell, send_notice, together
 from flows.schedule.field_schedule import FieldSchedule, moment_words, read_moment
 from flows.schedule.rig_lock import RigLock
 from flows.schedule.served import ServedField, ServeRequest
+from pipeline.lazy import deferred
 from storage.archive.staging import take_lock
+
+if TYPE_CHECKING:
+    import prefect.client.orchestration as prefect_client
+    import prefect.client.schemas.filters as prefect_filters
+    import prefect.client.schemas.objects as prefect_objects
+    import prefect.exceptions as prefect_exceptions
+    import prefect.states as prefect_states
+else:
+    prefect_client = deferred("prefect.client.orchestration")
+    prefect_filters = deferred("prefect.client.schemas.filters")
+    prefect_objects = deferred("prefect.client.schemas.objects")
+    prefect_exceptions = deferred("prefect.exceptions")
+    prefect_states = deferred("prefect.states")
 
 LIMIT = "rig"  # a Prefect concurrency limit that shows who waits; the kernel's lock decides
 REPROCESS_LOCK = "reprocess-flow.lock"
@@ -47,8 +61,6 @@ class FlowRuns:
 
         Those of ``spared`` are neither made nor taken back. Gives the due times whose run somebody cancelled.
         """
-        from prefect.exceptions import ObjectNotFound
-
         waiting = self._waiting(client)
         for due in waiting.keys() - wanted.keys() - set(spared):
             self._take_back(client, due, waiting[due], now, "it is accounted for already, or not served any more")
@@ -56,7 +68,7 @@ class FlowRuns:
         missing = [due for due in wanted if due not in waiting and due not in spared]
         try:
             deployment = client.read_deployment_by_name(f"survey/{self.name}").id
-        except ObjectNotFound:
+        except prefect_exceptions.ObjectNotFound:
             self.known = False
             return []
         self.known = True
@@ -69,21 +81,17 @@ class FlowRuns:
 
     def give_up(self, client: Any, due: datetime) -> None:
         """A due time's run whose process is gone before it began: another is made at the next look."""
-        from prefect.states import Crashed
-
         for run in self._waiting(client).get(due, []):
             if run.state is not None and run.state.is_pending():
-                client.set_flow_run_state(run.id, Crashed(message="it never began"), force=True)
+                client.set_flow_run_state(run.id, prefect_states.Crashed(message="it never began"), force=True)
 
     def _plan(self, client: Any, deployment: Any, due: datetime, begun: int) -> bool:
         """Make a due time's flow run: asked again Prefect gives the same one. False where somebody cancelled it."""
-        from prefect.states import Scheduled
-
         while (number := self.tries.setdefault(due, 0)) < MOST_TRIES:
             run = client.create_flow_run_from_deployment(
                 deployment,
                 parameters={"due": moment_words(due)},
-                state=Scheduled(scheduled_time=due),
+                state=prefect_states.Scheduled(scheduled_time=due),
                 name=f"survey-{self.name}",
                 idempotency_key=f"{self.name} {moment_words(due)} {begun} {number}",
             )
@@ -96,20 +104,16 @@ class FlowRuns:
 
     def _take_back(self, client: Any, due: datetime, runs: Iterable[Any], now: datetime, why: str) -> None:
         """No process is started for these any more. Of those to come nothing is left: they may be planned again."""
-        from prefect.states import Cancelled
-
         for run in runs:
             if run.state is None or not run.state.is_scheduled():
                 continue  # a process was started for it, and finds out by itself
             if due > now:
                 client.delete_flow_run(run.id)
             else:
-                client.set_flow_run_state(run.id, Cancelled(name=SKIPPED, message=why))
+                client.set_flow_run_state(run.id, prefect_states.Cancelled(name=SKIPPED, message=why))
 
     def _waiting(self, client: Any) -> dict[datetime, list[Any]]:
-        from prefect.client.schemas.filters import DeploymentFilter, DeploymentFilterName
-
-        named = DeploymentFilter(name=DeploymentFilterName(any_=[self.name]))
+        named = prefect_filters.DeploymentFilter(name=prefect_filters.DeploymentFilterName(any_=[self.name]))
         runs: dict[datetime, list[Any]] = {}
         for run in _read_runs(client, "survey", "SCHEDULED", "PENDING", deployment_filter=named):
             due = read_moment(run.parameters.get("due"))
@@ -292,31 +296,27 @@ class Watcher:
 
 def reap_flow_runs(client: Any, field: str | None, archive: str | None) -> list[str]:
     """Crash runs that Prefect believes alive, of a field or an archive whose lock is held here; gives their names."""
-    from prefect.states import Crashed
-
     flow, parameter, value = ("reprocess", "archive", archive) if field is None else ("survey", "field", field)
     reaped: list[str] = []
     for run in _read_runs(client, flow, "RUNNING", "PENDING"):
         if run.parameters.get(parameter) == value:
-            client.set_flow_run_state(run.id, Crashed(message="its process was gone: its lock is free"), force=True)
+            client.set_flow_run_state(
+                run.id, prefect_states.Crashed(message="its process was gone: its lock is free"), force=True
+            )
             reaped.append(run.name)
     return reaped
 
 
 def _read_runs(client: Any, flow: str, *states: str, **filters: Any) -> list[Any]:
-    from prefect.client.schemas.filters import FlowFilter, FlowFilterName, FlowRunFilter, FlowRunFilterState
-    from prefect.client.schemas.filters import FlowRunFilterStateType as StateFilter
-    from prefect.client.schemas.objects import StateType
-
-    named = FlowFilter(name=FlowFilterName(any_=[flow]))
-    of_type = FlowRunFilterState(type=StateFilter(any_=[StateType[state] for state in states]))
+    named = prefect_filters.FlowFilter(name=prefect_filters.FlowFilterName(any_=[flow]))
+    of_type = prefect_filters.FlowRunFilterState(
+        type=prefect_filters.FlowRunFilterStateType(any_=[prefect_objects.StateType[state] for state in states])
+    )
     runs: list[Any] = client.read_flow_runs(
-        flow_filter=named, flow_run_filter=FlowRunFilter(state=of_type), limit=MOST_RUNS, **filters
+        flow_filter=named, flow_run_filter=prefect_filters.FlowRunFilter(state=of_type), limit=MOST_RUNS, **filters
     )
     return runs
 
 
 def _client() -> Any:
-    from prefect.client.orchestration import get_client
-
-    return get_client(sync_client=True)
+    return prefect_client.get_client(sync_client=True)

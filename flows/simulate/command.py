@@ -6,7 +6,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console
@@ -27,10 +27,16 @@ from models.network.process import keep_freed_memory, use_one_thread
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
+from pipeline.lazy import deferred
 from pipeline.simulator.selection.choice import UNIT_WORDS
 from storage.archive.keys import StageRef
 from storage.readers.scene_files import load_scene_file
 from storage.remote.opening import open_archive
+
+if TYPE_CHECKING:
+    import flows.simulate.effect_picture as effect_picture
+else:
+    effect_picture = deferred("flows.simulate.effect_picture")
 
 TITLES = {"effects": "effects that matter", "capture": "scan", "comparison": "the same with everything on"}
 PATCH, FACTOR = 16, 4  # of the weights that come with the house: scans are those of its surveys
@@ -91,10 +97,10 @@ def run_simulate(
     _print(record, console)
     if picture is None or found is None:
         return record
-    from flows.simulate.effect_picture import Words, draw_comparison  # matplotlib
-
     with writing(picture, "--compare"):
-        draw_comparison(picture, found, Words(f"{Path(settings.scene).stem}, seed {settings.seed}", settings.effects))
+        effect_picture.draw_comparison(
+            picture, found, effect_picture.Words(f"{Path(settings.scene).stem}, seed {settings.seed}", settings.effects)
+        )
     _print_comparison(found, picture, console)
     return record | {"comparison": {**found.record(), "picture": str(picture)}}
 

@@ -11,13 +11,27 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from flows.survey.survey import STAGES, Products, StageRunner, Step, survey
 from flows.terminal.processes import end_with_us, terminable
 from pipeline.errors import PipelineError
+from pipeline.lazy import deferred
 from storage.archive.keys import StageRef
 from storage.archive.staging import remove_tree, take_lock
+
+if TYPE_CHECKING:
+    import prefect
+    import prefect.cache_policies as prefect_cache_policies
+    import prefect.context as prefect_context
+    import prefect.server.api.server as prefect_server
+    import prefect.settings as prefect_settings
+else:
+    prefect = deferred("prefect")
+    prefect_cache_policies = deferred("prefect.cache_policies")
+    prefect_context = deferred("prefect.context")
+    prefect_server = deferred("prefect.server.api.server")
+    prefect_settings = deferred("prefect.settings")
 
 RETRY_DELAY_S = 2.0
 PASSWORD = f"spectralzoom:{secrets.token_urlsafe(24)}"  # of the ephemeral server that this process starts
@@ -63,31 +77,27 @@ def survey_with_prefect(runner: StageRunner, finish: Callable[[Step, Products], 
 
 def _password() -> dict[Any, str]:
     """What an ephemeral server and its client need so that it answers this process alone, and no page of a browser."""
-    from prefect.settings import (
-        PREFECT_API_AUTH_STRING,
-        PREFECT_SERVER_API_AUTH_STRING,
-        PREFECT_SERVER_CORS_ALLOWED_ORIGINS,
-    )
-
-    if "PREFECT_API_URL" in os.environ or PREFECT_SERVER_API_AUTH_STRING.value() or PREFECT_API_AUTH_STRING.value():
+    if (
+        "PREFECT_API_URL" in os.environ
+        or prefect_settings.PREFECT_SERVER_API_AUTH_STRING.value()
+        or prefect_settings.PREFECT_API_AUTH_STRING.value()
+    ):
         return {}
-    known = {PREFECT_API_AUTH_STRING: PASSWORD, PREFECT_SERVER_API_AUTH_STRING: PASSWORD}
-    return {**known, PREFECT_SERVER_CORS_ALLOWED_ORIGINS: "http://127.0.0.1"}
+    known = {
+        prefect_settings.PREFECT_API_AUTH_STRING: PASSWORD,
+        prefect_settings.PREFECT_SERVER_API_AUTH_STRING: PASSWORD,
+    }
+    return {**known, prefect_settings.PREFECT_SERVER_CORS_ALLOWED_ORIGINS: "http://127.0.0.1"}
 
 
 def inside_flow() -> bool:
     """Whether this is the body of a Prefect flow, which then holds the survey's tasks."""
     if "prefect" not in sys.modules:
         return False
-    from prefect.context import FlowRunContext
-
-    return FlowRunContext.get() is not None
+    return prefect_context.FlowRunContext.get() is not None
 
 
 def _task_step(runner: StageRunner) -> Step:
-    from prefect import task
-    from prefect.cache_policies import NO_CACHE
-
     def ref_of(uri: str) -> StageRef:
         return runner.run.archive.ref(*uri.split("/")[1:])
 
@@ -99,10 +109,10 @@ def _task_step(runner: StageRunner) -> Step:
         return None if ref is None else {"uri": ref.uri, "key": ref.key}
 
     def step(name: str, /, *inputs: StageRef) -> StageRef | None:
-        one = task(
+        one = prefect.task(
             name=name,
             task_run_name=f"{name}-{runner.run.name}",
-            cache_policy=NO_CACHE,
+            cache_policy=prefect_cache_policies.NO_CACHE,
             persist_result=False,
             retries=STAGES[name].retries,
             retry_delay_seconds=RETRY_DELAY_S,
@@ -119,13 +129,13 @@ def _task_step(runner: StageRunner) -> Step:
 
 
 def _run_flow(runner: StageRunner, finish: Callable[[Step, Products], Left]) -> Left:
-    from prefect import flow
-
     started: list[bool] = []
     stopped: list[KeyboardInterrupt] = []
     left: list[Left] = []
 
-    @flow(name="survey", flow_run_name=f"survey-{runner.run.name}", persist_result=False, validate_parameters=False)
+    @prefect.flow(
+        name="survey", flow_run_name=f"survey-{runner.run.name}", persist_result=False, validate_parameters=False
+    )
     def survey_flow(scene: str, seed: int, budget: float) -> None:
         """Sweep coarsely, look again where it changes the map, draw the map."""
         started.append(True)
@@ -153,14 +163,12 @@ def _stopping(stopped: list[KeyboardInterrupt]) -> Iterator[None]:
 
     Whoever ends a service ends the server too: Prefect then tries but once to tell it, and not for a minute.
     """
-    from prefect.settings import get_current_settings
-
     with terminable():
         try:
             yield
         except KeyboardInterrupt as error:
             stopped.append(error)
-            get_current_settings().client.max_retries = 0
+            prefect_settings.get_current_settings().client.max_retries = 0
             raise
 
 
@@ -170,23 +178,21 @@ def _guarded_server() -> Iterator[None]:
     if "PREFECT_API_URL" in os.environ:
         yield
         return
-    from prefect.server.api.server import SubprocessASGIServer
-
-    start = getattr(SubprocessASGIServer, "_run_uvicorn_command", None)
+    start = getattr(prefect_server.SubprocessASGIServer, "_run_uvicorn_command", None)
     if start is None:  # another version of Prefect: its server is ended at exit, not after a kill
         yield
         return
 
-    def guarded(self: SubprocessASGIServer) -> subprocess.Popen[Any]:
+    def guarded(self: prefect_server.SubprocessASGIServer) -> subprocess.Popen[Any]:
         process: subprocess.Popen[Any] = start(self)
         atexit.register(end_with_us(process.pid))  # asked before Prefect asks for its server's end, so called after it
         return process
 
-    SubprocessASGIServer._run_uvicorn_command = guarded  # type: ignore[method-assign]
+    prefect_server.SubprocessASGIServer._run_uvicorn_command = guarded  # type: ignore[method-assign]
     try:
         yield
     finally:
-        SubprocessASGIServer._run_uvicorn_command = start  # type: ignore[method-assign]
+        prefect_server.SubprocessASGIServer._run_uvicorn_command = start  # type: ignore[method-assign]
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from models.weights.files import Description
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.geometry.scan import Sweep
-from pipeline.lazy import Once
+from pipeline.lazy import Once, deferred
 from pipeline.simulator.effects.effect import Effect
 from pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE, farm_scene, law_of_key
 from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
@@ -28,6 +28,11 @@ from pipeline.source import Source
 from storage.readers.cube_sources import machine_bytes
 from storage.readers.raster_files import load_raster
 from storage.readers.scene_files import load_scene_file
+
+if TYPE_CHECKING:
+    import flows.survey.rig_field as rig_field
+else:
+    rig_field = deferred("flows.survey.rig_field")
 
 # Peak of a survey of the farm without controls: 1.58 GB for 1280 x 1024 px, 4.12 GB for 2560 x 2560 px
 FARM_BYTES, FARM_BYTES_PER_PX = 1_000_000_000, 490
@@ -227,9 +232,7 @@ def field_source(
     """Give who looks, as the settings say; raises what `flows.survey.rig_field.rig_field` does."""
     if settings.source != "rig":
         return SimulatedField(simulated)
-    from flows.survey.rig_field import rig_field  # drivers load pyserial and scipy, which others do without
-
-    return rig_field(scene, settings, planned)
+    return rig_field.rig_field(scene, settings, planned)
 
 
 def for_rig(settings: Settings) -> Settings:

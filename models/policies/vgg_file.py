@@ -10,11 +10,15 @@ from typing import TYPE_CHECKING
 
 from models.network.sizes import TRAINED_VGG_FROM, VGG_FROM
 from pipeline.errors import SettingsError, WeightsError
+from pipeline.lazy import deferred
 
 if TYPE_CHECKING:
-    from models.policies.vgg import VggFeatures, VggSaliency
+    import models.policies.vgg as vgg
+    from models.policies.vgg import VggFeatures
     from models.training.pretrained import LoadReport
     from models.weights.files import Weights
+else:
+    vgg = deferred("models.policies.vgg")
 
 
 @dataclass(frozen=True)
@@ -41,15 +45,13 @@ class VggFile:
         """What was taken from it. Raises WeightsError: another network, damaged, or changed since."""
         return _network_at(self)[1]
 
-    def saliency(self, weights: Weights) -> VggSaliency:
+    def saliency(self, weights: Weights) -> vgg.VggSaliency:
         """Give the policy for looks with the columns of ``weights``.
 
         Raises WeightsError as `report`, or its channels are none that these weights can give.
         """
-        from models.policies.vgg import VggSaliency, channels_of, colours_of  # loads torch
-
         network = _network_at(self)[0]
-        return VggSaliency(network, channels_of(weights, network) if self.trained else colours_of(weights))
+        return vgg.VggSaliency(network, vgg.channels_of(weights, network) if self.trained else vgg.colours_of(weights))
 
 
 def _hash(path: Path) -> str:
@@ -59,9 +61,7 @@ def _hash(path: Path) -> str:
 
 @lru_cache(maxsize=1)
 def _network_at(file: VggFile) -> tuple[VggFeatures, LoadReport]:
-    from models.policies.vgg import load_vgg  # loads torch
-
-    loaded = load_vgg(file.path, trained=file.trained)
+    loaded = vgg.load_vgg(file.path, trained=file.trained)
     if _hash(file.path) != file.key:
         raise WeightsError(f"the VGG19 {file.path} has changed since the survey began; start it again")
     return loaded

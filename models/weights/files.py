@@ -30,10 +30,12 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
+    from models.network import controls
     from models.network.controls import Network
     from models.network.segmenter import Segmenter
 else:
     torch = deferred("torch")
+    controls = deferred("models.network.controls")
 
 NORMALISATION = ("centre", "spread", "whitening")
 FORMAT, UNSEALED = "spectralzoom-weights/2", "spectralzoom-weights/1"  # the earlier one has no hashes
@@ -198,10 +200,8 @@ def _read(path: Path, described: Description) -> AnyWeights:
 
 
 def _network(config: SegmenterConfig, device: str) -> Network:
-    from models.network.controls import build_network  # loads torch
-
     with torch.device(device):
-        return build_network(config)
+        return controls.build_network(config)
 
 
 def read_tensors(path: Path, described: Description) -> dict[str, Tensor]:

@@ -21,10 +21,12 @@ from pipeline.errors import WeightsError
 from pipeline.lazy import deferred
 
 if TYPE_CHECKING:
+    import safetensors.torch as safetensors_torch
     import torch
     from torch import Tensor
 else:
     torch = deferred("torch")
+    safetensors_torch = deferred("safetensors.torch")
 
 ABOUT = "about"  # the text's name in the file
 TENSORS, SEAL = "tensors", "seal"  # entries of the description: hashes of the tensors by name, and its own
@@ -36,14 +38,12 @@ Checkpoint = tuple[dict[str, Any], "dict[str, Tensor]"]
 
 def write_sealed(path: Path, about: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
     """Write the file by a temporary name and a rename, so that it is whole or absent. Raises OSError."""
-    from safetensors.torch import save
-
     whole = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     hashed = {**about, TENSORS: {name: hash_of(tensor) for name, tensor in whole.items()}}
     text = json.dumps({**hashed, SEAL: _seal(hashed)}, sort_keys=True)
     temporary = path.with_name(path.name + ".part")
     try:
-        temporary.write_bytes(save(whole, {ABOUT: text}))
+        temporary.write_bytes(safetensors_torch.save(whole, {ABOUT: text}))
         temporary.replace(path)
     except OSError:
         with suppress(OSError):
