@@ -162,7 +162,7 @@ def test_no_file_imports_itself_in_a_circle() -> None:
 
 
 def test_files_say_at_their_heads_what_they_need() -> None:
-    """What takes long to load is deferred at the head of a file; functions import only what the table gives a reason."""
+    """What takes long to load is deferred at a file's head; functions import only what the table gives a reason for."""
     found: dict[str, set[str]] = {}
     for path, tree in source().items():
         inner = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
