@@ -1,9 +1,14 @@
-"""What a stage's code is: which definitions are reached, and what leaves their digest alone."""
+"""What a stage is: a module in the folder, and all code that is reached from it; what leaves its digest alone."""
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import pytest
 
+from flows.survey import stages
+from flows.survey.stage import all_stages
 from tests.flows.survey.stage_closure import Sources
 
 STAGE = """
@@ -188,3 +193,30 @@ def test_a_name_must_say_which() -> None:
         code.named("stage")
     with pytest.raises(LookupError, match="called gone, found it in no module"):
         code.named("gone")
+
+
+ADDED = """
+from flows.survey.stage import Product, Wanted, stage
+
+@stage("count_pixels", "pixels counted", Product("count", 1), of=("draw_map",), after=("ground",), unit="pixels")
+def count_pixels(run, class_map):
+    return Wanted(lambda path: None, {}, [class_map])
+"""
+
+
+def test_stages_run_once_what_they_are_made_of_has() -> None:
+    """The order of a survey follows from the records; what judges comes last."""
+    order = list(all_stages())
+    for name, one in all_stages().items():
+        assert all(order.index(before) < order.index(name) for before in (*one.of, *one.after))
+    assert [name for name, one in all_stages().items() if one.judges] == order[-1:]
+
+
+def test_a_module_is_all_that_a_stage_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is found and stands after what it names; nothing else had to know of it."""
+    (tmp_path / "counting.py").write_text(ADDED)
+    monkeypatch.setattr(stages, "__path__", [*stages.__path__, str(tmp_path)])
+    found = list(all_stages.__wrapped__())
+    monkeypatch.delitem(sys.modules, "flows.survey.stages.counting")
+    assert set(found) - set(all_stages()) == {"count_pixels"}
+    assert found.index("count_pixels") > found.index("ground")
