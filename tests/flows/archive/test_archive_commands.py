@@ -49,7 +49,7 @@ def _json(capsys: pytest.CaptureFixture[str], run: Callable[[], int], code: int 
 
 
 def test_ls_shows_runs_and_stores(surveyed: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """As JSON with figures, and for people with units."""
+    """As JSON with figures; for people with units, in 80 columns, into a pipe as well."""
     content = _json(capsys, lambda: ls(surveyed, as_json=True))
     first, second = content["runs"]
     assert (first["survey"], first["budget"], second["budget"], first["seed"]) == ("scene", 0.8, 0.7, 0)
@@ -63,6 +63,10 @@ def test_ls_shows_runs_and_stores(surveyed: Path, capsys: pytest.CaptureFixture[
     assert first["id"] in out
     assert content["stages"]["rectify"][0]["key"] in out
     assert "2 runs, 16 stores" in out
+    ls(surveyed)
+    out = capsys.readouterr().out
+    assert max(map(len, out.splitlines())) <= 80
+    assert "age" in out
 
 
 def test_of_many_stores_the_newest_are_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -303,11 +307,3 @@ def test_an_archive_surveyed_by_relative_paths_is_repaired_from_anywhere(
     for run in Catalogue.read(tmp_path / "archive").runs:
         assert run.settings["scene"] == str(scene_files / "scene.png")
         assert (run.settings["source"], run.settings["mask"]) == ("sim", None)
-
-
-def test_tables_of_a_plain_archive_fit_a_narrow_terminal(surveyed: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """80 columns, into a pipe as well."""
-    ls(surveyed)
-    out = capsys.readouterr().out
-    assert max(map(len, out.splitlines())) <= 80
-    assert "age" in out

@@ -152,7 +152,7 @@ def test_a_map_that_cannot_be_believed_is_not_compared(surveyed: Path, tmp_path:
 
 
 def test_previous_is_the_run_just_before(tmp_path: Path) -> None:
-    """Of the same field, whatever lies between; runs without a map do not count."""
+    """Of the same field, whatever lies between; runs without a map do not count; an empty archive has none."""
     archive = Archive.open(tmp_path)
     made = []
     for seed, product in ((0, "class_map"), (0, "class_map"), (0, "plan"), (1, "class_map"), (0, "class_map")):
@@ -162,6 +162,9 @@ def test_previous_is_the_run_just_before(tmp_path: Path) -> None:
             made.append(draft.id)
     catalogue = Catalogue.read(tmp_path)
     assert [find_run(catalogue, text).folder.name for text in ("latest", "previous")] == [made[4], made[1]]
+    Archive.open(tmp_path)
+    with pytest.raises(ArchiveError, match="no run of this archive"):
+        find_run(Catalogue.read(tmp_path), "latest")
 
 
 def test_a_file_in_the_place_of_the_folder_is_refused(surveyed: Path, tmp_path: Path) -> None:
@@ -173,13 +176,6 @@ def test_a_file_in_the_place_of_the_folder_is_refused(surveyed: Path, tmp_path: 
         with pytest.raises(ArchiveError, match=r"mine.* is or lies below a file, expected a folder; choose another"):
             compare(surveyed, "previous", "latest", out=out)
     assert (tmp_path / "mine").read_text() == "mine"
-
-
-def test_an_empty_archive_has_no_latest(tmp_path: Path) -> None:
-    """It says so."""
-    Archive.open(tmp_path)
-    with pytest.raises(ArchiveError, match="no run of this archive"):
-        find_run(Catalogue.read(tmp_path), "latest")
 
 
 def test_classes_are_matched_by_name() -> None:

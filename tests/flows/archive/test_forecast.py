@@ -81,8 +81,10 @@ def test_without_an_archive_the_plan_makes_none(settings: Settings, tmp_path: Pa
     assert {name: planned[name].why for name in WAITS} == {name: f"waits for {on}" for name, on in WAITS.items()}
 
 
-def test_planning_leaves_an_archive_as_it_is(settings: Settings, archive: Path) -> None:
-    """Every file and folder, the spool of a broken capture of the same key too."""
+def test_planning_leaves_an_archive_as_it_is(
+    settings: Settings, archive: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every file and folder, the spool of a broken capture too; not one line of light is asked for."""
     key = _plan(settings, archive)["capture_coarse"].key
     (archive / "spool" / str(key)).mkdir(parents=True)
     (archive / "spool" / str(key) / "lines").write_bytes(b"light")
@@ -90,10 +92,6 @@ def test_planning_leaves_an_archive_as_it_is(settings: Settings, archive: Path) 
     _plan(settings, archive)
     _plan(settings, archive, seed=9)
     assert _tree(archive) == before
-
-
-def test_no_light_is_simulated(settings: Settings, archive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Not one line of the scene is asked for."""
 
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError("the plan asked for light")

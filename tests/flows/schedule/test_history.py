@@ -75,7 +75,7 @@ def archive(tmp_path_factory: pytest.TempPathFactory, survey_png: Any) -> Path:
 
 
 def test_runs_and_ledger_are_one_history(archive: Path) -> None:
-    """Runs on schedule and by hand are of the field; what was due is counted; shares of the map add up."""
+    """Runs on schedule and by hand are counted; shares add up; what is brown on the map is brown on the page."""
     north, south = read_histories(Archive.open(archive))
     assert (north.field, south.field) == ("north", "south")
     assert north.counts == {"done": 1, "skipped": 721, "failed": 1}
@@ -83,10 +83,21 @@ def test_runs_and_ledger_are_one_history(archive: Path) -> None:
     assert sum(north.runs[0]["areas"].values()) == pytest.approx(1.0)
     assert north.runs[0]["miou"] is not None
     assert south.counts == {"done": 0, "skipped": 0, "failed": 0}
+    (north, _) = read_histories(Archive.open(archive))
+    receipt = json.loads((archive / north.runs[0]["run"] / "receipt.json").read_text())
+    shown = load_class_map(archive / receipt["products"]["class_map"])
+    wanted = {name: "#" + bytes(map(int, rgb)).hex() for name, rgb in zip(shown.names, shown.colours, strict=True)}
+    assert north.runs[0]["colours"] == wanted
+    page = render_history(north, "runs")
+    seen = [name for name, share in north.runs[0]["areas"].items() if share]
+    assert all(f'<i style="background:{wanted[name]}"></i>{name.replace("_", " ")}' in page for name in seen)
+    chart = line_chart({"a": [(0.0, 1.0)], "b": [(0.0, 1.0)]}, "x", colours={"b": "#123456", "c": "#654321"})
+    assert chart.legend == {"a": COLOURS[0], "b": "#123456"}
+    assert "#123456" in (chart.drawing or "")
 
 
-def test_a_page_loads_nothing_and_leads_to_reports(archive: Path, command_line: Any, tmp_path: Path) -> None:
-    """From disk, without script; every word is escaped; each link is a file that is there."""
+def test_pages_load_nothing_and_lead_to_reports(archive: Path, command_line: Any, tmp_path: Path) -> None:
+    """Without script, every word escaped; each link is a file that is there, on a field's page and on the index."""
     page = tmp_path / "pages" / "history.html"
     ended = command_line("report", archive, "--field", "north", "-o", page)
     assert ended.code == 0, ended.err
@@ -99,10 +110,6 @@ def test_a_page_loads_nothing_and_leads_to_reports(archive: Path, command_line: 
     assert len(found.links) == 2
     assert all((page.parent / link).is_file() for link in found.links)
     assert all(words in text for words in ("720 skipped", "no reply", "Share of the map", "attempt 2", "<svg"))
-
-
-def test_the_index_leads_to_every_field(archive: Path, command_line: Any, tmp_path: Path) -> None:
-    """Without a field there is a page for each, and one that tells how all of them fare."""
     page = tmp_path / "index.html"
     ended = command_line("report", archive, "-o", page)
     assert ended.code == 0, ended.err
@@ -168,21 +175,6 @@ def test_whatever_a_receipt_claims_is_drawn_or_left_out(points: list[tuple[float
     chart = line_chart({"soil": points}, "Share", "%")
     assert (chart.drawing or "").count("<use") == drawn
     assert (chart.drawing is None) == (drawn == 0 and len(points) == 1)
-
-
-def test_classes_have_the_colours_of_the_map(archive: Path) -> None:
-    """What is brown on the map is brown on the page; series without a colour of their own take one in turn."""
-    (north, _) = read_histories(Archive.open(archive))
-    receipt = json.loads((archive / north.runs[0]["run"] / "receipt.json").read_text())
-    shown = load_class_map(archive / receipt["products"]["class_map"])
-    wanted = {name: "#" + bytes(map(int, rgb)).hex() for name, rgb in zip(shown.names, shown.colours, strict=True)}
-    assert north.runs[0]["colours"] == wanted
-    page = render_history(north, "runs")
-    seen = [name for name, share in north.runs[0]["areas"].items() if share]
-    assert all(f'<i style="background:{wanted[name]}"></i>{name.replace("_", " ")}' in page for name in seen)
-    chart = line_chart({"a": [(0.0, 1.0)], "b": [(0.0, 1.0)]}, "x", colours={"b": "#123456", "c": "#654321"})
-    assert chart.legend == {"a": COLOURS[0], "b": "#123456"}
-    assert "#123456" in (chart.drawing or "")
 
 
 def test_the_way_to_an_archive(tmp_path: Path) -> None:

@@ -85,13 +85,9 @@ def stranger() -> Iterator[str]:
     thread.join()
 
 
-def test_an_answer_that_is_none_ends_nothing(stranger: str) -> None:
-    """An address at which something else listens gets no notice, and nobody is the wiser."""
+def test_who_speaks_another_protocol_does_not_answer(stranger: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A notice to it is lost without a word; a Prefect server that is none is refused in one message."""
     assert not send_notice(stranger, Outcome("north", NOON, "failed", "no reply"), "archive")
-
-
-def test_a_named_server_that_speaks_another_protocol(stranger: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is refused in one message, as one that does not answer."""
     from flows.schedule.server import server_for
 
     for url in (stranger, "http://127.0.0.1:port/api"):
@@ -173,8 +169,16 @@ def test_a_notice_follows_no_redirect(listener: tuple[str, list[dict[str, Any]]]
     assert (sent, asked, posted) == (False, ["/hook"], [])
 
 
-def test_what_ended_alike_is_one_notice() -> None:
-    """For each field and ending one that counts; what ended alone is as it was, and keeps its reason."""
+def test_what_ended_alike_is_one_notice_that_counts(listener: tuple[str, list[dict[str, Any]]]) -> None:
+    """For each field and ending; what ended alone is as it was, counts as one, and keeps its reason."""
+    address, posted = listener
+    outcomes = [Outcome("north", NOON + timedelta(hours=number), "skipped", "too late") for number in range(2)]
+    for outcome in (outcomes[0], *together(outcomes)):
+        assert send_notice(address, outcome, "archive")
+    lone, several = posted
+    assert (lone["count"], "since" in lone) == (1, False)
+    assert lone.keys() < several.keys()
+    assert (several["count"], several["since"], several["due"]) == (2, "2026-06-01T12:00:00Z", "2026-06-01T13:00:00Z")
     skipped = [Outcome("north", NOON + timedelta(hours=number), "skipped", f"late by {number}") for number in range(3)]
     failed, other = Outcome("north", NOON, "failed", "no reply"), Outcome("south", NOON, "skipped", "too late")
     many, one, two = together([*skipped[:2], failed, skipped[2], other])
@@ -184,18 +188,6 @@ def test_what_ended_alike_is_one_notice() -> None:
     assert many.words() == (
         "north, 3 due between 2026-06-01 12:00:00 and 2026-06-01 14:00:00 UTC, skipped: the last one: late by 2"
     )
-
-
-def test_a_notice_of_several_counts_them(listener: tuple[str, list[dict[str, Any]]]) -> None:
-    """It has what a notice of one has, how many there are and since when; a lone one counts as one."""
-    address, posted = listener
-    outcomes = [Outcome("north", NOON + timedelta(hours=number), "skipped", "too late") for number in range(2)]
-    for outcome in (outcomes[0], *together(outcomes)):
-        assert send_notice(address, outcome, "archive")
-    lone, several = posted
-    assert (lone["count"], "since" in lone) == (1, False)
-    assert lone.keys() < several.keys()
-    assert (several["count"], several["since"], several["due"]) == (2, "2026-06-01T12:00:00Z", "2026-06-01T13:00:00Z")
 
 
 def test_an_outage_is_one_notice_and_the_next_run_does_not_wait(tmp_path: Path) -> None:

@@ -271,8 +271,11 @@ def test_the_kernel_frees_the_rig_of_a_killed_process(tmp_path: Path) -> None:
     lock.release()
 
 
-def test_a_survey_by_hand_outlasts_a_look(tmp_path: Path) -> None:
-    """A schedule that looks whether the rig is free does not keep a survey off; one that surveys does."""
+def test_each_rig_has_one_lock(tmp_path: Path) -> None:
+    """The simulated one is the archive's own; a look does not keep a survey off, a survey does."""
+    rig = replace(Settings(), source="rig")
+    assert rig_lock(rig, tmp_path / "a").place == rig_lock(rig, tmp_path / "b").place
+    assert rig_lock(Settings(), tmp_path / "a").place != rig_lock(Settings(), tmp_path / "b").place
     looking, survey = RigLock(tmp_path / "rig.lock"), RigLock(tmp_path / "rig.lock")
     assert looking.take("a look at the schedule")
     later = threading.Timer(0.2, looking.release)
@@ -281,10 +284,3 @@ def test_a_survey_by_hand_outlasts_a_look(tmp_path: Path) -> None:
     later.join()
     assert not RigLock(tmp_path / "rig.lock").take_soon("another")
     survey.release()
-
-
-def test_each_rig_has_one_lock(tmp_path: Path) -> None:
-    """The rig's is the same for every archive; that of the simulated one is the archive's own."""
-    rig = replace(Settings(), source="rig")
-    assert rig_lock(rig, tmp_path / "a").place == rig_lock(rig, tmp_path / "b").place
-    assert rig_lock(Settings(), tmp_path / "a").place != rig_lock(Settings(), tmp_path / "b").place

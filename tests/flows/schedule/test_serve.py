@@ -70,12 +70,17 @@ def test_refused_before_anything_is_served(
 
 
 def test_two_serves_on_one_archive(field_file: Callable[..., Path], command_line: Any) -> None:
-    """The second is refused, and nothing of the first is changed."""
+    """The second is refused while the first serves, and not after it."""
     file = field_file()
     with alone_on(load_fields([file])):
         ended = command_line("serve", file, "--every", "30m", "--engine", "plain")
     assert (ended.code, len(ended.errors)) == (1, 1)
     assert "another serve works on the archive" in ended.errors[0]
+    fields = load_fields([field_file()])
+    with alone_on(fields), pytest.raises(ArchiveError, match="another serve"), alone_on(fields):
+        pass
+    with alone_on(fields):
+        pass
 
 
 def test_two_serves_of_one_rig(field_file: Callable[..., Path], tmp_path: Path, command_line: Any) -> None:
@@ -234,15 +239,6 @@ def test_the_picture_of_an_artifact_is_small(survey_png: Any, tmp_path: Path) ->
     assert "archive/runs/x/report.html" in text
     assert all(row["cost"] in text for row in savings_rows(published.receipt))
     assert artifact_key("North_field 7") == "north-field-7"
-
-
-def test_alone_means_alone(field_file: Callable[..., Path]) -> None:
-    """The lock of a serve is free again after it."""
-    fields = load_fields([field_file()])
-    with alone_on(fields), pytest.raises(ArchiveError, match="another serve"), alone_on(fields):
-        pass
-    with alone_on(fields):
-        pass
 
 
 def refuse(monkeypatch: pytest.MonkeyPatch, field: str, event: str) -> None:

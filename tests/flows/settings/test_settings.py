@@ -41,21 +41,13 @@ def toml(tmp_path: Path):
     return write
 
 
-def test_nothing_given_is_the_default():
-    """No file and no flag gives the defaults of the design."""
+def test_defaults_and_parts_are_read_back():
+    """No file and no flag gives the design's defaults; every part is read back; effects are those that exist."""
     found = load_settings()
     assert found == Settings()
     assert (found.scene, found.budget, found.policy, found.memory) == ("farm", 0.5, "gain", 4 * 2**30)
-
-
-def test_every_field_of_the_dataclasses_can_be_set():
-    """Every part of the survey and of the rig is read back from its plain values."""
     for name in ("camera", "cost", "optics", "mirror", "detector", "air", "sky"):
         assert parse_settings({name: asdict(getattr(Settings(), name))}) == Settings()
-
-
-def test_words_are_those_of_the_parts_that_use_them():
-    """Effects that the settings accept are exactly those that exist."""
     every = ",".join(effect.name for effect in EFFECTS)
     assert parse_settings({"effects": every}).effects == every
 
@@ -77,19 +69,21 @@ def test_paths_of_a_file_start_at_its_folder(toml):
     assert load_settings(toml('scene = "farm"')).scene == "farm"
 
 
-def test_example_in_the_project_is_valid():
-    """The example that the README points to is accepted and says the defaults."""
+def test_the_example_says_every_default():
+    """It is what `python -m flows.settings.documents > survey.example.toml` makes, and valid."""
     found = load_settings(EXAMPLE)
     assert replace(found, out=Settings.out) == Settings()
-
-
-def test_example_is_what_the_declarations_say():
-    """The file is made of them; after a change: python -m flows.settings.documents > survey.example.toml."""
     assert EXAMPLE.read_text(encoding="utf-8") == example_toml()
+    lines = [line.removeprefix("# ") for line in EXAMPLE.read_text(encoding="utf-8").splitlines()]
+    named = {line.partition("=")[0].strip() for line in lines if "=" in line}
+    assert {item.name for item in fields(Settings)} - set(TABLES) <= named
+    for name, keys in TABLES.items():
+        assert f"[{name}]" in lines
+        assert set(keys) <= named, name
 
 
-def test_the_table_of_documents_has_every_setting():
-    """With its default, what it may be, and a line of help, in as many cells everywhere."""
+def test_documents_have_every_setting_with_its_default():
+    """A line of help each, in as many cells everywhere, and a default that its own range does not refuse."""
     rows = [line.split(" | ") for line in settings_table().splitlines() if line.startswith("| `")]
     assert [row[0].strip("| `") for row in rows] == [
         *(name for name in SURVEY if name not in TABLES),
@@ -97,25 +91,11 @@ def test_the_table_of_documents_has_every_setting():
     ]
     assert {len(row) for row in rows} == {4}
     assert ["| `samples`", "`640`", "a whole number from 16 to 65536", "Pixels of a line [px] |"] in rows
-
-
-def test_every_setting_says_what_it_is_and_takes_its_default():
-    """A line of help each, and a default (or an example) that its own range does not refuse."""
     for keys in ({name: one for name, one in SURVEY.items() if name not in TABLES}, *TABLES.values()):
         for name, one in keys.items():
             assert one.item.metadata["description"], name
             value = one.told["example"] if one.item.default in (None, MISSING) else one.item.default
             assert one.read(str(value) if isinstance(value, Tolerance) else value, name) is not None
-
-
-def test_example_lists_every_setting():
-    """Those without a default, and whole tables, stand in comments."""
-    lines = [line.removeprefix("# ") for line in EXAMPLE.read_text(encoding="utf-8").splitlines()]
-    named = {line.partition("=")[0].strip() for line in lines if "=" in line}
-    assert {item.name for item in fields(Settings)} - set(TABLES) <= named
-    for name, keys in TABLES.items():
-        assert f"[{name}]" in lines
-        assert set(keys) <= named, name
 
 
 @pytest.mark.parametrize(
@@ -192,6 +172,8 @@ def test_memory_reads_units(text, count):
         ({"memory": "4"}, "at least 256MiB"),
         ({"scheduler": "dask"}, "'scheduler': .* threads, processes, or the address of a dask scheduler such as tcp:"),
         ({"workers": 0}, "a whole number from 1 to 1024, got 0; one process or thread each"),
+        ({"scheduler": ""}, "^'scheduler' must be text that is not empty"),
+        ({"scheduler": 3}, "^'scheduler' must be text that is not empty"),
         ({"rounds": 1}, r"unknown setting 'rounds'; there is one round of detail: .* was removed; leave it out$"),
         ({"rounds": 2}, r"unknown setting 'rounds'; there is one round of detail: .* was removed; leave it out$"),
         ({"threshold": -1}, "threshold' must be a number from 0 to 1e\\+09 nat per second, got -1"),
@@ -376,10 +358,3 @@ def test_receipt_settings_read_back_the_same(budget, seed, bands, memory, exposu
     )
     assert parse_settings(settings.to_dict()) == settings
     assert parse_settings(json.loads(to_json(settings.to_dict()))) == settings
-
-
-@pytest.mark.parametrize("value", ["", 3])
-def test_a_scheduler_that_is_no_text_is_named_once(value):
-    """A setting stands once in its message."""
-    with pytest.raises(SettingsError, match=r"^'scheduler' must be text that is not empty"):
-        parse_settings({"scheduler": value})

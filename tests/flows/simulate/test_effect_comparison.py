@@ -215,8 +215,8 @@ def decided(scene_files: Path, tmp_path_factory: pytest.TempPathFactory) -> tupl
     return out, choose(opened(scene_files, out))
 
 
-def test_the_manifest_has_every_effect_and_the_totals(decided: tuple[Path, StageRef]) -> None:
-    """In the order of the chain, on as asked, those left out measured within their bounds."""
+def test_the_manifest_and_the_source_have_what_was_decided(decided: tuple[Path, StageRef], scene_files: Path) -> None:
+    """Every effect in the chain's order, those left out within their bounds; the source has variants and clock."""
     manifest = load_manifest(decided[1])
     rows = {row["name"]: row for row in manifest["effects"]}
     assert list(rows) == [effect.name for effect in EFFECTS]
@@ -227,10 +227,6 @@ def test_the_manifest_has_every_effect_and_the_totals(decided: tuple[Path, Stage
     }
     assert rows["diffraction"]["bound"] >= rows["diffraction"]["measured"] > 0
     assert (manifest["total"]["asked"], manifest["total"]["tolerance"]) == (ASKED, 0.1)
-
-
-def test_the_source_has_what_was_decided(scene_files: Path, decided: tuple[Path, StageRef]) -> None:
-    """Effects with their variants, and the clock that is given."""
     source = source_with(opened(scene_files, decided[0]).simulated, decided[1], {"a": 3.0})
     on = {row["name"]: row["variant"] for row in load_manifest(decided[1])["effects"] if row["state"] == "on"}
     assert {effect.name: variant for effect, variant in source.choice.effects} == on

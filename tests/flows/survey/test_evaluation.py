@@ -131,8 +131,18 @@ def test_an_older_receipt_scores_as_it_would_now_or_not_at_all(
 
 
 def test_a_receipt_of_now_gives_its_own_figures():
-    """Both figures as they stand there."""
+    """Both means; the worst class of the truth; and each map that shows a false class, with its pixels."""
     assert score_of(make_receipt()) == {"miou": 0.75, "overall_accuracy": 0.934}
+    accuracy: Any = copy.deepcopy(make_receipt()["accuracy"])
+    assert worst_class(accuracy) == ("bare_weed", 0.2, 0.6, 0.8)
+    accuracy["per_class_iou"] = {"wheat": None}
+    assert worst_class(accuracy) is None
+    accuracy: Any = copy.deepcopy(make_receipt()["accuracy"])
+    accuracy["none"]["false_classes"] = {"wheat": 30, "bare_track": 1}
+    words = "Shown although the truth has none: this survey wheat 2 px; none wheat 30 px, bare track 1 px."
+    assert false_class_words(accuracy) == words
+    accuracy["false_classes"] = accuracy["none"]["false_classes"] = {}
+    assert false_class_words(accuracy) == ""
 
 
 @pytest.mark.parametrize("accuracy", [None, 3, {}, {"miou": "x"}, {"per_class_iou": [1], "none": 2, "all": None}])
@@ -140,24 +150,6 @@ def test_what_was_not_judged_has_no_score(accuracy: object):
     """No labels, or a receipt that somebody has damaged."""
     assert score_of({"accuracy": accuracy}) == {"miou": None, "overall_accuracy": None}
     assert score_of({}) == {"miou": None, "overall_accuracy": None}
-
-
-def test_the_worst_class_is_one_of_the_truth():
-    """A false class has no IoU and cannot be it; nothing judged has none."""
-    accuracy: Any = copy.deepcopy(make_receipt()["accuracy"])
-    assert worst_class(accuracy) == ("bare_weed", 0.2, 0.6, 0.8)
-    accuracy["per_class_iou"] = {"wheat": None}
-    assert worst_class(accuracy) is None
-
-
-def test_false_classes_are_told_of_every_map():
-    """Each map that shows one is named, with the pixels of each class."""
-    accuracy: Any = copy.deepcopy(make_receipt()["accuracy"])
-    accuracy["none"]["false_classes"] = {"wheat": 30, "bare_track": 1}
-    words = "Shown although the truth has none: this survey wheat 2 px; none wheat 30 px, bare track 1 px."
-    assert false_class_words(accuracy) == words
-    accuracy["false_classes"] = accuracy["none"]["false_classes"] = {}
-    assert false_class_words(accuracy) == ""
 
 
 @given(MAP, MAP)

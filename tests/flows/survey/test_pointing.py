@@ -51,17 +51,13 @@ def surveyed(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], 
     return json.loads(json.dumps(found)), archive
 
 
-def test_coarse_sweeps_are_put_right_by_their_seams(surveyed: tuple[dict[str, Any], Path]) -> None:
-    """What registration finds of every sweep beside the one it held is what the simulator got wrong."""
+def test_sweeps_are_put_right_by_seams_and_on_the_mosaic(surveyed: tuple[dict[str, Any], Path]) -> None:
+    """What registration finds beside the sweep it held is what the simulator got wrong, within half a pixel."""
     coarse, errors = surveyed[0]["pointing"]["coarse"], PointingErrors(OFF_PX, 0.0, SEED)
     assert len(coarse["sweeps"]) > 1
     for name, offset in coarse["sweeps"].items():
         assert np.abs(errors.offset(name) - errors.offset(coarse["held"]) - offset).max() < 0.4
     assert coarse["residual_rms_px"] is None  # windows are no more than unknowns: that they fit says nothing
-
-
-def test_fine_sweeps_are_put_right_on_the_mosaic(surveyed: tuple[dict[str, Any], Path]) -> None:
-    """Every fine sweep that could be compared lies on the mosaic within half a pixel."""
     pointing, errors = surveyed[0]["pointing"], PointingErrors(OFF_PX, 0.0, SEED)
     held = errors.offset(pointing["coarse"]["held"])
     told = {
@@ -72,23 +68,15 @@ def test_fine_sweeps_are_put_right_on_the_mosaic(surveyed: tuple[dict[str, Any],
         assert np.abs(errors.offset(name) - held - offset).max() < 0.5
 
 
-def test_what_the_mirror_missed_is_told(surveyed: tuple[dict[str, Any], Path]) -> None:
-    """Seats that the fine sweeps saw in part are counted, as their patches say."""
+def test_what_the_mirror_missed_is_told_and_detail_still_helps(surveyed: tuple[dict[str, Any], Path]) -> None:
+    """Seats seen in part are counted, either pass has its sentence, and with patches the map is better than without."""
     receipt, archive = surveyed
     values = read_array(open_group(archive / receipt["products"]["patches"]), "values")
     partly = np.isnan(values).all(axis=3).any(axis=(1, 2))
     assert receipt["pointing"]["fine"]["partly_seen"] == np.count_nonzero(partly)
-
-
-def test_the_mirror_is_told_of_in_words(surveyed: tuple[dict[str, Any], Path]) -> None:
-    """Terminal and report have a sentence for either pass."""
     words = " ".join(sentences(surveyed[0]))
     assert "The coarse sweeps were put right by up to" in words
     assert "The fine sweeps were put right by up to" in words
-
-
-def test_detail_still_helps(surveyed: tuple[dict[str, Any], Path]) -> None:
-    """Patches lie where the map says: with them the map is better than without."""
     accuracy = surveyed[0]["accuracy"]
     assert accuracy["miou"] > accuracy["none"]["miou"]
 
@@ -170,18 +158,14 @@ def shared_px(sweeps: list[Sweep]) -> float:
     return min(float(left[1] - right[0]) for left, right in pairwise(reach))
 
 
-def test_either_pass_overlaps_by_what_it_needs() -> None:
-    """64 pixels of its own are left where neighbours look as far apart as they can; the full scan pays for no more."""
+def test_either_pass_overlaps_and_reaches_by_what_it_needs() -> None:
+    """Neighbours that look as far apart as they can share 64 px, and both ends of the field are seen."""
     plan = plan_capture(parse_settings({"pointing_px": OFF, "budget": 1.0}), GRID)
     assert plan.along == "x"
     assert plan.overlap_px == 2 * OFF + 64 * 4
     assert shared_px(plan.coarse) >= plan.overlap_px - 1e-3
     assert shared_px(plan.full) >= 2 * OFF + 64 - 1e-3
     assert len(plan.full) == int(np.ceil(1500 / (640 - 2 * OFF - 64)))
-
-
-def test_sweeps_reach_beyond_the_field_by_twice_the_error() -> None:
-    """The sweep that is held may look one way and its neighbour the other: both ends of the map are seen by both."""
     plan = plan_capture(parse_settings({"pointing_px": OFF, "budget": 1.0}), GRID)
     for sweep in (*plan.coarse, *plan.full):
         held = sweep.held_px()

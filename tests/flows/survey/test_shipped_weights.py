@@ -59,36 +59,24 @@ def controls(weights: Weights) -> Controls:
     return run_controls(weights, seen, columns, np.asarray(scene.labels), share=0.35, seed=41)
 
 
-def test_file_is_sealed_and_its_key_is_that_of_before() -> None:
-    """Every tensor has its hash; what was made with these weights before they had is still theirs."""
+def test_file_is_sealed_small_and_tells_its_making(weights: Weights) -> None:
+    """Hashes, the key of before, at most 8 MB; command, seed, law of the data, and figures of scenes not trained on."""
     assert describe_weights(PATH).sealed
     assert content_key(PATH) == "8ea1bd282d34bea7e1a8"
-
-
-def test_file_is_small_and_tells_its_making(weights: Weights) -> None:
-    """At most 8 MB, with command, seed, law of the data and validation figures."""
     assert PATH.stat().st_size <= 8e6
     assert weights.record["command"].startswith("spectralzoom train farm")
     assert weights.record["data"] == FARM_LAW
     assert weights.record["settings"]["seed"] == 0
     assert weights.record["validation"]["entropy"]["miou"] > 0.8
     assert weights.class_names == tuple(entry for entry in CLASSES)
-
-
-def test_validation_scenes_were_not_trained_on(weights: Weights) -> None:
-    """No scene is in both lists of the split."""
     split = weights.record["split"]
     assert not set(split["train"]) & set(split["validation"])
 
 
 def test_detail_where_the_map_is_unsure_beats_chance(controls: Controls) -> None:
-    """At K = 35 % entropy is above random by more than the spread of five random placements."""
+    """At K = 35 % entropy is above random by more than its spread, and more than half of the way to all."""
     rows = controls.as_dict()
     assert rows["entropy"]["miou"] > rows["random"]["miou"] + rows["random"]["spread"]
-
-
-def test_a_third_of_the_seats_is_nearer_to_all_than_to_none(controls: Controls) -> None:
-    """At K = 35 % the map by entropy closes more than half of the way from no detail to all detail."""
     none, every = mean_iou(controls.none), mean_iou(controls.every)
     assert every - none > 0.05
     assert mean_iou(controls.policies["entropy"]) > (none + every) / 2

@@ -128,9 +128,7 @@ def test_a_moved_definition_leaves_the_digest() -> None:
     assert digest(moved) == digest({})
 
 
-def test_local_names_are_no_imports() -> None:
-    """A parameter, a loop's variable and a comprehension's that are called as a definition do not reach it."""
-    text = """
+LOCAL_NAMES = """
 from models.light import Lamp, brighter, STEP
 
 def stage(Lamp):
@@ -138,18 +136,8 @@ def stage(Lamp):
         print(brighter)
     return [STEP for STEP in Lamp] + [(lambda stage: stage)(1)]
 """
-    assert Sources(TEXTS | {"flows.survey.stages": text}).closure(["stage"]) == {("flows.survey.stages", "stage")}
-
-
-def test_a_global_beside_a_comprehension_is_reached() -> None:
-    """A comprehension's variable hides a definition in the comprehension alone."""
-    text = "from models.light import STEP\n\ndef stage(x):\n    return [STEP for STEP in x], STEP\n"
-    assert ("models.light", "STEP") in Sources(TEXTS | {"flows.survey.stages": text}).closure(["stage"])
-
-
-def test_registrations_come_with_their_module() -> None:
-    """What registers itself, by a bare statement or a decorator of our own, counts once its module is reached."""
-    text = """
+BESIDE = "from models.light import STEP\n\ndef stage(x):\n    return [STEP for STEP in x], STEP\n"
+REGISTERED = """
 from pipeline.table import KNOWN, register
 
 def stage():
@@ -160,14 +148,7 @@ def one(): return 1
 
 KNOWN.append(2)
 """
-    table = "KNOWN = []\n\ndef register(one):\n    KNOWN.append(one)\n    return one\n"
-    found = Sources({"flows.survey.stages": text, "pipeline.table": table}).closure(["stage"])
-    assert {("flows.survey.stages", ""), ("flows.survey.stages", "one"), ("pipeline.table", "register")} <= found
-
-
-def test_names_in_casts_are_followed() -> None:
-    """A type imported for the checker alone leads to its class."""
-    text = """
+CAST = """
 from typing import TYPE_CHECKING, cast
 
 if TYPE_CHECKING:
@@ -176,7 +157,38 @@ if TYPE_CHECKING:
 def stage(lamp):
     return cast("Lamp", lamp).lit()
 """
-    assert ("pipeline.shapes", "Shape") in Sources(TEXTS | {"flows.survey.stages": text}).closure(["stage"])
+TABLE = "KNOWN = []\n\ndef register(one):\n    KNOWN.append(one)\n    return one\n"
+STAGES_OWN = ("flows.survey.stages", "stage")
+
+
+@pytest.mark.parametrize(
+    ("text", "reached"),
+    [
+        (BESIDE, {STAGES_OWN, ("models.light", "STEP")}),
+        (LOCAL_NAMES, {STAGES_OWN}),
+        (
+            CAST,
+            {
+                STAGES_OWN,
+                *(REACHED & {("models.light", name) for name in ("Lamp", "STEP")}),
+                ("pipeline.shapes", "Shape"),
+            },
+        ),
+        (
+            REGISTERED,
+            {
+                *((STAGES_OWN[0], name) for name in ("stage", "one", "")),
+                ("pipeline.table", "KNOWN"),
+                ("pipeline.table", "register"),
+            },
+        ),
+    ],
+    ids=["a global beside a comprehension", "local names", "a type in a cast", "registrations"],
+)
+def test_what_names_lead_to(text: str, reached: set[tuple[str, str]]) -> None:
+    """Local names hide definitions; what registers itself comes with its module; types for the checker count."""
+    code = Sources(TEXTS | {"flows.survey.stages": text, "pipeline.table": TABLE})
+    assert code.closure(["stage"]) == reached
 
 
 def test_a_barrier_ends_the_way() -> None:

@@ -133,8 +133,8 @@ def test_savings_add_up(farm: Done) -> None:
 
 
 @pytest.mark.parametrize("name", ["farm", "picture"])
-def test_savings_agree_with_the_stored_cubes(name: str, request: pytest.FixtureRequest) -> None:
-    """Lines, samples on the scene and bytes of the receipt are those of the raw cubes that lie in the archive."""
+def test_savings_are_those_of_the_stored_cubes(name: str, request: pytest.FixtureRequest) -> None:
+    """Lines, samples on the scene and bytes are the cubes'; seconds are the cost model's price of either pass."""
     done: Done = request.getfixturevalue(name)
     savings, sweeps = done.receipt["savings"], done.sweeps()
     shape = tuple(done.open("class_map").sizes[axis] for axis in ("y", "x"))
@@ -144,11 +144,6 @@ def test_savings_agree_with_the_stored_cubes(name: str, request: pytest.FixtureR
     assert savings["bytes_raw"]["done"] == sum(cube["dn"].nbytes for cube, _ in sweeps)
     files = [file for _, path in sweeps for file in path.rglob("*") if file.is_file()]
     assert savings["bytes_stored"]["done"] == sum(file.stat().st_size for file in files)
-
-
-@pytest.mark.parametrize("name", ["farm", "picture"])
-def test_seconds_are_those_of_the_stored_sweeps(name: str, request: pytest.FixtureRequest) -> None:
-    """Capture time is the price of the coarse pass and of the fine pass, each by the cost model, lines as stored."""
     done: Done = request.getfixturevalue(name)
     sweeps = [Sweep(**cube.attrs["sweep"]) for cube, _ in done.sweeps()]
     passes = [[sweep for sweep in sweeps if sweep.kind == kind] for kind in ("coarse", "fine")]
@@ -253,8 +248,11 @@ def test_without_labels_there_is_no_accuracy(survey_png: Any, scene_files: Path,
     assert stored.tolist() == [float(word) for word in nm.split(",")]
 
 
-def test_report_and_picture_open_from_disk(farm: Done) -> None:
-    """The report asks the network for nothing and the quicklook is a picture of useful size."""
+def test_products_are_where_the_receipt_says_and_open_from_disk(farm: Done) -> None:
+    """Addresses are relative; the report asks the network for nothing; the quicklook is of useful size."""
+    for name, address in farm.receipt["products"].items():
+        assert (farm.archive / address).exists(), name
+    assert (farm.published.folder / "receipt.json").read_text().startswith('{\n  "survey": "farm"')
     folder = farm.archive / farm.receipt["products"]["report.html"]
     html = folder.read_text(encoding="utf-8")
     assert not re.search(r"https?://|src=['\"]//|@import", html)
@@ -262,13 +260,6 @@ def test_report_and_picture_open_from_disk(farm: Done) -> None:
     with Image.open(farm.archive / farm.receipt["products"]["quicklook.png"]) as image:
         assert image.format == "PNG"
         assert min(image.size) >= 600
-
-
-def test_products_are_where_the_receipt_says(farm: Done) -> None:
-    """Every address is relative to the archive and there; the stored receipt is the one returned."""
-    for name, address in farm.receipt["products"].items():
-        assert (farm.archive / address).exists(), name
-    assert (farm.published.folder / "receipt.json").read_text().startswith('{\n  "survey": "farm"')
 
 
 def test_another_policy_looks_at_other_places(picture: Done, survey_png: Any, tmp_path: Path) -> None:

@@ -109,7 +109,7 @@ def without(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey) -> tup
 def test_a_threshold_leaves_seconds_and_says_so(
     without: tuple[Published, Path], survey_png: Survey, tmp_path: Path
 ) -> None:
-    """Above what the plan shows a second less is bought; the receipt has what is left; the budget still holds."""
+    """Less is bought, and the receipt has what is left; without a threshold no store knows of it."""
     mean = without[0].receipt["plan"]["score_per_second"]
     receipt: Any = survey_png(tmp_path, threshold=str(1.02 * mean), **FLAGS).receipt
     plan = receipt["plan"]
@@ -120,6 +120,13 @@ def test_a_threshold_leaves_seconds_and_says_so(
     assert plan["spared_score"] > 0
     assert "unspent: no further run of lines pays" in " ".join(sentences(receipt))
     assert "threshold" not in without[0].receipt["plan"]
+    receipt: Any = without[0].receipt
+    key = next(stage["key"] for stage in receipt["stages"] if stage["name"] == "attend")
+    folder = without[1] / "stages" / "attend" / key
+    assert not {"threshold", "spared_s"} & set(json.loads((folder / "plan.json").read_text()))
+    manifest = json.loads((folder / "manifest.json").read_text())
+    assert not {"threshold", "rounds", "round"} & set(manifest["params"])
+    assert not {"threshold", "spared_s"} & set(receipt["plan"])
 
 
 def test_a_threshold_above_all_gains_draws_the_coarse_map(survey_png: Survey, tmp_path: Path) -> None:
@@ -129,17 +136,6 @@ def test_a_threshold_above_all_gains_draws_the_coarse_map(survey_png: Survey, tm
     assert done.looked_twice == 0
     assert receipt["plan"]["lines"] == 0
     assert receipt["accuracy"]["miou"] == receipt["accuracy"]["none"]["miou"]
-
-
-def test_a_survey_without_a_threshold_stores_nothing_of_it(without: tuple[Published, Path]) -> None:
-    """The plan, its keys and the receipt know no word of thresholds or rounds: old stores are found as they were."""
-    receipt: Any = without[0].receipt
-    key = next(stage["key"] for stage in receipt["stages"] if stage["name"] == "attend")
-    folder = without[1] / "stages" / "attend" / key
-    assert not {"threshold", "spared_s"} & set(json.loads((folder / "plan.json").read_text()))
-    manifest = json.loads((folder / "manifest.json").read_text())
-    assert not {"threshold", "rounds", "round"} & set(manifest["params"])
-    assert not {"threshold", "spared_s"} & set(receipt["plan"])
 
 
 @pytest.fixture(scope="module")

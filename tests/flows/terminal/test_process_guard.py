@@ -66,13 +66,9 @@ def held() -> tuple[int, list[int]]:
     return len(list(Path("/proc/self/fd").iterdir())), children_of(os.getpid())
 
 
-def test_a_killed_process_leaves_none_behind() -> None:
-    """What was bound to end with a process does so when it is killed."""
+def test_a_killed_process_leaves_none_behind_but_what_it_let_go_of() -> None:
+    """What was bound to it ends with it; a number that was let go of may be a stranger's."""
     assert wait_until_gone(killed_beside_a_child())
-
-
-def test_what_was_let_go_of_is_left_alone() -> None:
-    """A number that was let go of may be a stranger's: nothing is sent to it when the process that held it ends."""
     stranger = killed_beside_a_child("let go")
     try:
         assert not wait_until_gone(stranger, 0.5)

@@ -58,14 +58,10 @@ def errors(entry: Tradeoff, state: object) -> dict[object, float]:
 
 
 def test_the_stage_has_its_knobs_the_exact_setting_first():
-    """Tolerance, slit, groups of bands, bands, supersampling and noise are what the simulator trades."""
+    """Tolerance, slit, groups, bands, supersampling and noise; a variant that an effect gains is measured unasked."""
     found = find_tradeoffs("simulate")
     assert set(found) == {TOLERANCE, FOOTPRINT, GROUP_COUNT, BAND_COUNT, SUPERSAMPLING, NOISE, DIM_NOISE}
     assert [entry.settings[0] for entry in (TOLERANCE, FOOTPRINT, GROUP_COUNT)] == [EXACT, SLIT.variants[0], EACH]
-
-
-def test_variants_are_those_that_effects_have():
-    """A variant that an effect gains is measured without a word here."""
     assert FOOTPRINT.settings == (*SLIT.variants, OFF)
     assert NOISE.settings == (*SHOT.variants, OFF)
     assert set(SLIT.variants) < set(SUPERSAMPLING.settings)
@@ -83,13 +79,6 @@ def test_what_is_chosen_keeps_its_bound_and_the_bound_its_tolerance(lines: FarmL
     assert found[TOLERANCES[-1]] > 0
 
 
-def test_finer_boxes_are_nearer_to_the_footprint(lines: FarmLines):
-    """The finest is the reference, and a mere ray errs by the most."""
-    found = errors(FOOTPRINT, Seen(lines, seen_by(lines)))
-    assert found[SLIT.variants[0]] == 0
-    assert found[OFF] == max(found.values()) > 10 * found[SLIT.variants[1]]
-
-
 def test_figures_of_a_change_by_hand():
     """Two samples of 400 and 10,000 electrons, the first 30 brighter: in its noise, by the root of two less, in DN."""
     against = Against(np.array([[[400.0, 1e4]]], np.float32), np.array([[[30.0, 100.0]]], np.float32), 5.0)
@@ -99,10 +88,13 @@ def test_figures_of_a_change_by_hand():
     assert [level.error for level in against.levels()] == pytest.approx([0.1, 2.5 / 30])
 
 
-def test_an_effect_is_put_in_another_variant_or_left_out(lines: FarmLines):
-    """The order of the others stays."""
+def test_finer_boxes_are_nearer_to_the_footprint(lines: FarmLines):
+    """The finest is the reference, a mere ray errs most; an effect changed or left out leaves the others' order."""
     assert list(with_variant(lines.footprint, SLIT, "1x1")) == list(lines.footprint)
     assert SLIT not in with_variant(lines.footprint, SLIT, OFF)
+    found = errors(FOOTPRINT, Seen(lines, seen_by(lines)))
+    assert found[SLIT.variants[0]] == 0
+    assert found[OFF] == max(found.values()) > 10 * found[SLIT.variants[1]]
 
 
 def test_bands_of_a_group_share_the_mean_blur():
