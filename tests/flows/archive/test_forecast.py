@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +19,7 @@ from flows.terminal.progress import put_out
 from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from pipeline.simulator.simulated import SimulatedSource
 from storage.archive.archive import Archive
-from tests.flows.stage_doubles import be_version
+from tests.flows.conftest import be_version, python
 
 WAITS = {"locate": "capture_coarse", "rectify": "locate", "attend": "rectify", "capture_fine": "attend"}
 ON_REQUEST = ["register_coarse", "register_fine", "ground"]
@@ -187,8 +185,7 @@ def test_a_plan_loads_neither_torch_nor_figures_nor_maps() -> None:
     """They take seconds: who needs one imports it in the function that does."""
     heavy = {"torch", "matplotlib", "xarray", "odc.geo", "rasterio", "scipy", "pandas", "prefect", "distributed"}
     code = "import sys, flows.cli.main, flows.archive.plan_command; print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert not heavy & set(done.stdout.split())
+    assert not heavy & set(python(code).stdout.split())
 
 
 def _size(archive: Path, stage: str) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from PIL import Image
 from rich.console import Console
 
 from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
@@ -23,25 +21,12 @@ from flows.survey.survey import STAGES
 from models.weights.files import save_weights
 from pipeline.errors import SettingsError
 from storage.archive.archive import Archive
-from storage.remote.opening import verify_archive
 from tests.conftest import RGB_NM, random_weights
-from tests.flows.conftest import CommandLine
-from tests.flows.stage_doubles import act_instead, be_version
+from tests.flows.conftest import CommandLine, act_instead, be_version, problems, turned
 from tests.storage.small_archive import flip
 
 QUIET = Console(quiet=True)
 Refuse = Callable[[Path, Path, pytest.MonkeyPatch], None]
-
-
-def tells(pattern: str, lines: list[str]) -> bool:
-    """Whether the one error that was told matches."""
-    (line,) = lines
-    return re.search(pattern, line) is not None
-
-
-def problems(out: Path) -> list[str]:
-    """What verify finds."""
-    return [f"{one.uri} {one.problem}" for one in verify_archive(Archive.open(out)) if one.problem]
 
 
 def receipts(out: Path) -> list[Any]:
@@ -248,17 +233,12 @@ def test_labels_may_come_later(
     survey(labels=None)
     monkeypatch.chdir(scene)
     ended = command_line("evaluate", out, "latest")
-    assert tells("there are no labels to judge runs/.* by; give --labels FILE", ended.errors)
+    ended.refused(1, "there are no labels to judge runs/.* by; give --labels FILE")
     assert command_line("evaluate", out, "latest", "--labels", "labels.png").code == 0
     (receipt,) = receipts(out)
     assert receipt["accuracy_is"] == "judged"
     assert receipt["settings"]["labels"] == str(scene / "labels.png")
     assert comparable(receipt)["accuracy"] == survey().receipt["accuracy"]
-
-
-def _other_scene(scene: Path, out: Path, patch: pytest.MonkeyPatch) -> None:
-    with Image.open(scene / "scene.png") as image:
-        image.transpose(Image.Transpose.ROTATE_180).save(scene / "scene.png")
 
 
 def _other_weights(scene: Path, out: Path, patch: pytest.MonkeyPatch) -> None:
@@ -271,7 +251,10 @@ def _mosaic_gone(scene: Path, out: Path, patch: pytest.MonkeyPatch) -> None:
 
 
 REFUSED: dict[str, tuple[Refuse, str]] = {
-    "another scene": (_other_scene, "is another than runs/.* looked at; put that one back"),
+    "another scene": (
+        lambda scene, *_: turned(scene / "scene.png", scene / "scene.png"),
+        "is another than runs/.* looked at; put that one back",
+    ),
     "no scene": (lambda scene, *_: (scene / "scene.png").unlink(), "there is no file .*scene.png"),
     "a damaged receipt": (
         lambda scene, out, patch: flip(Archive.open(out).runs()[0] / "receipt.json"),
@@ -298,9 +281,7 @@ def test_what_cannot_be_judged_is_refused(
     spoil(scene, unjudged, monkeypatch)
     (run,) = Archive.open(unjudged).runs()
     before = (run / "manifest.json").read_bytes()
-    ended = command_line("evaluate", unjudged, run.name)
-    assert (ended.code, len(ended.errors)) == (1, 1), ended.err
-    assert tells(message, ended.errors)
+    command_line("evaluate", unjudged, run.name).refused(1, message)
     assert (run / "manifest.json").read_bytes() == before
     assert Archive.open(unjudged).runs() == [run]
 
@@ -321,9 +302,7 @@ WORDS = {
 def test_words_that_mean_neither_are_refused(case: str, surveyed: Path, command_line: CommandLine) -> None:
     """One message that says which of the two wants what, or which runs there are."""
     code, words, message = WORDS[case]
-    ended = command_line("evaluate", *words.replace("ARCHIVE", str(surveyed)).split())
-    assert (ended.code, len(ended.errors)) == (code, 1), ended.err
-    assert tells(message, ended.errors)
+    command_line("evaluate", *words.replace("ARCHIVE", str(surveyed)).split()).refused(code, message)
 
 
 @pytest.mark.parametrize(

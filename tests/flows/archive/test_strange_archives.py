@@ -11,7 +11,9 @@ from typing import Any
 import pytest
 
 from flows.cli.main import main
+from flows.publish import survey_command
 from flows.publish.run_folder import Published
+from flows.survey.prefect_engine import EngineUnavailable
 from flows.survey.stage import versions
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
@@ -194,9 +196,18 @@ def name_products(small: Small, lead: str) -> None:
 @pytest.mark.parametrize("lead", LEADS)
 @pytest.mark.parametrize("change", [list_file, rest_on, call_itself, name_products])
 def test_no_verb_leaves_the_archive(
-    tmp_path: Path, change: Callable[[Small, str], None], lead: str, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
+    change: Callable[[Small, str], None],
+    lead: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Each verb ends with an answer or one message; what lies beside the archive stays, and none of it is shown."""
+
+    def no_server(*given: object) -> None:  # else each repair waits for one
+        raise EngineUnavailable("none here")
+
+    monkeypatch.setattr(survey_command, "survey_with_prefect", no_server)
     root = tmp_path / "archive"
     change(small_survey(Archive.open(root), simulated=False), lead)
     secrets = [tmp_path / "secret", root / "secret", root / "stages" / "secret"]

@@ -208,6 +208,8 @@ def test_very_many_missed_due_times_have_one_line(tmp_path: Path) -> None:
     assert lines[-1]["count"] == 30 * 72 - 1
     assert schedule.pending() == [NOON + timedelta(days=30)]
     assert schedule.ledger.lines() == lines
+    assert schedule.begin(NOON + timedelta(minutes=20)) is None
+    assert schedule.begin(clock.now() - timedelta(minutes=21)) is None
     assert schedule.begin(NOON + timedelta(days=30)) == 1
     assert [line["event"] for line in schedule.ledger.lines()] == ["opened", "passed", "begun"]
 

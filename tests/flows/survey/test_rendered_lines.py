@@ -58,8 +58,10 @@ def expected() -> list[Line]:
 
 @pytest.mark.parametrize(
     ("scheduler", "workers", "size"),
-    [("threads", 1, 64), ("threads", 2, 1), ("threads", 2, 70), ("threads", 5, 7)]
-    + [("processes", 2, 16), ("tcp://192.0.2.1:8786", 2, 16)],  # without this process's memory: left to threads here
+    [  # crews without this process's memory, even of a scheduler that is not there, leave it to threads here
+        *(("threads", 1, 64), ("threads", 2, 1), ("threads", 2, 70), ("threads", 5, 7)),
+        *(("processes", 2, 16), ("tcp://192.0.2.1:8786", 2, 16)),
+    ],
 )
 def test_neither_crew_nor_blocks_change_a_number(
     expected: list[Line], monkeypatch: pytest.MonkeyPatch, scheduler: str, workers: int, size: int

@@ -191,10 +191,8 @@ def test_a_survey_by_a_trained_network(trained_file: Path, survey_png: Any, tmp_
     assert done.receipt["savings"]["multiply_adds"]["score"] == score
 
 
-def test_a_trained_network_that_reads_other_channels_is_refused_before_anything_is_captured(
-    trained_file: Path, survey_png: Any, tmp_path: Path
-) -> None:
-    """Channels beyond the weights, or a number of them that says nothing: the message says which, nothing is left."""
+def test_files_that_are_no_such_network_are_refused_first(trained_file: Path, survey_png: Any, tmp_path: Path) -> None:
+    """Channels beyond the weights or unsaid, another policy's file, another network, no file: nothing is left."""
     state = torch.load(trained_file, weights_only=True)
     torch.save(state | {"wavelength_nm": torch.tensor([640.0, 1640.0])}, tmp_path / "far.pth")
     del state["wavelength_nm"]
@@ -205,10 +203,6 @@ def test_a_trained_network_that_reads_other_channels_is_refused_before_anything_
     with pytest.raises(WeightsError, match="is for the policy vgg-trained"):
         survey_png(tmp_path / "archive", policy="vgg-static", vgg=str(trained_file))
     assert not (tmp_path / "archive").exists()
-
-
-def test_a_file_that_is_no_vgg19_is_refused_before_anything_is_captured(survey_png: Any, tmp_path: Path) -> None:
-    """A missing file is a matter of usage; another network leaves no archive."""
     with pytest.raises(SettingsError, match=r"no file .*none\.pth; --vgg takes the weights of VGG19"):
         survey_png(tmp_path / "archive", policy="vgg-static", vgg=str(tmp_path / "none.pth"))
     torch.save({"blocks.0.weight": torch.from_numpy(np.zeros((2, 2)))}, tmp_path / "vit.pth")

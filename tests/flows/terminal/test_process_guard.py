@@ -15,6 +15,7 @@ import pytest
 
 from flows.terminal import processes
 from flows.terminal.processes import KeptProcess, end_with_us, refusal_words
+from tests.flows.conftest import python
 from tests.soak.processes import children_of, is_alive
 
 SLEEPS = [sys.executable, "-c", "import time; print('up', flush=True); time.sleep(60)"]
@@ -37,10 +38,7 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 def killed_beside_a_child(*words: str) -> int:
     """Have a process killed that bound another to itself; gives the other."""
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
-    ended = subprocess.run(
-        [sys.executable, "-c", ENDS, *words], env=environment, capture_output=True, text=True, check=False
-    )
+    ended = python(ENDS, *words)
     assert ended.returncode == -signal.SIGKILL
     return int(ended.stdout)
 

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 from rich.console import Console
 
 from flows.cli.main import main
@@ -175,42 +174,13 @@ def test_a_survey_with_a_control_is_refused(folder: Path, out: Path):
             open_run(load_settings(None, flags), planning=planning)
 
 
-TOML = """
-labels = "labels/{number}_labels.png"
-[classes]
-left = [0, 0, 0]
-right = [255, 0, 0]
-"""
-SHORT = TrainingSettings(steps=2, batch=1, crop=64, minutes=5)
-
-
-@pytest.fixture
-def halves(tmp_path: Path) -> Path:
-    """Three small frames with labels: bright on the right."""
-    rng = np.random.default_rng(3)
-    (tmp_path / "labels").mkdir()
-    for number in ("001", "002", "003"):
-        image = rng.integers(0, 60, (64, 72, 3)).astype(np.uint8)
-        labels = np.zeros((64, 72, 3), np.uint8)
-        image[:, 40:] += 120
-        labels[:, 40:, 0] = 255
-        Image.fromarray(image).save(tmp_path / f"{number}.png")
-        Image.fromarray(labels).save(tmp_path / "labels" / f"{number}_labels.png")
-    (tmp_path / "scene.toml").write_text(TOML)
-    return tmp_path
-
-
-def _two_steps(dataset: Path | str, out: Path, **more: object) -> TrainRequest:
-    """A training run of two steps."""
-    return TrainRequest(str(dataset), out, patch=8, factor=2, width=8, settings=SHORT, **more)  # type: ignore[arg-type]
-
-
-def test_a_survey_says_that_a_scene_was_trained_on(out: Path, halves: Path, tmp_path: Path) -> None:
+def test_a_survey_says_that_a_scene_was_trained_on(folder: Path, out: Path) -> None:
     """The accuracy on a training scene comes with a warning, that on a held-out one does not."""
-    train_weights(_two_steps(halves, out, hold_out=("002",), validation=0))
+    train_weights(_request(folder, out, hold_out=("002",), validation=0))
     notes = {}
     for number in ("001", "002"):
-        flags = {"scene": str(halves / f"{number}.png"), "weights": str(out), "out": str(tmp_path / "a"), "budget": 1}
+        scene = folder / "images" / f"{number}_image.png"
+        flags = {"scene": str(scene), "weights": str(out), "out": str(out.parent / "a"), "budget": 1}
         notes[number] = " ".join(open_run(load_settings(None, flags)).notes)
     assert "trained on this scene" in notes["001"]
     assert "trained on this scene" not in notes["002"]
@@ -225,7 +195,8 @@ def test_pixels_trained_on_are_not_judged(out: Path, tmp_path: Path) -> None:
     np.save(tmp_path / "labels.npy", labels)
     np.save(tmp_path / "mask.npy", mask)
     given = {"labels": str(tmp_path / "labels.npy"), "wavelengths": [500, 600, 700, 800]}
-    train_weights(_two_steps(tmp_path / "cube.npy", out, choices={**given, "train_mask": str(tmp_path / "mask.npy")}))
+    choices = {**given, "train_mask": str(tmp_path / "mask.npy")}
+    train_weights(_request(tmp_path / "cube.npy", out, choices=choices))
     flags = {**given, "scene": str(tmp_path / "cube.npy"), "weights": str(out), "out": str(tmp_path / "a"), "budget": 1}
     run = open_run(load_settings(None, flags))
     assert run.labels is not None
@@ -233,13 +204,13 @@ def test_pixels_trained_on_are_not_judged(out: Path, tmp_path: Path) -> None:
     assert (run.labels[10:] != 255).all()
 
 
-def test_the_same_seed_gives_the_same_weights(out: Path, halves: Path, tmp_path: Path) -> None:
+def test_the_same_seed_gives_the_same_weights(folder: Path, out: Path) -> None:
     """Two runs of one command agree to rounding, in another order of sums; another seed gives other weights."""
     found = []
     for name, seed in (("one", 0), ("two", 0), ("other", 1)):
-        out = tmp_path / f"{name}.safetensors"
-        train_weights(replace(_two_steps(halves, out, validation=0), settings=replace(SHORT, seed=seed)))
-        tensors = load_weights(out).segmenter.state_dict().values()
+        path = out.with_name(f"{name}.safetensors")
+        train_weights(_request(folder, path, validation=0, settings=replace(SETTINGS, steps=2, seed=seed)))
+        tensors = load_weights(path).segmenter.state_dict().values()
         found.append(np.concatenate([tensor.numpy().ravel().astype(np.float64) for tensor in tensors]))
     one, two, other = found
     assert np.linalg.norm(one - two) < 1e-3 * np.linalg.norm(one - other)
