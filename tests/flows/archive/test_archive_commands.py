@@ -85,10 +85,13 @@ def test_of_many_stores_the_newest_are_shown(tmp_path: Path, capsys: pytest.Capt
 
 
 def test_ages_are_told_in_days(surveyed: Path) -> None:
-    """And a clock that was set back gives no error."""
+    """A clock that was set back gives no error; progress goes to the console, not among answers."""
     for days in (3, -3):
         content = contents(Archive.open(surveyed), datetime.now(UTC) + timedelta(days=days))
         assert content["stages"]["rectify"][0]["age_s"] == pytest.approx(days * 86400, abs=1000)
+    told = io.StringIO()
+    run_verify(surveyed, Console(file=told))
+    assert "reading again: 100%" in told.getvalue()
 
 
 @pytest.mark.parametrize(
@@ -148,10 +151,8 @@ def test_explain_shows_lineage_and_what_changed(surveyed: Path, capsys: pytest.C
     assert "fine_s" in out
 
 
-def test_a_fine_capture_is_not_taken_for_a_version_of_the_coarse_one(
-    surveyed: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Both are of the stage capture; the first survey's coarse sweeps are the first of their kind."""
+def test_captures_and_runs_are_explained(surveyed: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Coarse and fine sweeps are not versions of each other; a run has its command, and each store once."""
     assert _json(capsys, lambda: explain(surveyed, "raw_coarse", as_json=True))["before"] is None
     explain(surveyed, "raw_coarse")
     assert "no earlier version" in capsys.readouterr().out
@@ -159,10 +160,6 @@ def test_a_fine_capture_is_not_taken_for_a_version_of_the_coarse_one(
     (earlier,) = [run for run in contents(Archive.open(surveyed))["runs"] if run["budget"] == 0.8]
     runs = _json(capsys, lambda: explain(surveyed, fine["before"], as_json=True))["runs"]
     assert runs == [f"runs/{earlier['id']}"]
-
-
-def test_a_run_is_explained_by_its_command_and_stores(surveyed: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Each store opens once; what nothing else was made of is at the top."""
     (first, _) = (run["id"] for run in contents(Archive.open(surveyed))["runs"])
     content = _json(capsys, lambda: explain(surveyed, first, as_json=True))
     assert [tree["stage"] for tree in content["lineage"]] == ["evaluate", "turned"]
@@ -265,13 +262,6 @@ def test_a_repair_that_could_do_some_of_it_says_so(archive: Path, capsys: pytest
     assert "restore them from a copy" in content["repair"]["hopeless"]["stages/ingest/cube"]
     content = _json(capsys, lambda: run_verify(archive, QUIET, remake=True, as_json=True), FAILED)
     assert [one["uri"] for one in content["problems"]] == ["stages/ingest/cube"]
-
-
-def test_progress_is_told_on_the_console(surveyed: Path) -> None:
-    """Not on stdout, which is for the answer."""
-    told = io.StringIO()
-    run_verify(surveyed, Console(file=told))
-    assert "reading again: 100%" in told.getvalue()
 
 
 def test_commands_ask_for_the_settings_again(tmp_path: Path) -> None:

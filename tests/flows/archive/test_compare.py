@@ -48,7 +48,7 @@ def _map(classes: np.ndarray[Any, Any], names: tuple[str, ...], seed: int = 0) -
 
 
 def test_a_run_is_the_same_as_itself(surveyed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Nothing differs, and every class agrees wholly."""
+    """Every class agrees wholly; the picture lies beside the archive, which is left as it is."""
     content = _compared(capsys, surveyed, "latest", "latest", tmp_path)
     assert content["differing"] == {"pixels": 0, "share": 0.0, "pairs": 0}
     assert (content["settings"], content["versions"], content["largest"]) == ([], [], [])
@@ -56,6 +56,11 @@ def test_a_run_is_the_same_as_itself(surveyed: Path, tmp_path: Path, capsys: pyt
     assert content["confidence"]["change"] == 0
     assert compare(surveyed, "latest", "latest", out=tmp_path) == 0
     assert "settings and versions are the same" in capsys.readouterr().out
+    old, new = (path.name for path in Archive.open(surveyed).runs())
+    before = sorted(surveyed.rglob("*"))
+    content = _compared(capsys, surveyed, old, f"runs/{new}")
+    assert Path(content["picture"]) == surveyed.parent / f"compare-{old}-{new}.png"
+    assert sorted(surveyed.rglob("*")) == before
 
 
 def test_two_budgets_are_told_apart_either_way(
@@ -86,15 +91,6 @@ def test_two_budgets_are_told_apart_either_way(
     assert {(row["from"], row["to"], row["pixels"]) for row in one["largest"]} == {
         (row["to"], row["from"], row["pixels"]) for row in other["largest"]
     }
-
-
-def test_the_picture_lies_beside_the_archive(surveyed: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Named by both runs; the archive itself is left as it is."""
-    old, new = (path.name for path in Archive.open(surveyed).runs())
-    before = sorted(surveyed.rglob("*"))
-    content = _compared(capsys, surveyed, old, f"runs/{new}")
-    assert Path(content["picture"]) == surveyed.parent / f"compare-{old}-{new}.png"
-    assert sorted(surveyed.rglob("*")) == before
 
 
 def test_new_weights_and_hectares_are_told(
@@ -174,7 +170,7 @@ def test_a_file_in_the_place_of_the_folder_is_refused(surveyed: Path, tmp_path: 
 
 
 def test_classes_are_matched_by_name() -> None:
-    """The same map under another order of names is the same map; a class that only one list has stays its own."""
+    """In another order it is the same map; a class of one list alone stays its own; sizes have to agree."""
     classes = np.random.default_rng(3).integers(0, 3, (9, 7)).astype(np.uint8)
     classes[0, 0] = UNLABELLED
     order = np.full(256, UNLABELLED, np.uint8)
@@ -185,6 +181,8 @@ def test_classes_are_matched_by_name() -> None:
     np.testing.assert_array_equal(pair.maps.old, pair.maps.new)
     assert not pair.maps.pairs
     assert np.trace(pair.joint) == classes.size
+    with pytest.raises(ShapeError, match=r"\(4, 4\) and \(4, 5\)"):
+        _pair_of([_map(np.zeros((4, width)), ("a",)) for width in (4, 5)])
 
 
 def test_hectares_are_told_where_both_runs_have_them() -> None:
@@ -213,14 +211,8 @@ def test_confidence_is_compared_where_both_have_a_class() -> None:
     assert set(_confidence(old[2:3], new[2:3]).values()) == {None}
 
 
-def test_maps_of_different_sizes_are_refused() -> None:
-    """With both sizes."""
-    with pytest.raises(ShapeError, match=r"\(4, 4\) and \(4, 5\)"):
-        _pair_of([_map(np.zeros((4, width)), ("a",)) for width in (4, 5)])
-
-
 def test_changes_have_colours_of_their_own() -> None:
-    """The largest pairs each, the rest dark, what is the same light; pixels without a class count as a class."""
+    """The largest pairs each, the rest dark, what is the same light; maps of any shape and name are drawn."""
     rng = np.random.default_rng(1)
     names = tuple("abcdef")
     old, new = (rng.integers(0, 6, (40, 50)).astype(np.uint8) for _ in range(2))
@@ -232,6 +224,11 @@ def test_changes_have_colours_of_their_own() -> None:
     np.testing.assert_array_equal((picture == np.float32(SAME)).all(axis=-1), old == new)
     assert (picture == np.float32(OTHER)).all(axis=-1).any()
     assert (maps.name(0), maps.name(UNLABELLED)) == ("a", "no class")
+    for shape in ((1, 90), (300, 8)):
+        zero = np.zeros(shape, np.uint8)
+        drawn = draw_difference(MapPair(zero, zero, ("a $x$_b",), np.zeros((1, 3), np.uint8), []), ("A", "B", "none"))
+        with Image.open(io.BytesIO(drawn)) as picture:
+            assert picture.format == "PNG"
 
 
 @pytest.mark.parametrize(("step", "shape"), [(1, (6, 9)), (3, (2, 3)), (4, (2, 3)), (20, (1, 1))])
@@ -247,12 +244,3 @@ def test_no_change_is_left_out_of_a_thinned_picture(step: int, shape: tuple[int,
     assert (maps.old[tuple(place)], maps.new[tuple(place)]) == (old[4, 8], 7)
     if step == 3:
         np.testing.assert_array_equal(maps.old[0], old[0, ::3])
-
-
-def test_wide_tall_and_equal_maps_are_drawn() -> None:
-    """Names with dollar signs are text."""
-    for shape in ((1, 90), (300, 8)):
-        zero = np.zeros(shape, np.uint8)
-        drawn = draw_difference(MapPair(zero, zero, ("a $x$_b",), np.zeros((1, 3), np.uint8), []), ("A", "B", "none"))
-        with Image.open(io.BytesIO(drawn)) as picture:
-            assert picture.format == "PNG"

@@ -98,8 +98,10 @@ def test_planning_leaves_an_archive_as_it_is(
     assert _plan(settings, archive, seed=9)["capture_coarse"].state == "to run"
 
 
-def test_the_reason_is_what_differs(settings: Settings, archive: Path, make_weights: Any) -> None:
-    """A parameter with both values, where it began for a store further down, and weights as such."""
+def test_the_reason_is_what_differs(
+    settings: Settings, archive: Path, make_weights: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A parameter with both values, where it began, weights as such, and the version of a stage."""
     planned = _plan(settings, archive, kernel="nearest")
     assert planned["rectify"].why == "kernel: catmull-rom before, nearest now"
     assert planned["attend"].why == "kernel of rectify: catmull-rom before, nearest now"
@@ -112,12 +114,6 @@ def test_the_reason_is_what_differs(settings: Settings, archive: Path, make_weig
     other = _plan(settings, archive, weights=str(make_weights(layers=2)))
     assert other["rectify"].state == "cached"
     assert other["attend"].why == "other weights than in the newest store"
-
-
-def test_a_stage_of_another_version_is_made_again(
-    settings: Settings, archive: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The reason names the version; the stage below is still read."""
     be_version(monkeypatch, "rectify", 99)
     planned = _plan(settings, archive)
     assert planned["locate"].state == "cached"
@@ -201,18 +197,14 @@ def test_judging_with_controls_is_not_estimated_by_judging_without(settings: Set
     assert row.seconds is None
 
 
-def test_a_damaged_store_blocks_what_needs_it(settings: Settings, archive: Path) -> None:
-    """With the archive's own words, which say what to do."""
+def test_a_damaged_store_blocks_what_needs_it(settings: Settings, archive: Path, tmp_path: Path) -> None:
+    """With the archive's own words; an archive that is a file is refused as a survey refuses it."""
     store = Archive(archive).refs("rectify")[0]
     (store.path / "lines.json").unlink()
     planned = _plan(settings, archive)
     assert planned["rectify"].state == "blocked"
     assert "verify --repair" in planned["rectify"].why
     assert planned["attend"].why == "waits for rectify"
-
-
-def test_what_the_survey_refuses_the_plan_refuses(settings: Settings, tmp_path: Path) -> None:
-    """An archive that is a file."""
     (tmp_path / "file").write_text("no archive")
     with pytest.raises(ArchiveError, match="is a file"):
         _plan(settings, tmp_path / "file")

@@ -166,16 +166,12 @@ def test_what_was_ingested_is_a_scene(tmp_path: Path, raw: NDArray[np.uint16]) -
     assert again["lost_lines"] == 2
 
 
-def test_geotiff_by_rows(tmp_path: Path, real_data: Path) -> None:
-    """A GeoTIFF is read some rows at a time, and gives the numbers that a scene of it has."""
+def test_real_files_come_back_bit_by_bit(tmp_path: Path, real_data: Path) -> None:
+    """A GeoTIFF read some rows at a time, and raw frames of a space-borne imager."""
     pytest.importorskip("rasterio")
     path = real_data / "rgbn" / "rgbn.tif"
     data = opened(ingest(path, tmp_path / "archive"))
     np.testing.assert_array_equal(data["values"], load_scene_file(path).values)
-
-
-def test_real_raw_frames(tmp_path: Path, real_data: Path) -> None:
-    """Raw frames of a space-borne imager come back bit by bit; the header says nothing of wavelengths."""
     header = next((real_data / "emit_raw").glob("*.hdr"))
     record = ingest(header, tmp_path / "archive")
     data = opened(record)

@@ -142,16 +142,28 @@ def test_where_accuracy_is_stored_the_run_is_published_once(
     assert comparable(first) == comparable(second)
 
 
-def test_a_survey_of_other_words_leaves_the_run_of_another(
+def test_a_stopped_run_is_judged_by_its_own_words(
     survey: Callable[..., Any], out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It publishes one of its own; the stopped one is judged by its own words."""
+    """A survey of other words leaves it and publishes one of its own."""
     break_off(survey, monkeypatch, name="north")
     survey(name="south")
     assert {one["survey"]: is_pending(one) for one in receipts(out)} == {"north": True, "south": False}
     survey(name="north")
     assert {one["survey"]: is_pending(one) for one in receipts(out)} == {"north": False, "south": False}
     assert len(receipts(out)) == 2
+
+
+def test_reprocess_adds_what_a_stopped_survey_lacks(
+    survey: Callable[..., Any], out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The field is not as it would become: its run is judged, and no other is made."""
+    break_off(survey, monkeypatch)
+    for _ in range(2):
+        assert run_reprocess(ReprocessRequest(out), QUIET) == 0
+        (receipt,) = receipts(out)
+        assert receipt["accuracy_is"] == "judged"
+    assert problems(out) == []
 
 
 def test_a_run_that_is_being_judged_is_left_alone(
@@ -168,18 +180,6 @@ def test_a_run_that_is_being_judged_is_left_alone(
         assert ended.errors == [f"runs/{run.name} is being judged by another process; it adds the accuracy"]
         survey()
     assert [is_pending(one) for one in receipts(out)] == [True, False]
-
-
-def test_reprocess_adds_what_a_stopped_survey_lacks(
-    survey: Callable[..., Any], out: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The field is not as it would become: its run is judged, and no other is made."""
-    break_off(survey, monkeypatch)
-    for _ in range(2):
-        assert run_reprocess(ReprocessRequest(out), QUIET) == 0
-        (receipt,) = receipts(out)
-        assert receipt["accuracy_is"] == "judged"
-    assert problems(out) == []
 
 
 def test_ls_and_the_receipt_say_that_a_map_is_not_judged_yet(

@@ -140,7 +140,7 @@ def test_an_interrupted_run_goes_on(archive: Path, other: Path, reprocess: Repro
 
 
 def test_a_newer_stage_is_run_for_those_that_rest_on_an_older(
-    archive: Path, reprocess: Reprocess, monkeypatch: pytest.MonkeyPatch
+    archive: Path, reprocess: Reprocess, monkeypatch: pytest.MonkeyPatch, surveyed: Path
 ) -> None:
     """A raised version makes it and what follows anew, and `--stage` finds the fields; light is not captured again."""
     assert reprocess(archive, stage="segment") == []
@@ -155,6 +155,9 @@ def test_a_newer_stage_is_run_for_those_that_rest_on_an_older(
     assert _captures(archive) == light
     assert reprocess.states(archive) == [("scene", "ran"), ("turned", "skipped")]
     assert _captures(archive) == light
+    be_version(monkeypatch, "rectify", 99)
+    assert len(reprocess(surveyed, stage="segment", dry_run=True)) == 2
+    assert reprocess(surveyed, stage="capture_coarse", dry_run=True) == []
 
 
 def test_one_field_fails_and_the_others_are_done(archive: Path, other: Path, reprocess: Reprocess) -> None:
@@ -260,15 +263,6 @@ def test_a_place_that_cannot_hold_the_summary_is_refused_first(
     request = ReprocessRequest(archive, weights=other, out=tmp_path / "mine")
     with pytest.raises(ArchiveError, match="expected a folder; choose another --out"):
         run_reprocess(request, QUIET, survey=lambda settings, console: pytest.fail("surveyed"))
-
-
-def test_a_stage_is_made_anew_with_what_it_rests_on(
-    surveyed: Path, reprocess: Reprocess, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of a newer mosaic come a newer map and the same raw light."""
-    be_version(monkeypatch, "rectify", 99)
-    assert len(reprocess(surveyed, stage="segment", dry_run=True)) == 2
-    assert reprocess(surveyed, stage="capture_coarse", dry_run=True) == []
 
 
 def test_a_run_is_current_only_where_all_of_it_is_there(archive: Path) -> None:

@@ -28,10 +28,12 @@ except SystemExit:
 """
 
 
-def test_numpy_computes_on_one_thread_whatever_the_shell_says() -> None:
-    """Sums split among threads round otherwise: one seed would give other light on a machine with more cores."""
+def test_a_process_begins_with_one_thread_and_ends_as_it_would_have() -> None:
+    """Sums split among threads round otherwise; SIGTERM has no effect once the exit code stands."""
     ended = python(ONE_THREAD, OPENBLAS_NUM_THREADS="2")
     assert (ended.returncode, ended.stdout.split()[-1]) == (0, "1"), ended.stderr
+    ended = python(ENDING)
+    assert (ended.returncode, ended.stderr) == (0, "")
 
 
 def _flags(verb: str) -> dict[str, str | None]:
@@ -121,9 +123,3 @@ atexit.register(lambda: os.kill(os.getpid(), signal.SIGTERM))
 sys.argv[1:] = ["--version"]
 main()
 """
-
-
-def test_sigterm_has_no_effect_once_the_exit_code_stands() -> None:
-    """A command that has done its work and is ending, children and all, ends as it would have."""
-    ended = python(ENDING)
-    assert (ended.returncode, ended.stderr) == (0, "")

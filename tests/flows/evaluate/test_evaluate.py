@@ -356,8 +356,8 @@ def _record(name: str, rng: np.random.Generator) -> dict[str, Any]:
     return {"frame": name, "seats": 4, "rows": rows, "ranking": [], "positive_seats": 1}
 
 
-def test_seconds_of_a_row():
-    """Glance, scores and map together; `all`, `none` and a control are the map alone."""
+def test_seconds_are_taken_in_turn_and_add_up():
+    """Whatever slows the machine meets all parts alike; glance, scores and map make a row."""
     timed = {
         "glance": 1.0,
         "score": {"entropy": 0.5},
@@ -369,10 +369,6 @@ def test_seconds_of_a_row():
     assert row_seconds(timed, "entropy", 0.1) == 4.5
     assert row_seconds(timed, ORACLE, 0.1) == 4
     assert (row_seconds(timed, "none", 0.0), row_seconds(timed, "all", 1.0)) == (2, 9)
-
-
-def test_everything_timed_goes_in_turn():
-    """Whatever slows the machine for a while meets all parts alike; rounds of warming up are not counted."""
     went: list[str] = []
     works = {("segment", name): lambda name=name: went.append(name) for name in ("a", "b")}  # type: ignore[misc]
     taken = cpu_seconds(works, 2, warm_up=1)
@@ -412,8 +408,10 @@ def test_what_cannot_be_is_refused(data: Path, tmp_path: Path, change: dict[str,
         evaluate_weights(replace(request, **change))
 
 
-def test_the_table_prints(drawn: tuple[Path, dict[str, Any]], data: Path, capsys: pytest.CaptureFixture[str]):
-    """Rows, classes and what the figures mean on stdout; from what was kept, without judging again."""
+def test_figures_are_printed(
+    drawn: tuple[Path, dict[str, Any]], data: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+):
+    """Rows, classes and what the figures mean, from what was kept; with --json one object on stdout."""
     folder, _ = drawn
     weights = tuple(folder / f"w{seed}.safetensors" for seed in (0, 1))
     run_evaluate(EvaluateRequest(str(data), weights, folder / "out", **QUICK), Console(stderr=True))
@@ -421,10 +419,6 @@ def test_the_table_prints(drawn: tuple[Path, dict[str, Any]], data: Path, capsys
     for words in ("oracle*", "multiply-adds", "rig s", "crop", "uses labels", "paired bootstrap", "baseline: all"):
         assert words in shown.out
     assert "evaluation.json" in shown.err
-
-
-def test_the_verb_prints_one_object(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """`evaluate --json` gives the figures on stdout and leaves with 0; frames trained on leave with 1."""
     weights = write_weights(tmp_path / "w.safetensors")
     words = ["evaluate", str(data), "--weights", str(weights), "--shares", "0.5", "--policies", "entropy", "--json"]
     with pytest.raises(SystemExit) as left:

@@ -218,26 +218,18 @@ def _row(folds: list[list[dict[str, Any]]], names: list[str], policy: str = "non
     return row
 
 
-def test_a_row_of_folds_is_one_run():
-    """The figure is that of all frames together, as if one training had judged them."""
+def test_rows_are_of_runs_and_differ_over_shared_frames():
+    """Folds are one run, draws of a seed each their own; a control that lacks a frame is compared on the others."""
     row = _row([[_record("a", 5)], [_record("b", 10)]], ["a", "b"])
     assert row.counts.shape == (1, 2, 2, 2)
     assert row.counts.sum(axis=(0, 1)).tolist() == [[15, 5], [0, 20]]
     assert row.of_seed.tolist() == [0]
-
-
-def test_a_difference_is_taken_where_both_rows_have_a_frame():
-    """A control that lacks a frame is compared on the others, whose number is told."""
     ours = _row([[_record("a", 10), _record("b", 0)]], ["a", "b"])
     control = _row([[_record("a", 10)]], ["a", "b"])
     found = difference(ours, control, TRIAL)
     assert (found["difference"], found["frames"]) == (pytest.approx(0), 1)
     nowhere = difference(_row([[_record("b", 1)]], ["a", "b"]), control, TRIAL)
     assert (nowhere["difference"], nowhere["frames"]) == (None, 0)
-
-
-def test_every_draw_of_every_seed_is_a_run_of_its_own():
-    """Seeds first, draws within them; counts of no two are added or lost."""
     seeds = [[_record("a", right), _record("a", right + 1)] for right in (2, 6)]
     for one, other in seeds:
         other["rows"][0]["draw"] = 1

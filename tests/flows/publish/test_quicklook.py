@@ -93,11 +93,14 @@ def test_pictures_of_less_and_of_the_same(tmp_path: Path):
     assert (tmp_path / "empty.png").stat().st_size > 10_000
 
 
-def test_bands_nearest_to_true_colour():
-    """Sorted or not, the bands nearest 640, 550 and 460 nm are red, green and blue."""
+def test_colours_of_bands_and_of_pixels_without_a_class():
+    """The bands nearest 640, 550 and 460 nm, sorted or not; 255 and numbers without a name are grey."""
     assert choose_bands(WAVES)[0] == (24, 15, 6)
     order = np.random.default_rng(0).permutation(61)
     assert choose_bands(WAVES[order])[0] == tuple(np.argsort(order)[[24, 15, 6]])
+    picture = class_rgb(np.array([[0, 9, 255]], np.uint8), class_palette(2))
+    np.testing.assert_array_equal(picture[0, 1], picture[0, 2])
+    assert (picture[0, 0] != picture[0, 1]).any()
 
 
 @pytest.mark.parametrize(
@@ -148,10 +151,3 @@ def test_palette_colours_are_all_different(count):
     assert palette.max() <= 1
     given = np.array([[0, 255, 0]], np.uint8)
     np.testing.assert_array_equal(class_palette(1, given), [[0, 1, 0]])
-
-
-def test_unlabelled_pixels_are_grey():
-    """255 and numbers without a name get the same light grey."""
-    picture = class_rgb(np.array([[0, 9, 255]], np.uint8), class_palette(2))
-    np.testing.assert_array_equal(picture[0, 1], picture[0, 2])
-    assert (picture[0, 0] != picture[0, 1]).any()

@@ -178,11 +178,12 @@ def test_comparable_leaves_times_out_and_nothing_else():
 
 
 def test_table_shows_savings_accuracy_and_stages_in_80_columns():
-    """Figures with their units, 'predicted', the controls and every stage; no line is wider than a terminal."""
+    """Figures with their units, 'predicted', the controls, every stage; small areas in square metres."""
     text = _printed(make_receipt())
     for words in ("104 s", "209 s", "50 %", "predicted", "75.0", "93.4", "± 1.2", "67 %", "capture", "cached"):
         assert words in text, words
     assert max(map(len, _printed(make_receipt(), 80).splitlines())) <= 80
+    assert [area_words(hectares) for hectares in (2.5, 0.1, 0.0999, 0.0012)] == ["2.5 ha", "0.1 ha", "999 m²", "12 m²"]
 
 
 def _printed(receipt: Receipt, width: int = 100) -> str:
@@ -204,11 +205,6 @@ def test_table_shows_both_definitions_where_they_differ():
         one["miou_of_shown_classes"] = one["miou"]
     accuracy["false_classes"] = {}
     assert "shown" not in _printed(receipt).lower()
-
-
-def test_small_areas_are_told_in_square_metres():
-    """A hectare has ten thousand of them."""
-    assert [area_words(hectares) for hectares in (2.5, 0.1, 0.0999, 0.0012)] == ["2.5 ha", "0.1 ha", "999 m²", "12 m²"]
 
 
 def test_headline_is_one_paragraph_with_the_figures():

@@ -135,12 +135,15 @@ def test_a_report_that_cannot_be_written(
     assert not list(tmp_path.glob("*.html"))
 
 
-def test_a_field_without_anything_has_a_page() -> None:
-    """A schedule that has just begun, and an archive without fields."""
+def test_a_page_of_nothing_and_the_way_to_an_archive(tmp_path: Path) -> None:
+    """A schedule that has just begun has a page; links are relative, so that both can be moved."""
     page = render_history(FieldHistory("new", "archive", [], []), "")
     Addresses(page)
     assert "nothing to draw yet" in page
     Addresses(render_index([], "archive", {}))
+    assert way_to(tmp_path / "archive", tmp_path / "x.html") == "archive"
+    assert way_to(tmp_path / "archive", tmp_path / "pages" / "x.html") == "../archive"
+    assert way_to(tmp_path / "my field", tmp_path / "x.html") == "my%20field"
 
 
 def test_a_chart_has_a_line_for_each_series() -> None:
@@ -173,10 +176,3 @@ def test_whatever_a_receipt_claims_is_drawn_or_left_out(points: list[tuple[float
     chart = line_chart({"soil": points}, "Share", "%")
     assert (chart.drawing or "").count("<use") == drawn
     assert (chart.drawing is None) == (drawn == 0 and len(points) == 1)
-
-
-def test_the_way_to_an_archive(tmp_path: Path) -> None:
-    """Relative where page and archive lie together, so that both can be moved."""
-    assert way_to(tmp_path / "archive", tmp_path / "x.html") == "archive"
-    assert way_to(tmp_path / "archive", tmp_path / "pages" / "x.html") == "../archive"
-    assert way_to(tmp_path / "my field", tmp_path / "x.html") == "my%20field"

@@ -122,7 +122,7 @@ def test_due_times_do_not_depend_on_when_they_are_asked_for(zone: str, cron: str
 
 
 def test_due_times_when_clocks_change_and_whoever_began() -> None:
-    """A half past two that is not there is due when the lost hour ends; intervals count from one moment."""
+    """A half past two that is not there is due when the lost hour ends; crons read back with their zone."""
     table = parse_timetable(None, "30m", "UTC")
     assert table.next_after(NOON + timedelta(minutes=7)) == NOON + timedelta(minutes=30)
     assert table.next_after(NOON) == NOON + timedelta(minutes=30)
@@ -131,6 +131,10 @@ def test_due_times_when_clocks_change_and_whoever_began() -> None:
     autumn = list(table.due_between(datetime(2026, 10, 24, 12, tzinfo=UTC), datetime(2026, 10, 25, 12, tzinfo=UTC)))
     assert spring == [datetime(2026, 3, 29, 1, 0, tzinfo=UTC)]
     assert autumn == [datetime(2026, 10, 25, 0, 30, tzinfo=UTC)]
+    table = parse_timetable("0 6 * * 1", None, "Europe/Berlin")
+    assert read_timetable(table.to_dict()) == table
+    assert read_timetable({"cron": "nonsense"}) is None
+    assert parse_every("1.5h") == timedelta(minutes=90)
 
 
 @pytest.mark.parametrize(
@@ -176,14 +180,6 @@ def test_a_span_is_told_exactly(every: str, words: str) -> None:
     assert table.every is not None
     assert parse_every(words) == parse_every(exact_words(table.every)) == table.every
     assert read_timetable(json.loads(json.dumps(table.to_dict()))) == table
-
-
-def test_crons_read_back_as_they_were_written() -> None:
-    """With their zone; nonsense is no timetable."""
-    table = parse_timetable("0 6 * * 1", None, "Europe/Berlin")
-    assert read_timetable(table.to_dict()) == table
-    assert read_timetable({"cron": "nonsense"}) is None
-    assert parse_every("1.5h") == timedelta(minutes=90)
 
 
 @pytest.mark.parametrize("before", ["never served", "closed", "served by another schedule", "served less patiently"])

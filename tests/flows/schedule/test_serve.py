@@ -149,15 +149,11 @@ def test_sigterm_stops_a_schedule(
     assert ended.err.splitlines()[-1].startswith("stopped: nothing is due any more; the same command serves again")
 
 
-def test_the_flag_for_the_archive_wins(field_file: Callable[..., Path], tmp_path: Path) -> None:
-    """Fields keep their own archives, unless one is given for all."""
+def test_fields_are_asked_for_by_archive_and_day(field_file: Callable[..., Path], tmp_path: Path) -> None:
+    """One archive given for all wins; each due time is a visit, and the farm is as on that day."""
     files = [field_file("north"), field_file("south", out=str(tmp_path / "other"))]
     assert [Path(one.settings.out).name for one in load_fields(files)] == ["archive", "other"]
     assert {one.settings.out for one in load_fields(files, "all")} == {"all"}
-
-
-def test_a_farm_that_grows_is_seen_on_its_day() -> None:
-    """Each due time is a visit of its own; the built-in farm is as on that day, unless the settings say another."""
     due = datetime(2026, 2, 1, 23, 30, tzinfo=UTC)
     one = ServedField("farm", Path("farm.toml"), Settings(scene="farm@2"))
     berlin = parse_timetable("30 0 * * *", None, "Europe/Berlin")

@@ -52,21 +52,21 @@ def test_defaults_and_parts_are_read_back():
     assert parse_settings({"effects": every}).effects == every
 
 
-def test_flags_win_over_the_file(toml):
-    """A flag replaces the file's value and leaves the others."""
+def test_flags_and_files_say_the_same(toml):
+    """Flags win over the file, commas are lists, and relative paths of a file start at its folder."""
     path = toml('budget = 0.4\npolicy = "sobel"\n[camera]\nexposure_ms = 50\nbits = 10\n')
     found = load_settings(path, {"budget": "0.3", "camera.exposure_ms": 20, "seed": None})
     assert (found.budget, found.policy, found.seed) == (0.3, "sobel", 0)
     assert (found.camera.exposure_ms, found.camera.bits) == (20.0, 10)
-
-
-def test_paths_of_a_file_start_at_its_folder(toml):
-    """Relative paths move with the settings file; built-in names and flags stay as they are."""
     path = toml('scene = "field.npy"\nlabels = "/data/labels.png"\nsource = "sim"\n')
     found = load_settings(path, {"out": "here"})
     assert found.scene == str(path.parent / "field.npy")
     assert (found.labels, found.source, found.out) == ("/data/labels.png", "sim", "here")
     assert load_settings(toml('scene = "farm"')).scene == "farm"
+    one = load_settings(flags={"bands": "0, 2", "wavelengths": "660,800.5", "size": "300x20", "effects": "shot,slit"})
+    two = parse_settings({"bands": [0, 2], "wavelengths": [660, 800.5], "size": [300, 20], "effects": ["slit", "shot"]})
+    assert one == two
+    assert (one.shape, one.effects) == ((20, 300), "slit,shot")
 
 
 def test_the_example_says_every_default():
@@ -319,14 +319,6 @@ def test_file_that_cannot_be_read_is_one_message(toml, tmp_path):
         load_settings(tmp_path)
     with pytest.raises(SettingsError, match=r"cannot read the settings file .*line 1.*expected TOML"):
         load_settings(toml("budget 0.5"))
-
-
-def test_text_and_lists_say_the_same():
-    """What a flag says with commas is what a file says with a list."""
-    one = load_settings(flags={"bands": "0, 2", "wavelengths": "660,800.5", "size": "300x20", "effects": "shot,slit"})
-    two = parse_settings({"bands": [0, 2], "wavelengths": [660, 800.5], "size": [300, 20], "effects": ["slit", "shot"]})
-    assert one == two
-    assert (one.shape, one.effects) == ((20, 300), "slit,shot")
 
 
 @given(

@@ -78,16 +78,14 @@ def made_up(measured: float = 0.02, tolerance: float | None = 0.1) -> Comparison
     )
 
 
-def test_everything_is_what_the_rig_has_in_exact_variants(scan: tuple[CaptureRun, list[Sweep], StageRef]) -> None:
-    """What was not asked for is there as well; what the rig has none of is not."""
+def test_figures_are_beside_all_that_the_rig_has(
+    scan: tuple[CaptureRun, list[Sweep], StageRef], found: Comparison
+) -> None:
+    """What was not asked for is there exactly; all lines are compared and the greatest change keeps its bound."""
     names = {effect.name: variant for effect, variant in everything(scan[2]).items()}
     assert {"rotation", "slit", "smear", "diffraction", "shot", "quantisation"} <= set(names)
     assert {"wind", "cloud", "defects"}.isdisjoint(names)
     assert all(variant == BY_NAME[name].variants[0] for name, variant in names.items())
-
-
-def test_figures_hold_together(found: Comparison) -> None:
-    """All lines are compared, the greatest change keeps its bound and is the greatest of the view about it."""
     assert found.lines == found.of_lines
     assert found.bound is not None
     assert 0 < found.rms < found.measured <= found.bound
@@ -110,10 +108,10 @@ def test_what_is_exact_differs_by_nothing(scene_files: Path, tmp_path: Path) -> 
     assert (same.left_out, same.cheaper) == ((), ())
 
 
-def test_a_scan_that_takes_too_long_is_compared_in_part(
+def test_a_scan_is_compared_in_part_and_a_broken_bound_has_its_place(
     scan: tuple[CaptureRun, list[Sweep], StageRef], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Blocks evenly out of all; what that is of is said."""
+    """Blocks evenly out of all, which is said; a bound that does not hold is told where."""
     said: list[str] = []
     monkeypatch.setattr(effect_comparison, "MOST_S", 1e-9)
     monkeypatch.setattr(effect_comparison, "BLOCK_LINES", 4)
@@ -121,12 +119,7 @@ def test_a_scan_that_takes_too_long_is_compared_in_part(
     assert part.lines == 4 < part.of_lines
     assert said[0].startswith(f"4 of {part.of_lines} lines are taken both ways: ")
     assert "all would take about" in said[0]
-
-
-def test_a_bound_that_does_not_hold_is_told_with_its_place(
-    scan: tuple[CaptureRun, list[Sweep], StageRef], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The whole scan is a harder check than the worst chips."""
+    monkeypatch.undo()
 
     def believing(effects: StageRef) -> dict[str, Any]:
         manifest = load_manifest(effects)
@@ -269,8 +262,10 @@ def test_what_the_decision_depends_on_is_its_key(
     assert key_of(opened(scene_files, decided[0], **flags)) != decided[1].key
 
 
-def test_a_broken_bound_leaves_no_store(scene_files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What cannot be trusted is not kept."""
+def test_broken_bounds_and_unknown_effects_are_refused(
+    scene_files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, decided: tuple[Path, StageRef]
+) -> None:
+    """What cannot be trusted is not kept; an effect that this version does not know is named."""
 
     def broken(*_: object) -> None:
         raise BoundError("smile: what was left out changes light by 3")
@@ -279,12 +274,6 @@ def test_a_broken_bound_leaves_no_store(scene_files: Path, tmp_path: Path, monke
     with pytest.raises(BoundError, match="smile"):
         choose(opened(scene_files, tmp_path))
     assert not list((tmp_path / "stages").glob("effects/*"))
-
-
-def test_an_effect_of_another_version_is_refused(
-    decided: tuple[Path, StageRef], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It is named, with what to do."""
     row = {"name": "glare", "state": "on", "variant": "exact"}
     monkeypatch.setattr(effect_choice, "load_manifest", lambda effects: {"effects": [row]})
     with pytest.raises(IncompleteStoreError, match="the effect glare, exact, which this version does not know"):

@@ -132,16 +132,12 @@ def test_ports_that_cannot_be_opened(
     assert "Traceback" not in ended.err
 
 
-def test_port_that_another_program_has(command_line: CommandLine) -> None:
-    """It is not shared: two would mix their motions."""
+def test_one_of_two_devices_is_partly(command_line: CommandLine) -> None:
+    """A camera that cannot be reached beside a mirror that works: 3; a port that is not shared, or alone: 1."""
     with served() as rig, serial.Serial(rig.port, exclusive=True):
         ended = command_line("rig", "check", "--port", rig.port)
         assert ended.code == 1
         assert "in use by another program" in ended.out
-
-
-def test_one_of_two_devices_is_partly(command_line: CommandLine) -> None:
-    """A camera that cannot be reached beside a mirror that works: exit code 3; alone: 1."""
     with served() as rig:
         ended = command_line("rig", "check", "--port", rig.port, "--camera", NOWHERE, "--json")
         record = json.loads(ended.out)

@@ -121,8 +121,20 @@ def test_wrong_words_are_refused(
     assert not (tmp_path / "none").exists()
 
 
-def test_a_file_with_gaps_is_refused_with_the_first(command_line: Any, tmp_path: Path) -> None:
-    """No light is invented; bands are numbered as in the file."""
+def test_unusual_files_are_scanned_or_refused(command_line: Any, tmp_path: Path) -> None:
+    """One band, sixty full wells beside dark rows; of pixels without a value the first is named."""
+    np.save(tmp_path / "one.npy", np.random.default_rng(0).uniform(0.1, 1, (20, 30, 1)).astype(np.float32))
+    out = tmp_path / "scan"
+    ended = command_line("simulate", tmp_path / "one.npy", "-o", out, "--coarse", "--wavelengths", "650", "--json")
+    rows = {row["name"]: row for row in json.loads(ended.out)["effects"]}
+    assert (rows["smile"]["reason"], rows["smear"]["state"]) == ("absent", "on")
+    rows = np.zeros((128, 160, 3), np.float32)
+    rows[1::2] = 1
+    np.save(tmp_path / "rows.npy", rows)
+    flags = ["--wavelengths", "640,550,460", "--exposure-ms", "10000", "-o", str(tmp_path / "scan"), "--json"]
+    record = json.loads(command_line("simulate", str(tmp_path / "rows.npy"), *flags).out)
+    assert record["lines"] == 131
+    assert record["effects_total"]["within"]
     values = np.ones((20, 30, 4), np.float32)
     values[3, 4, 2], values[7, 8, 2] = np.nan, np.inf
     np.save(tmp_path / "gaps.npy", values)
@@ -132,15 +144,6 @@ def test_a_file_with_gaps_is_refused_with_the_first(command_line: Any, tmp_path:
     (message,) = ended.errors
     assert "has no finite value at row 3, column 4, band 2 (pixels without: 2)" in message
     assert not (tmp_path / "none").exists()
-
-
-def test_a_scene_of_one_band_is_simulated(command_line: Any, tmp_path: Path) -> None:
-    """What needs neighbouring bands is not there."""
-    np.save(tmp_path / "one.npy", np.random.default_rng(0).uniform(0.1, 1, (20, 30, 1)).astype(np.float32))
-    out = tmp_path / "scan"
-    ended = command_line("simulate", tmp_path / "one.npy", "-o", out, "--coarse", "--wavelengths", "650", "--json")
-    rows = {row["name"]: row for row in json.loads(ended.out)["effects"]}
-    assert (rows["smile"]["reason"], rows["smear"]["state"]) == ("absent", "on")
 
 
 ROW = {"name": "smile", "state": "on", "variant": "cubic", "bound": 0.0, "measured": None, "cost_s": 0.004, "why": ""}
@@ -163,14 +166,3 @@ def test_the_table_fits_the_terminal(width: int) -> None:
     assert ("0.3 nm" in row) == (width >= 100)
     assert "smile: smile" not in said.getvalue()
     assert "Not there: wind (the air is calm)." in said.getvalue()
-
-
-def test_rows_at_the_longest_exposure_are_scanned(command_line: Any, tmp_path: Path) -> None:
-    """Light of sixty full wells beside dark rows: what arithmetic loses of it is no broken bound."""
-    rows = np.zeros((128, 160, 3), np.float32)
-    rows[1::2] = 1
-    np.save(tmp_path / "rows.npy", rows)
-    flags = ["--wavelengths", "640,550,460", "--exposure-ms", "10000", "-o", str(tmp_path / "scan"), "--json"]
-    record = json.loads(command_line("simulate", str(tmp_path / "rows.npy"), *flags).out)
-    assert record["lines"] == 131
-    assert record["effects_total"]["within"]

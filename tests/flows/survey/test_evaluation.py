@@ -75,8 +75,8 @@ def test_controls_look_where_the_map_does(tmp_path: Path) -> None:
     assert (evaluation._map_offset(run, []) == 0).all()
 
 
-def test_brighter_sweep_is_turned_down(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of two sweeps one of which was lit four times as much, either gain is what its values are multiplied by."""
+def test_corrections_are_found_and_read(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Two sweeps lit differently meet in the middle; offset, drift and gain reach their sweep alone."""
     ratio = LightRatio(0, 1, np.log([4.0, 4.0]), np.zeros(2))
     monkeypatch.setattr(pointing_stage, "overlap_light", lambda *_: [ratio])
     placed: Any = [SimpleNamespace(lines=SimpleNamespace(sweep=SimpleNamespace(name=name))) for name in "ab"]
@@ -85,10 +85,6 @@ def test_brighter_sweep_is_turned_down(monkeypatch: pytest.MonkeyPatch) -> None:
     gains = pointing_stage._gains(run, found, placed)
     np.testing.assert_allclose(gains["a"], 2.0, rtol=1e-6)
     np.testing.assert_allclose(gains["b"], 0.5, rtol=1e-6)
-
-
-def test_corrections_are_read_as_they_were_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Offset, drift and gain of a sweep reach its placing unchanged; a sweep that is not named has none."""
     record = {"a": {"offset_px": [1.0, -2.0], "drift_px_per_line": [0.5, 0.0], "gain": [0.5, 2.0]}}
     ref = _registration(tmp_path, {"sweeps": record})
     cubes = [SimpleNamespace(sweep=SimpleNamespace(name=name), time_s=np.arange(3.0)) for name in "ab"]

@@ -79,9 +79,12 @@ def test_seconds_buy_no_more_lines_than_they_pay_for(seconds: float, run_lines: 
     assert price(bought + 1) > seconds
 
 
-def test_no_more_lines_are_bought_than_the_full_scan_has() -> None:
-    """Whatever the seconds."""
+def test_a_large_field_is_counted_region_by_region() -> None:
+    """Sixteen times the field takes as many fields and their halos, and no more lines than the full scan."""
     assert SMALL.buying(1e6, run_lines=50, most=321).fine_lines == 321
+    small, large = (work_of_map(run, run.grid.valid_seats()) for run in (_run(2560, "gain"), _run(10240, "gain")))
+    assert 16 * small.decode < large.decode < 16 * 1.3 * small.decode
+    assert 16 * small.total < large.total < 16 * 1.3 * small.total
 
 
 CONFIG, BANDS = SegmenterConfig(classes=4), 8
@@ -108,10 +111,3 @@ def test_a_policy_that_asks_the_glance_reads_the_coarse_look_once_more(policy: s
     done, closed = work_done(run, np.array([3, 8])), multiply_adds(CONFIG, run.grid, 2, BANDS, policy)
     assert done.glance == looks * closed.glance
     assert (done.score, done.encode, done.decode) == (closed.score, closed.encode, closed.decode)
-
-
-def test_a_large_field_is_counted_region_by_region() -> None:
-    """Sixteen times the field takes what sixteen such fields take, and its halos: attention ends with a region."""
-    small, large = (work_of_map(run, run.grid.valid_seats()) for run in (_run(2560, "gain"), _run(10240, "gain")))
-    assert 16 * small.decode < large.decode < 16 * 1.3 * small.decode
-    assert 16 * small.total < large.total < 16 * 1.3 * small.total

@@ -92,16 +92,12 @@ def test_scores_of_regions_make_those_of_the_field(surveyed: tuple[SurveyRun, Pa
         assert (load_attention(_store(stages, "attend/*/attention.zarr")).score == whole).all()
 
 
-def test_edges_need_one_patch_of_halo(surveyed: tuple[SurveyRun, Path]) -> None:
-    """The edge score looks one pixel around: with a halo of one coarse patch regions give the field's own."""
+def test_edges_need_one_patch_of_halo_and_work_travels_as_paths(surveyed: tuple[SurveyRun, Path]) -> None:
+    """With one coarse patch regions give the field's own edges; what another process gets is small."""
     run, stages = surveyed
     mosaic = _store(stages, "rectify/*/mosaic.zarr")
     whole = FieldWork.of(run).score("sobel", mosaic, lambda done: None)
     np.testing.assert_allclose(_work(run, Crew(), 1).score("sobel", mosaic, lambda done: None), whole, rtol=1e-5)
-
-
-def test_work_travels_as_paths(surveyed: tuple[SurveyRun, Path]) -> None:
-    """What another process gets is small, and gives there what it gives here."""
     run, stages = surveyed
     work = FieldWork.of(run)
     scoring = Scoring(work.weights, _store(stages, "rectify/*/mosaic.zarr"), "entropy")

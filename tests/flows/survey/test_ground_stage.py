@@ -130,8 +130,8 @@ def test_map_and_picture_lie_where_the_rays_end(run: Run, stores: tuple[StageRef
     assert np.corrcoef(along, found.picture[row, column, 0])[0, 1] > 0.95
 
 
-def test_hectares_are_those_of_the_pixels_footprints(run: Run, stores: tuple[StageRef, StageRef]) -> None:
-    """Each class's area is the sum of its scene pixels' footprints, whatever the map's resolution."""
+def test_the_store_has_hectares_and_where_it_was_seen_from(run: Run, stores: tuple[StageRef, StageRef]) -> None:
+    """Areas are sums of footprints at any resolution; plain xarray reads pose, counts of pixels and CRS."""
     ref = draw(replace(run, settings=Settings(pose=POSE, map=MapChoice(resolution_m=0.02))), stores)
     areas = load_ground_map(ref.path / STORE).areas
     grid = grid_of(run)
@@ -139,6 +139,11 @@ def test_hectares_are_those_of_the_pixels_footprints(run: Run, stores: tuple[Sta
     assert areas["weed"]["m2"] == pytest.approx(exact[:, :80].sum(), rel=1e-12)
     assert areas["crop"]["m2"] == pytest.approx(exact[30:, 80:].sum(), rel=1e-12)
     assert areas["crop"]["ha"] == pytest.approx(areas["crop"]["m2"] / 10_000)
+    ref = draw(replace(run, settings=Settings(pose=POSE, map=MapChoice(epsg=25832))), stores)
+    with xr.open_zarr(ref.path / STORE, consolidated=False) as content:
+        assert content.attrs["proj:code"] == "EPSG:25832"
+        assert content.attrs["rig_pose"]["tilt_deg"] == 50.0
+        assert content.attrs["scene_pixels"] == {"mapped_px": 120 * 160, "beyond_reach_px": 0, "no_ground_px": 0}
 
 
 def test_the_key_follows_pose_and_map(run: Run, stores: tuple[StageRef, StageRef]) -> None:
@@ -153,12 +158,3 @@ def test_the_key_follows_pose_and_map(run: Run, stores: tuple[StageRef, StageRef
     keys = [ref.key for ref in refs]
     assert keys[0] == keys[3]
     assert len(set(keys)) == 3
-
-
-def test_the_store_says_where_it_was_seen_from(run: Run, stores: tuple[StageRef, StageRef]) -> None:
-    """Plain xarray reads pose, counts of pixels and the CRS asked for."""
-    ref = draw(replace(run, settings=Settings(pose=POSE, map=MapChoice(epsg=25832))), stores)
-    with xr.open_zarr(ref.path / STORE, consolidated=False) as content:
-        assert content.attrs["proj:code"] == "EPSG:25832"
-        assert content.attrs["rig_pose"]["tilt_deg"] == 50.0
-        assert content.attrs["scene_pixels"] == {"mapped_px": 120 * 160, "beyond_reach_px": 0, "no_ground_px": 0}

@@ -142,11 +142,6 @@ def test_every_finding_has_its_sentence(case: str) -> None:
     assert sentences(found_of(**told)) == [words]
 
 
-def test_no_fine_sweep_says_nothing() -> None:
-    """A pass without a sweep has no sentence."""
-    assert sentences(found_of(held="the mosaic", sweeps={})) == []
-
-
 GRID = SceneGrid(300, 1500, 16, 4)
 OFF = 20.0
 
@@ -173,15 +168,12 @@ def test_either_pass_overlaps_and_reaches_by_what_it_needs() -> None:
 
 
 def test_a_mirror_that_is_believed_costs_nothing() -> None:
-    """Without a pointing error there are neither overlaps nor margins."""
+    """Neither overlaps nor margins nor words; overlaps of a whole line are refused with what could be put right."""
     settings = parse_settings({"budget": 1.0})
     plan = plan_capture(settings, GRID)
     assert plan.overlap_px == 0
     assert plan.full == full_sweeps(GRID, settings.camera, plan.along)
     assert plan.coarse == coarse_sweeps(GRID, settings.camera, plan.along)
-
-
-def test_overlaps_of_a_whole_line_are_refused() -> None:
-    """The message names the flag and the error that could still be put right."""
     with pytest.raises(SettingsError, match=r"^--pointing-px 192: .* overlap by 640 px .* give less than 192$"):
         plan_capture(parse_settings({"pointing_px": 192.0}), GRID)
+    assert sentences(found_of(held="the mosaic", sweeps={})) == []

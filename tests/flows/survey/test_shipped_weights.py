@@ -111,17 +111,15 @@ def test_a_survey_says_so_until_they_are_sealed(
     assert after.weights_key == before.weights_key
 
 
-def test_evaluate_says_so(earlier: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """After the figures."""
+def test_evaluate_says_so_and_sealing_needs_files(
+    earlier: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """After the figures; without a file one message, exit code 2."""
     told = io.StringIO()
     monkeypatch.setattr(evaluate_command, "evaluate_weights", lambda request, show: {"files": []})
     request = EvaluateRequest("data", (earlier,))
     run_evaluate(request, Console(file=told, width=500), as_json=True)
     assert f"note: w.safetensors {SAID}{earlier}" in told.getvalue()
-
-
-def test_sealing_needs_files(capsys: pytest.CaptureFixture[str]) -> None:
-    """One message, exit code 2."""
     with pytest.raises(SystemExit) as ended:
         cli.main(["seal"])
     assert (ended.value.code, capsys.readouterr().err[:30]) == (2, "error: seal needs files of wei")

@@ -68,9 +68,11 @@ def edited(module: str, old: str, new: str) -> dict[str, str]:
     return {module: TEXTS[module].replace(old, new)}
 
 
-def test_names_are_followed_through_imports() -> None:
-    """Default values, annotations, base classes, modules' attributes and imports in functions lead on."""
+def test_names_are_followed_through_imports_up_to_barriers() -> None:
+    """Defaults, annotations, bases, modules' attributes lead on; what is behind a barrier alone is not reached."""
     assert Sources(TEXTS).closure(["stage"]) == REACHED
+    behind = {("models.light", "Lamp"), ("models.light", "STEP"), ("pipeline.shapes", "Shape")}
+    assert Sources(TEXTS).closure(["stage"], ["Lamp"]) == REACHED - behind
 
 
 @pytest.mark.parametrize(
@@ -189,12 +191,6 @@ def test_what_names_lead_to(text: str, reached: set[tuple[str, str]]) -> None:
     """Local names hide definitions; what registers itself comes with its module; types for the checker count."""
     code = Sources(TEXTS | {"flows.survey.stages": text, "pipeline.table": TABLE})
     assert code.closure(["stage"]) == reached
-
-
-def test_a_barrier_ends_the_way() -> None:
-    """What is behind a barrier alone is not reached, nor the barrier."""
-    behind = {("models.light", "Lamp"), ("models.light", "STEP"), ("pipeline.shapes", "Shape")}
-    assert Sources(TEXTS).closure(["stage"], ["Lamp"]) == REACHED - behind
 
 
 def test_a_name_must_say_which() -> None:

@@ -121,8 +121,8 @@ def test_all_maps_of_a_receipt_are_judged_over_the_classes_of_the_truth(farm: Do
         assert not truth & set(one["false_classes"])
 
 
-def test_savings_add_up(farm: Done) -> None:
-    """Every ratio is done over full, capture stays within the budget, and the split of multiply-adds is its sum."""
+def test_savings_add_up_and_ranks_follow_the_scores(farm: Done) -> None:
+    """Ratios are done over full and capture keeps the budget; of captured seats scores fall with the rank."""
     savings = farm.receipt["savings"]
     for name, entry in savings.items():
         if name != "segment_wall_s":
@@ -130,6 +130,13 @@ def test_savings_add_up(farm: Done) -> None:
     assert savings["capture_s"]["ratio"] <= 0.9 + 1e-9
     work = savings["multiply_adds"]
     assert work["done"] == sum(work[part] for part in ("glance", "score", "encode", "decode"))
+    attention, patches = farm.open("attention"), farm.open("patches")
+    score, rank = attention["score"].values.ravel(), attention["rank"].values.ravel()
+    chosen = np.flatnonzero(rank >= 0)
+    assert set(chosen) == set(patches["seat"].values.tolist())
+    ordered = chosen[np.argsort(rank[chosen])]
+    assert (np.sort(rank[chosen]) == np.arange(len(chosen))).all()
+    assert (np.diff(score[ordered]) <= 0).all()
 
 
 @pytest.mark.parametrize("name", ["farm", "picture"])
@@ -150,17 +157,6 @@ def test_savings_are_those_of_the_stored_cubes(name: str, request: pytest.Fixtur
     assert all(passes)
     seconds = sum(CostModel().seconds(part, LineCamera()) for part in passes)
     assert done.receipt["savings"]["capture_s"]["done"] == pytest.approx(seconds)
-
-
-def test_ranks_follow_the_scores(farm: Done) -> None:
-    """Of the seats that were captured the best score has rank 0 and scores fall with the rank; the others have none."""
-    attention, patches = farm.open("attention"), farm.open("patches")
-    score, rank = attention["score"].values.ravel(), attention["rank"].values.ravel()
-    chosen = np.flatnonzero(rank >= 0)
-    assert set(chosen) == set(patches["seat"].values.tolist())
-    ordered = chosen[np.argsort(rank[chosen])]
-    assert (np.sort(rank[chosen]) == np.arange(len(chosen))).all()
-    assert (np.diff(score[ordered]) <= 0).all()
 
 
 @pytest.mark.usefixtures("choosing_anew")

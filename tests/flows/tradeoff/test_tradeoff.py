@@ -84,35 +84,29 @@ def spend(clock, seconds):
     return 0.0
 
 
-def test_errors_are_judged_against_the_reference():
-    """The error of a series that stops is its known remainder."""
+def test_every_setting_is_judged_and_runs_in_turn():
+    """A series that stops errs by its remainder; rounds start at another setting each; at least one is needed."""
     for point in measure_tradeoff(SERIES, repeats=1).points:
         assert point.error == pytest.approx(1 / float(point.setting), rel=1e-3)
+    with pytest.raises(SettingsError, match="at least 1, got 0"):
+        measure_tradeoff(SERIES, repeats=0)
+    seen: list[float] = []
+    watched = replace(SERIES, settings=(1.0, 2.0, 3.0), run=lambda truth, terms: seen.append(float(terms)) or 0.0)
+    measure_tradeoff(watched, repeats=2)
+    assert seen == [1, 2, 3, 1, 2, 3, 2, 3, 1]
 
 
-def test_least_time_is_the_price_and_median_ratio_stands_beside(clock):
-    """A machine that halts for a while raises neither: rounds of 4, 2 and 9 s against 2, 2 and 3 s."""
+def test_least_times_are_the_price_and_the_floor(clock, monkeypatch):
+    """A machine that halts for a while raises neither price nor the floor of copying the bytes."""
     turns = iter((1.0, 1.0, 2.0, 4.0, 2.0, 2.0, 3.0, 9.0))  # the second round begins with the second setting
     halting = replace(SERIES, settings=(1.0, 2.0), run=lambda truth, terms: spend(clock, next(turns)))
     second = measure_tradeoff(halting, repeats=3).points[1]
     assert (second.cpu_min_s, second.cpu_median_s, second.wall_median_s) == (2, 4, 8)
     assert second.ratio == 2
-
-
-def test_memory_floor_is_the_least_time_of_copying_the_bytes(clock, monkeypatch):
-    """A copy reads and writes every byte: 64 MiB in 2^27 ns are 1 ns a byte, and the slower rounds do not count."""
     turns = iter((3.0, 1.0, 2.0))
     monkeypatch.setattr(tradeoff_module.np, "copyto", lambda *_: spend(clock, next(turns) * 2**27 * 1e-9))
     result = measure_tradeoff(replace(SERIES, moved_bytes=6.0), repeats=3)
     assert result.memory_floor_ns == pytest.approx(6.0)
-
-
-def test_repeats_are_interleaved():
-    """Every round runs every setting once and starts at another one; one run of each comes before, to be judged."""
-    seen: list[float] = []
-    watched = replace(SERIES, settings=(1.0, 2.0, 3.0), run=lambda truth, terms: seen.append(float(terms)) or 0.0)
-    measure_tradeoff(watched, repeats=2)
-    assert seen == [1, 2, 3, 1, 2, 3, 2, 3, 1]
 
 
 def test_settings_run_on_one_thread():
@@ -186,12 +180,6 @@ def test_registry_finds_all_knobs_of_a_stage(monkeypatch):
     assert list(registered()) == [("series", "terms"), ("series", "order"), ("plan", "terms")]
     with pytest.raises(SettingsError, match="no trade-off for stage 'serie'; there are: plan, series"):
         find_tradeoffs("serie")
-
-
-def test_no_repeats_are_refused():
-    """At least one timed round is needed."""
-    with pytest.raises(SettingsError, match="at least 1, got 0"):
-        measure_tradeoff(SERIES, repeats=0)
 
 
 def test_result_is_json_and_names_the_machine():

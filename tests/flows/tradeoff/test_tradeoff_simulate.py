@@ -79,13 +79,21 @@ def test_what_is_chosen_keeps_its_bound_and_the_bound_its_tolerance(lines: FarmL
     assert found[TOLERANCES[-1]] > 0
 
 
-def test_figures_of_a_change_by_hand():
-    """Two samples of 400 and 10,000 electrons, the first 30 brighter: in its noise, by the root of two less, in DN."""
+def test_figures_by_hand():
+    """Of a change of 30 electrons, and of keystone shared by two, one, or as many groups as bands."""
     against = Against(np.array([[[400.0, 1e4]]], np.float32), np.array([[[30.0, 100.0]]], np.float32), 5.0)
     light = against.exact + np.array([30.0, 0.0], np.float32)
     assert (against.greatest(light), against.greatest_dn(light)) == pytest.approx((1.0, 6.0))
     assert against.rms(light) == pytest.approx(math.sqrt(0.5))
     assert [level.error for level in against.levels()] == pytest.approx([0.1, 2.5 / 30])
+    rig, nm = Rig(), np.linspace(400, 1000, 270)
+    k = rig.optics.keystone_px
+    two = Shared(KEYSTONE, 2).moments(rig, nm, "linear").shift[0]
+    assert (two[0], two[-1]) == pytest.approx((-k / 4, k / 4), rel=0.01)
+    assert len(np.unique(two)) == 2
+    assert Shared(KEYSTONE, 1).moments(rig, nm, "linear").shift == pytest.approx(0)
+    own = KEYSTONE.moments(rig, nm, "linear").shift
+    np.testing.assert_allclose(Shared(KEYSTONE, 270).moments(rig, nm, "linear").shift, own)
 
 
 def test_finer_boxes_are_nearer_to_the_footprint(lines: FarmLines):
@@ -97,20 +105,12 @@ def test_finer_boxes_are_nearer_to_the_footprint(lines: FarmLines):
     assert found[OFF] == max(found.values()) > 10 * found[SLIT.variants[1]]
 
 
-def test_bands_of_a_group_share_the_mean_blur():
-    """Keystone from -k/2 to k/2 in two groups is -k/4 and k/4; in one nothing; and in as many as bands its own."""
-    rig, nm = Rig(), np.linspace(400, 1000, 270)
-    k = rig.optics.keystone_px
-    two = Shared(KEYSTONE, 2).moments(rig, nm, "linear").shift[0]
-    assert (two[0], two[-1]) == pytest.approx((-k / 4, k / 4), rel=0.01)
-    assert len(np.unique(two)) == 2
-    assert Shared(KEYSTONE, 1).moments(rig, nm, "linear").shift == pytest.approx(0)
-    own = KEYSTONE.moments(rig, nm, "linear").shift
-    np.testing.assert_allclose(Shared(KEYSTONE, 270).moments(rig, nm, "linear").shift, own)
-
-
 def test_more_bands_and_more_groups_err_less(lines: FarmLines):
-    """All are the reference itself."""
+    """All are the reference itself; bands taken come out as they went in, ends among them."""
+    fewer = some_bands(lines, 30)
+    assert fewer.bands[[0, -1]].tolist() == [0, 269]
+    np.testing.assert_array_equal(fewer.scene.electrons, lines.scene.electrons[:, fewer.bands])
+    np.testing.assert_allclose(fewer.spline[:, fewer.bands], np.eye(30), atol=1e-6)
     against = seen_by(lines)
     groups, bands = (
         errors(GROUP_COUNT, Seen(lines, against)),
@@ -119,14 +119,6 @@ def test_more_bands_and_more_groups_err_less(lines: FarmLines):
     assert groups[EACH] == bands[270] == 0
     assert 0 < groups[6] < groups[1]
     assert 0 < bands[135] < bands[60] < bands[15]
-
-
-def test_a_scene_in_fewer_bands_keeps_their_light_and_splines_meet_them(lines: FarmLines):
-    """The bands taken come out as they went in; ends are among them."""
-    fewer = some_bands(lines, 30)
-    assert fewer.bands[[0, -1]].tolist() == [0, 269]
-    np.testing.assert_array_equal(fewer.scene.electrons, lines.scene.electrons[:, fewer.bands])
-    np.testing.assert_allclose(fewer.spline[:, fewer.bands], np.eye(30), atol=1e-6)
 
 
 def test_rays_come_to_the_boxes_as_they_get_more(lines: FarmLines, monkeypatch):

@@ -72,15 +72,11 @@ def test_days_that_are_none_are_refused(table: dict[str, Any], words: str) -> No
         parse_settings(table)
 
 
-def test_a_file_that_names_the_removed_farm_is_refused(tmp_path: Path) -> None:
-    """The name is no path: it is not looked for beside the file."""
+def test_the_removed_farm_is_no_file(tmp_path: Path) -> None:
+    """A settings file that names it is refused; its runs are told apart by their seeds."""
     (tmp_path / "field.toml").write_text(f'scene = "{REMOVED_LAW}"\n')
     with pytest.raises(SettingsError, match="farm@1 was removed"):
         load_settings(tmp_path / "field.toml")
-
-
-def test_runs_of_the_removed_farm_are_told_apart(tmp_path: Path) -> None:
-    """By their seeds: its name is no scene's file."""
     archive = Archive.open(tmp_path)
     keys = [f"farm@1/seed={seed}/shape=8x8/bands=9" for seed in (0, 1)]
     made = [_publish(archive, key, scene=REMOVED_LAW) for key in keys]

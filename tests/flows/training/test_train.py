@@ -88,10 +88,12 @@ def test_networks_that_cannot_be_are_refused_before_the_first_look(
         train_weights(_begun(folder, out, **{**choices, **begun}))
 
 
-def test_positions_that_a_preset_cannot_have_are_refused(folder: Path, out: Path):
-    """The flag is named before any scene is read."""
+def test_positions_and_crops_follow_the_preset(folder: Path, out: Path):
+    """Flags that do not fit are refused; the paper's network reads whole scenes."""
     with pytest.raises(SettingsError, match="--positions paper is not for --preset coarser"):
         run_train(_request(folder, out, preset="coarser", positions="paper"), Console(quiet=True))
+    assert usual_crop("farm", "paper") == usual_crop("frames", "paper") == 1024
+    assert [usual_crop("farm", "dense"), usual_crop("frames", "two-scale")] == [256, 384]
 
 
 @pytest.mark.parametrize("ending", ["", ".part", ".checkpoint", ".checkpoint.part"])
@@ -157,12 +159,6 @@ def test_without_validation_scenes_a_control_is_not_judged(folder: Path, out: Pa
     request = _request(folder, out, validation=0, preset="dense")
     assert run_train(request, Console(file=shown, width=100))["validation"] is None
     assert f"spectralzoom evaluate {folder} --weights OTHERS --control {out}" in shown.getvalue()
-
-
-def test_the_papers_network_trains_on_whole_scenes():
-    """Its numbers of places depend on the width of what it reads; the others' do not."""
-    assert usual_crop("farm", "paper") == usual_crop("frames", "paper") == 1024
-    assert [usual_crop("farm", "dense"), usual_crop("frames", "two-scale")] == [256, 384]
 
 
 def test_a_survey_with_a_control_is_refused(folder: Path, out: Path):
@@ -239,18 +235,14 @@ def earlier(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_weights_begun_from_others_say_so(folder: Path, earlier: Path, out: Path):
-    """They record the file and its hash, and are as much trained on its frames as it was."""
+def test_weights_begun_from_others_say_so_and_go_on_from_there(folder: Path, earlier: Path, out: Path):
+    """File, hash and its frames are recorded; a step at a rate of nothing leaves them as they were."""
     begun = train_weights(_begun(folder, out, hold_out=("001", "002", "003"), init=earlier))["begun_from"]
     assert (begun["file"], begun["kind"], begun["skipped"]) == ("first.safetensors", "spectralzoom", {})
     assert begun["sha256"] == hashlib.sha256(earlier.read_bytes()).hexdigest()
     split = load_weights(out).record["split"]
     assert list(split["train"]) == ["004", *(f"first.safetensors: {name}" for name in ("001", "002", "003"))]
     assert {*split["train"].values()} > {*describe_weights(earlier).record["split"]["train"].values()}
-
-
-def test_training_goes_on_from_there(folder: Path, earlier: Path, out: Path):
-    """After one step at a rate of nothing the weights are those that were begun from."""
     train_weights(_begun(folder, out, hold_out=("004",), init=earlier, settings=replace(SETTINGS, learning_rate=0.0)))
     before, after = (load_weights(path).segmenter.state_dict() for path in (earlier, out))
     assert all(torch.allclose(after[name], value, atol=1e-7) for name, value in before.items())
