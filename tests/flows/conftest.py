@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,39 @@ class Ended:
 def problems(out: Path) -> list[str]:
     """What a full verification of an archive finds."""
     return [f"{one.uri} {one.problem}" for one in verify_archive(Archive.open(out)) if one.problem]
+
+
+class Page(HTMLParser):
+    """A page whose tags close in order: its links, what else it would load from elsewhere, and its tags."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.links: list[str] = []
+        self.loaded: list[str] = []
+        self.open: list[str] = []
+        self.feed(page)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Remember addresses; tags without an end are not open, and scripts and frames are none of ours."""
+        assert tag not in ("script", "link", "iframe")
+        found = [str(value) for name, value in attrs if name in ("src", "href", "srcset", "action", "xlink:href")]
+        if tag == "a":
+            self.links += found
+        self.loaded += [one for one in found if tag != "a" and not one.startswith("#")]  # but for parts of the page
+        if tag not in ("meta", "img"):
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Nothing is open after it."""
+        self.handle_starttag(tag, attrs)
+        if tag not in ("meta", "img"):
+            self.open.pop()
+
+    def handle_endtag(self, tag: str) -> None:
+        """The innermost open tag closes."""
+        assert self.open.pop() == tag
 
 
 def turned(scene: Path, to: Path) -> Path:

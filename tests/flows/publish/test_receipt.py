@@ -6,7 +6,6 @@ import base64
 import copy
 import io
 import json
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
@@ -19,6 +18,7 @@ from flows.settings.survey_settings import Settings
 from pipeline.errors import ShapeError
 from storage.archive.records import StageRecord
 from storage.archive.whole_files import to_json
+from tests.flows.conftest import Page
 
 
 def make_receipt(*, wall: float = 1.5, labels: bool = True) -> Receipt:
@@ -225,50 +225,18 @@ def test_headline_is_one_paragraph_with_the_figures():
 
 
 PNG = b"\x89PNG\r\n\x1a\nnot a real picture"
-VOID = {"meta", "img"}
-
-
-class Tags(HTMLParser):
-    """Checks that tags close in order and collects what would be loaded from elsewhere."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.sources: list[str] = []
-        self.seen: set[str] = set()
-
-    def handle_starttag(self, tag, attrs):
-        """Remember the tag and its addresses."""
-        self.seen.add(tag)
-        self.sources += [value for name, value in attrs if name in ("src", "href", "srcset", "action")]
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        """The innermost open tag must be the one that closes."""
-        assert self.open.pop() == tag
-
-
-def read(page: str) -> Tags:
-    """Parse a page to its end."""
-    tags = Tags()
-    tags.feed(page)
-    tags.close()
-    assert not tags.open
-    return tags
 
 
 def test_page_loads_nothing_from_anywhere():
     """Every address is data of the page, the quicklook the bytes given; no script, no import, no link."""
     page = render_report(make_receipt(), PNG, [Picture(PNG, "spectra")])
-    tags = read(page)
-    assert len(tags.sources) == 2
-    assert all(source.startswith("data:image/png;base64,") for source in tags.sources)
-    assert not tags.seen & {"script", "link", "iframe"}
+    loaded = Page(page).loaded
+    assert len(loaded) == 2
+    assert all(source.startswith("data:image/png;base64,") for source in loaded)
     assert "http" not in page
     assert "@import" not in page
     assert "url(" not in page
-    source = read(render_report(make_receipt(), PNG)).sources[0]
+    source = Page(render_report(make_receipt(), PNG)).loaded[0]
     assert base64.b64decode(source.partition(",")[2]) == PNG
 
 
@@ -283,7 +251,7 @@ def test_words_are_escaped():
     receipt["accuracy"]["controls"] = {bad: {"miou": 0.5, "spread": None}}
     receipt["effects"][0]["why"] = bad
     page = render_report(receipt, PNG, [Picture(PNG, bad + '" onload="x')])
-    assert "script" not in read(page).seen
+    Page(page)
     assert '" onload="' not in page
     assert page.count("&lt;script&gt;") >= 11
 
@@ -297,6 +265,6 @@ def test_page_has_the_figures():
     receipt = make_receipt(labels=False)
     receipt["survey"] = "field $title"
     page = render_report(receipt, PNG)
-    read(page)
+    Page(page)
     assert "How good the map is" not in page
     assert "field $title" in page

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -15,37 +14,9 @@ from flows.schedule.history_page import COLOURS, line_chart, render_history, ren
 from storage.archive.archive import Archive
 from storage.archive.ledger import Ledger
 from storage.arrays.class_maps import load_class_map
+from tests.flows.conftest import Page
 
 BAD = '<script>alert("1")</script>&'
-
-
-class Addresses(HTMLParser):
-    """Collects what a page would load or link, and that its tags close in order."""
-
-    def __init__(self, page: str) -> None:
-        super().__init__()
-        self.links: list[str] = []
-        self.loaded: list[str] = []
-        self.open: list[str] = []
-        self.feed(page)
-        self.close()
-        assert not self.open
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Remember addresses; tags without an end are not open."""
-        self.links += [str(value) for name, value in attrs if name == "href" and tag == "a"]
-        other = [str(value) for name, value in attrs if name in ("src", "href", "xlink:href") and tag != "a"]
-        self.loaded += [value for value in other if not value.startswith("#")]  # a part of the page itself
-        assert tag not in ("script", "link", "iframe", "style") or tag == "style"
-        if tag != "meta":
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Nothing is open after it."""
-
-    def handle_endtag(self, tag: str) -> None:
-        """The innermost open tag closes."""
-        assert self.open.pop() == tag
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +73,7 @@ def test_pages_load_nothing_and_lead_to_reports(archive: Path, command_line: Any
     ended = command_line("report", archive, "--field", "north", "-o", page)
     assert ended.code == 0, ended.err
     text = page.read_text(encoding="utf-8")
-    found = Addresses(text)
+    found = Page(text)
     assert found.loaded == []
     assert BAD not in text
     assert "&lt;script&gt;" in text
@@ -113,7 +84,7 @@ def test_pages_load_nothing_and_lead_to_reports(archive: Path, command_line: Any
     page = tmp_path / "index.html"
     ended = command_line("report", archive, "-o", page)
     assert ended.code == 0, ended.err
-    found = Addresses(page.read_text(encoding="utf-8"))
+    found = Page(page.read_text(encoding="utf-8"))
     assert sorted(found.links) == ["index-north.html", "index-south.html"]
     assert all((tmp_path / link).is_file() for link in found.links)
 
@@ -138,9 +109,9 @@ def test_a_report_that_cannot_be_written(
 def test_a_page_of_nothing_and_the_way_to_an_archive(tmp_path: Path) -> None:
     """A schedule that has just begun has a page; links are relative, so that both can be moved."""
     page = render_history(FieldHistory("new", "archive", [], []), "")
-    Addresses(page)
+    Page(page)
     assert "nothing to draw yet" in page
-    Addresses(render_index([], "archive", {}))
+    Page(render_index([], "archive", {}))
     assert way_to(tmp_path / "archive", tmp_path / "x.html") == "archive"
     assert way_to(tmp_path / "archive", tmp_path / "pages" / "x.html") == "../archive"
     assert way_to(tmp_path / "my field", tmp_path / "x.html") == "my%20field"

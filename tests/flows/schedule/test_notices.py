@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import socket
 from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import timedelta
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
@@ -23,20 +24,21 @@ from tests.flows.schedule.schedule_days import NOON, HandClock, field_schedule, 
 LATER = NOON + timedelta(hours=33)
 
 
-@pytest.fixture
-def listener() -> Iterator[tuple[str, list[dict[str, Any]]]]:
-    """An address on this machine, and what was posted to it."""
+@contextmanager
+def listening(code: int = 204, elsewhere: str = "") -> Iterator[tuple[str, list[dict[str, Any]]]]:
+    """An address on this machine that answers with a code, and what was posted to it or asked."""
     posted: list[dict[str, Any]] = []
 
     class Handler(BaseHTTPRequestHandler):
         def do_POST(self) -> None:
             posted.append(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
-            self.send_response(204)
-            self.end_headers()
+            self.do_GET()
 
         def do_GET(self) -> None:  # as what follows a redirect of a POST asks
-            posted.append({"asked": self.path})
-            self.send_response(204)
+            if self.command == "GET":
+                posted.append({"asked": self.path})
+            self.send_response(code)
+            self.send_header("Location", elsewhere)
             self.end_headers()
 
         def log_message(self, *words: object) -> None:
@@ -49,6 +51,13 @@ def listener() -> Iterator[tuple[str, list[dict[str, Any]]]]:
     server.shutdown()
     server.server_close()
     thread.join()
+
+
+@pytest.fixture
+def listener() -> Iterator[tuple[str, list[dict[str, Any]]]]:
+    """An address that takes notices."""
+    with listening() as one:
+        yield one
 
 
 def test_notices_are_of_trouble_only_and_never_needed(listener: tuple[str, list[dict[str, Any]]]) -> None:
@@ -143,30 +152,9 @@ def test_an_address_may_stand_in_a_file_or_the_environment(tmp_path: Path, monke
 @pytest.mark.parametrize("code", [301, 302, 303, 307, 308])
 def test_a_notice_follows_no_redirect(listener: tuple[str, list[dict[str, Any]]], code: int) -> None:
     """An answer that names another address, such as a port of this machine, has nothing posted or asked there."""
-    address, posted = listener
-    asked: list[str] = []
-
-    class Elsewhere(BaseHTTPRequestHandler):
-        def do_POST(self) -> None:
-            asked.append(self.path)
-            self.rfile.read(int(self.headers["Content-Length"]))
-            self.send_response(code)
-            self.send_header("Location", address)
-            self.end_headers()
-
-        def log_message(self, *words: object) -> None:
-            pass
-
-    server = HTTPServer(("127.0.0.1", 0), Elsewhere)
-    thread = Thread(target=server.serve_forever)
-    thread.start()
-    sent = send_notice(
-        f"http://127.0.0.1:{server.server_port}/hook", Outcome("north", NOON, "failed", "no reply"), "archive"
-    )
-    server.shutdown()
-    server.server_close()
-    thread.join()
-    assert (sent, asked, posted) == (False, ["/hook"], [])
+    with listening(code, listener[0]) as (address, asked):
+        sent = send_notice(f"{address}hook", Outcome("north", NOON, "failed", "no reply"), "archive")
+    assert (sent, len(asked), listener[1]) == (False, 1, [])
 
 
 def test_what_ended_alike_is_one_notice_that_counts(listener: tuple[str, list[dict[str, Any]]]) -> None:

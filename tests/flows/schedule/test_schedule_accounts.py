@@ -15,6 +15,21 @@ from tests.flows.schedule.schedule_days import NOON, HandClock, accounted, field
 FIRST, SECOND, THIRD = (NOON + timedelta(minutes=20 * number) for number in (1, 2, 3))
 
 
+def test_what_ended_is_not_due_again_after_the_clock_was_set_back(tmp_path: Path) -> None:
+    """Neither what was done later than the clock shows now, nor what was done before."""
+    clock, schedule = opened(tmp_path)
+    for due in (FIRST, SECOND):
+        clock.moment = due
+        schedule.begin(due)
+        schedule.end(due, "done")
+    clock.moment = NOON + timedelta(minutes=30)
+    assert schedule.pending() == []
+    clock.moment = SECOND
+    assert schedule.pending() == []
+    assert [schedule.begin(due) for due in (FIRST, SECOND)] == [None, None]
+    assert [line["event"] for line in schedule.ledger.lines()].count("begun") == 2
+
+
 def test_a_clock_that_is_put_right_is_no_event(tmp_path: Path) -> None:
     """Less than a minute back: no line tells of it, and what was skipped stays skipped."""
     clock, schedule = opened(tmp_path)
