@@ -27,12 +27,6 @@ from tests.storage.small_archive import flip
 POSE = {"lon_deg": 9.5, "lat_deg": 52.1, "heading_deg": 25.0, "tilt_deg": 50.0, "height_m": 14.0}
 
 
-@pytest.fixture
-def surveyed(two_budgets: Path) -> Path:
-    """Not to be changed."""
-    return two_budgets
-
-
 def _compared(
     capsys: pytest.CaptureFixture[str], archive: Path, old: str, new: str, out: Path | None = None
 ) -> dict[str, Any]:
@@ -47,27 +41,27 @@ def _map(classes: np.ndarray[Any, Any], names: tuple[str, ...], seed: int = 0) -
     return ClassMap(np.asarray(classes, np.uint8), np.ones(classes.shape, np.float32), names, colours)
 
 
-def test_a_run_is_the_same_as_itself(surveyed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_is_the_same_as_itself(two_budgets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Every class agrees wholly; the picture lies beside the archive, which is left as it is."""
-    content = _compared(capsys, surveyed, "latest", "latest", tmp_path)
+    content = _compared(capsys, two_budgets, "latest", "latest", tmp_path)
     assert content["differing"] == {"pixels": 0, "share": 0.0, "pairs": 0}
     assert (content["settings"], content["versions"], content["largest"]) == ([], [], [])
     assert {row["iou"] for row in content["classes"]} == {1.0}
     assert content["confidence"]["change"] == 0
-    assert compare(surveyed, "latest", "latest", out=tmp_path) == 0
+    assert compare(two_budgets, "latest", "latest", out=tmp_path) == 0
     assert "settings and versions are the same" in capsys.readouterr().out
-    old, new = (path.name for path in Archive.open(surveyed).runs())
-    before = sorted(surveyed.rglob("*"))
-    content = _compared(capsys, surveyed, old, f"runs/{new}")
-    assert Path(content["picture"]) == surveyed.parent / f"compare-{old}-{new}.png"
-    assert sorted(surveyed.rglob("*")) == before
+    old, new = (path.name for path in Archive.open(two_budgets).runs())
+    before = sorted(two_budgets.rglob("*"))
+    content = _compared(capsys, two_budgets, old, f"runs/{new}")
+    assert Path(content["picture"]) == two_budgets.parent / f"compare-{old}-{new}.png"
+    assert sorted(two_budgets.rglob("*")) == before
 
 
 def test_two_budgets_are_told_apart_either_way(
-    surveyed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    two_budgets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Areas add up to the field, the changed setting is named; swapped runs swap the figures, and agreement stays."""
-    content = _compared(capsys, surveyed, "previous", "latest", tmp_path)
+    content = _compared(capsys, two_budgets, "previous", "latest", tmp_path)
     assert content["settings"] == [{"name": "budget", "old": 0.8, "new": 0.7}]
     for side in (0, 1):
         assert sum(row["pixels"][side] for row in content["classes"]) == 96 * 128
@@ -77,12 +71,12 @@ def test_two_budgets_are_told_apart_either_way(
     with Image.open(content["picture"]) as picture:
         assert picture.format == "PNG"
         assert picture.width > 3 * 400
-    compare(surveyed, "previous", "latest", out=tmp_path)
+    compare(two_budgets, "previous", "latest", out=tmp_path)
     out = capsys.readouterr().out
     for words in ("budget", "time of capture", "IoU of A and B", "confidence", "compare-"):
         assert words in out
     one, other = (
-        _compared(capsys, surveyed, *runs, tmp_path) for runs in (("previous", "latest"), ("latest", "previous"))
+        _compared(capsys, two_budgets, *runs, tmp_path) for runs in (("previous", "latest"), ("latest", "previous"))
     )
     assert one["differing"] == other["differing"]
     assert [(row["name"], row["pixels"], row["iou"]) for row in one["classes"]] == [
@@ -133,9 +127,9 @@ def test_what_sets_two_farms_apart_is_told(tmp_path: Path) -> None:
         compare(tmp_path, old, new)
 
 
-def test_a_map_that_cannot_be_believed_is_not_compared(surveyed: Path, tmp_path: Path) -> None:
+def test_a_map_that_cannot_be_believed_is_not_compared(two_budgets: Path, tmp_path: Path) -> None:
     """Though its numbers can still be read."""
-    archive = Path(shutil.copytree(surveyed, tmp_path / "archive"))
+    archive = Path(shutil.copytree(two_budgets, tmp_path / "archive"))
     address = Catalogue.read(archive).runs[-1].products["class_map"]
     flip(archive / address.rpartition("/")[0] / "manifest.json", at=40)
     with pytest.raises(ArchiveError, match=r"the class map .* is missing or damaged; run verify --repair"):
@@ -158,14 +152,14 @@ def test_previous_is_the_run_just_before(tmp_path: Path) -> None:
         find_run(Catalogue.read(tmp_path / "empty"), "latest")
 
 
-def test_a_file_in_the_place_of_the_folder_is_refused(surveyed: Path, tmp_path: Path) -> None:
+def test_a_file_in_the_place_of_the_folder_is_refused(two_budgets: Path, tmp_path: Path) -> None:
     """And is left as it is."""
     (tmp_path / "mine").write_text("mine")
     with pytest.raises(SettingsError, match="lies in the archive, where nothing else belongs"):
-        compare(surveyed, "previous", "latest", out=surveyed / "runs")
+        compare(two_budgets, "previous", "latest", out=two_budgets / "runs")
     for out in (tmp_path / "mine", tmp_path / "mine" / "below"):
         with pytest.raises(ArchiveError, match=r"mine.* is or lies below a file, expected a folder; choose another"):
-            compare(surveyed, "previous", "latest", out=out)
+            compare(two_budgets, "previous", "latest", out=out)
     assert (tmp_path / "mine").read_text() == "mine"
 
 

@@ -106,19 +106,8 @@ def test_a_report_that_cannot_be_written(
     assert not list(tmp_path.glob("*.html"))
 
 
-def test_a_page_of_nothing_and_the_way_to_an_archive(tmp_path: Path) -> None:
-    """A schedule that has just begun has a page; links are relative, so that both can be moved."""
-    page = render_history(FieldHistory("new", "archive", [], []), "")
-    Page(page)
-    assert "nothing to draw yet" in page
-    Page(render_index([], "archive", {}))
-    assert way_to(tmp_path / "archive", tmp_path / "x.html") == "archive"
-    assert way_to(tmp_path / "archive", tmp_path / "pages" / "x.html") == "../archive"
-    assert way_to(tmp_path / "my field", tmp_path / "x.html") == "my%20field"
-
-
-def test_a_chart_has_a_line_for_each_series() -> None:
-    """One point is drawn too; the same points give the same bytes, and nothing is looked for outside of the page."""
+def test_charts_and_pages_of_little(tmp_path: Path) -> None:
+    """One point is drawn too, the same points alike; a schedule that has just begun has a page; links are relative."""
     series = {"soil": [(0.0, 1.0), (86400.0, 0.5)], "crop": [(0.0, 0.2)]}
     chart, again = line_chart(series, "Share", "%"), line_chart(series, "Share", "%")
     assert chart.drawing == again.drawing
@@ -127,6 +116,13 @@ def test_a_chart_has_a_line_for_each_series() -> None:
     assert all(chart.drawing.count(f"fill: none; stroke: {colour}") == 1 for colour in chart.legend.values())
     assert ">100 %<" in chart.drawing
     assert not re.search(r"https?:|url\(|<style", chart.drawing)
+    page = render_history(FieldHistory("new", "archive", [], []), "")
+    Page(page)
+    assert "nothing to draw yet" in page
+    Page(render_index([], "archive", {}))
+    assert way_to(tmp_path / "archive", tmp_path / "x.html") == "archive"
+    assert way_to(tmp_path / "archive", tmp_path / "pages" / "x.html") == "../archive"
+    assert way_to(tmp_path / "my field", tmp_path / "x.html") == "my%20field"
 
 
 @pytest.mark.parametrize(

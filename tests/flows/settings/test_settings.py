@@ -242,16 +242,12 @@ def test_wrong_values_are_refused(table, words):
 
 
 def test_a_pose_and_its_map_are_read(toml):
-    """The tables become the pose and the choice of the map; without them there is no pose."""
+    """Without the tables there is no pose; those of the example are valid without their comment signs."""
     found = load_settings(toml("[pose]\nlon_deg = -3.25\nlat_deg = 57\nheading_deg = 350\ntilt_deg = 20\nrange_m = 40"))
     assert found.pose == RigPose(lon_deg=-3.25, lat_deg=57.0, heading_deg=350.0, tilt_deg=20.0, range_m=40.0)
     assert (found.map, Settings().pose) == (MapChoice(), None)
     found = parse_settings({"pose": POSE, "map": {"epsg": 25832, "resolution_m": 0.05}})
     assert found.map == MapChoice(25832, 0.05)
-
-
-def test_the_commented_pose_of_the_example_is_valid():
-    """Taking off the comment signs of [pose] and [map] gives a posed survey (with one of height and range)."""
     text = EXAMPLE.read_text(encoding="utf-8")
     lines = [line.removeprefix("# ") for line in text[text.index("# [pose]") :].splitlines()]
     table = tomllib.loads(

@@ -49,21 +49,6 @@ def still(rig: ServedRig) -> bool:
     return not any(act.request.command in SETS for act in rig.rig.mirror.acts)
 
 
-def test_rig_in_order(command_line: CommandLine, tmp_path: Path) -> None:
-    """A table of what was asked and came, exit code 0, and nothing moved, also where surveys park the mirror."""
-    with served() as rig:
-        ended = command_line("rig", "check", "--port", rig.port, "--camera", camera_of(rig))
-        assert ended.code == 0
-        assert "MR-E-2" in ended.out
-        assert "nothing to mend" in ended.out
-        assert still(rig)
-    with served() as rig:
-        file = tmp_path / "field.toml"
-        file.write_text(f'[rig]\nport = "{rig.port}"\npark_at_close = true\n')
-        assert command_line("rig", "check", file, "--camera", camera_of(rig)).code == 0
-        assert still(rig)
-
-
 def test_settings_file_says_where_both_are(command_line: CommandLine, tmp_path: Path) -> None:
     """Flags win over it; the square is gone round on request, and the record is one JSON object."""
     with served() as rig:
@@ -171,14 +156,25 @@ def test_usage_errors(command_line: CommandLine, words: tuple[str, ...]) -> None
     command_line("rig", *words).refused(2, "")
 
 
-def test_faults_are_listed(command_line: CommandLine) -> None:
-    """All of both devices, for people and programs."""
+def test_rig_in_order(command_line: CommandLine, tmp_path: Path) -> None:
+    """A table of what was asked and came, and nothing moved, also where surveys park; faults are listed."""
     ended = command_line("rig", "emulate", "--faults", "list", "--json")
     names = [row["name"] for row in json.loads(ended.out)["faults"]]
     assert {"reset-in-upload", "camera-full", "never-stable"} <= set(names)
     table = command_line("rig", "emulate", "--faults", "list")
     assert table.code == 0
     assert "camera-cut-cube" in table.out
+    with served() as rig:
+        ended = command_line("rig", "check", "--port", rig.port, "--camera", camera_of(rig))
+        assert ended.code == 0
+        assert "MR-E-2" in ended.out
+        assert "nothing to mend" in ended.out
+        assert still(rig)
+    with served() as rig:
+        file = tmp_path / "field.toml"
+        file.write_text(f'[rig]\nport = "{rig.port}"\npark_at_close = true\n')
+        assert command_line("rig", "check", file, "--camera", camera_of(rig)).code == 0
+        assert still(rig)
 
 
 def test_emulated_rig_is_checked_by_the_file_that_it_writes(command_line: CommandLine, tmp_path: Path) -> None:

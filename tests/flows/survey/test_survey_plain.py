@@ -223,8 +223,8 @@ def test_without_a_fine_seat_the_map_is_the_glance(survey_png: Any, weights: Pat
     assert done.receipt["accuracy"]["miou"] == done.receipt["accuracy"]["none"]["miou"]
 
 
-def test_no_controls_leaves_them_out(picture: Done) -> None:
-    """Neither other placements nor `all` are judged or timed; the map and the coarse look still are."""
+def test_what_is_not_judged_is_left_out(picture: Done, survey_png: Any, scene_files: Path, tmp_path: Path) -> None:
+    """Without controls neither other placements nor `all` are judged; without labels there is no accuracy."""
     accuracy = picture.receipt["accuracy"]
     assert accuracy["controls"] == {}
     assert accuracy["all"]["miou"] is None
@@ -232,10 +232,6 @@ def test_no_controls_leaves_them_out(picture: Done) -> None:
     assert accuracy["miou"] is not None
     assert accuracy["none"]["miou"] is not None
     assert "segment_wall_s" not in picture.receipt["savings"]
-
-
-def test_without_labels_there_is_no_accuracy(survey_png: Any, scene_files: Path, tmp_path: Path) -> None:
-    """A cube of other bands in any order is surveyed by the same weights; nothing is judged."""
     nm = "640,460,500,550,620,600"
     found = survey_png(tmp_path, scene=str(scene_files / "cube.npy"), labels=None, wavelengths=nm, budget="1").receipt
     assert "accuracy" not in check_receipt(found)

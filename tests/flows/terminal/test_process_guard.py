@@ -111,8 +111,10 @@ def test_a_kept_process_is_started_again_and_nothing_piles_up(kept: KeptProcess)
     assert held() == before
 
 
-def test_a_kept_process_that_does_not_listen_is_killed(tmp_path: Path) -> None:
-    """After its patience it is ended all the same."""
+def test_a_kept_process_is_ended_and_its_log_begun_anew(
+    tmp_path: Path, kept: KeptProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What does not listen is ended all the same; what was said is kept until it is too much."""
     deaf = KeptProcess(DEAF, tmp_path / "log", 0.1)
     before = held()
     deaf.keep_up()
@@ -121,10 +123,6 @@ def test_a_kept_process_that_does_not_listen_is_killed(tmp_path: Path) -> None:
     deaf.stop()
     assert held() == before
     assert "over" not in deaf.log.read_text()
-
-
-def test_a_log_that_has_grown_is_begun_anew(kept: KeptProcess, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What was said is kept from start to start until it is too much."""
     kept.log.parent.mkdir()
     kept.log.write_text("before\n")
     kept.keep_up()
