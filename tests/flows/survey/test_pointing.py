@@ -157,7 +157,7 @@ def test_either_pass_overlaps_and_reaches_by_what_it_needs() -> None:
     """Neighbours that look as far apart as they can share 64 px, and both ends of the field are seen."""
     plan = plan_capture(parse_settings({"pointing_px": OFF, "budget": 1.0}), GRID)
     assert plan.along == "x"
-    assert plan.overlap_px == 2 * OFF + 64 * 4
+    assert (plan.overlap_px, plan.margin_px) == (2 * OFF + 64 * 4, 2 * OFF)
     assert shared_px(plan.coarse) >= plan.overlap_px - 1e-3
     assert shared_px(plan.full) >= 2 * OFF + 64 - 1e-3
     assert len(plan.full) == int(np.ceil(1500 / (640 - 2 * OFF - 64)))
