@@ -1,17 +1,29 @@
-"""The command line in this process, and a Prefect that keeps to a folder of its own."""
+"""The command line in this process, a Prefect in a folder of its own, and archives of tiny surveys to look at."""
 
 from __future__ import annotations
 
 import json
+import os
+import re
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import pytest
+from PIL import Image
 
 from flows.cli.main import main
 from flows.schedule.served import NAMED_BY
 from flows.survey.prefect_engine import PASSWORD, QUIET
+from flows.survey.survey import STAGES
+from storage.archive.archive import Archive
+from storage.remote.opening import verify_archive
+from tests.conftest import Survey
+from tests.flows.small_fields import write_field
 
 CommandLine = Callable[..., "Ended"]
 
@@ -28,6 +40,76 @@ class Ended:
     def errors(self) -> list[str]:
         """The messages that begin with ``error:``."""
         return [line.removeprefix("error: ") for line in self.err.splitlines() if line.startswith("error: ")]
+
+    def refused(self, code: int, pattern: str) -> None:
+        """It ended with this code, one message that matches, and no traceback."""
+        assert (self.code, len(self.errors)) == (code, 1), self.err
+        assert re.search(pattern, self.errors[0]), self.errors[0]
+        assert "Traceback" not in self.err
+
+
+def problems(out: Path) -> list[str]:
+    """What a full verification of an archive finds."""
+    return [f"{one.uri} {one.problem}" for one in verify_archive(Archive.open(out)) if one.problem]
+
+
+class Page(HTMLParser):
+    """A page whose tags close in order: its links, what else it would load from elsewhere, and its tags."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.links: list[str] = []
+        self.loaded: list[str] = []
+        self.open: list[str] = []
+        self.feed(page)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Remember addresses; tags without an end are not open, and scripts and frames are none of ours."""
+        assert tag not in ("script", "link", "iframe")
+        found = [str(value) for name, value in attrs if name in ("src", "href", "srcset", "action", "xlink:href")]
+        if tag == "a":
+            self.links += found
+        self.loaded += [one for one in found if tag != "a" and not one.startswith("#")]  # but for parts of the page
+        if tag not in ("meta", "img"):
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Nothing is open after it."""
+        self.handle_starttag(tag, attrs)
+        if tag not in ("meta", "img"):
+            self.open.pop()
+
+    def handle_endtag(self, tag: str) -> None:
+        """The innermost open tag closes."""
+        assert self.open.pop() == tag
+
+
+def turned(scene: Path, to: Path) -> Path:
+    """Write a picture turned by half a circle: another field of the same size."""
+    with Image.open(scene) as image:
+        image.transpose(Image.Transpose.ROTATE_180).save(to)
+    return to
+
+
+def python(code: str, *words: object, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run code of this project in a process of its own."""
+    known = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2]), **environment}
+    command = [sys.executable, "-c", code, *map(str, words)]
+    return subprocess.run(command, env=known, capture_output=True, text=True, check=False)
+
+
+def act_instead(patch: pytest.MonkeyPatch, name: str, wants: Callable[..., Any]) -> None:
+    """Have a stage tell something else when it is asked what it wants."""
+    patch.setitem(STAGES, name, replace(STAGES[name], wants=wants))
+
+
+def be_version(patch: pytest.MonkeyPatch, product: str, version: int) -> None:
+    """Have all stages of a product write another version of it."""
+    for name, stage in list(STAGES.items()):
+        if stage.product.name == product:
+            patch.setitem(STAGES, name, replace(stage, product=replace(stage.product, version=version)))
 
 
 @pytest.fixture
@@ -85,3 +167,25 @@ def served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Pat
         return path
 
     return say
+
+
+@pytest.fixture(scope="session")
+def two_budgets(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey) -> Path:
+    """An archive of two surveys of one scene with different budgets, 0.8 and 0.7; not to be changed."""
+    folder = tmp_path_factory.mktemp("two_budgets") / "archive"
+    for budget in ("0.8", "0.7"):
+        survey_png(folder, budget=budget)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def one_survey(tmp_path_factory: pytest.TempPathFactory, surveyed_png: Survey) -> tuple[Path, Any]:
+    """An archive with one survey of the small picture, not to be changed, and what it published."""
+    out = tmp_path_factory.mktemp("one_survey") / "archive"
+    return out, surveyed_png(out)
+
+
+@pytest.fixture(scope="session")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of three small frames that all evaluations judge on."""
+    return write_field(tmp_path_factory.mktemp("evaluate") / "field")

@@ -30,15 +30,9 @@ QUIET = Console(quiet=True)
 
 
 @pytest.fixture
-def surveyed(two_budgets: Path) -> Path:
-    """Not to be changed."""
-    return two_budgets
-
-
-@pytest.fixture
-def archive(surveyed: Path, tmp_path: Path) -> Path:
+def archive(two_budgets: Path, tmp_path: Path) -> Path:
     """A copy of it."""
-    return Path(shutil.copytree(surveyed, tmp_path / "archive"))
+    return Path(shutil.copytree(two_budgets, tmp_path / "archive"))
 
 
 def _json(capsys: pytest.CaptureFixture[str], run: Callable[[], int], code: int = DONE) -> dict[str, Any]:
@@ -48,9 +42,9 @@ def _json(capsys: pytest.CaptureFixture[str], run: Callable[[], int], code: int 
     return content
 
 
-def test_ls_shows_runs_and_stores(surveyed: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """As JSON with figures, and for people with units."""
-    content = _json(capsys, lambda: ls(surveyed, as_json=True))
+def test_ls_shows_runs_and_stores(two_budgets: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As JSON with figures; for people with units, in 80 columns, into a pipe as well."""
+    content = _json(capsys, lambda: ls(two_budgets, as_json=True))
     first, second = content["runs"]
     assert (first["survey"], first["budget"], second["budget"], first["seed"]) == ("scene", 0.8, 0.7, 0)
     assert first["state"] == second["state"] == "there"
@@ -58,11 +52,15 @@ def test_ls_shows_runs_and_stores(surveyed: Path, capsys: pytest.CaptureFixture[
     assert first["bytes"] > second["bytes"] > 10_000
     assert [len(content["stages"][stage]) for stage in ("capture", "rectify", "segment")] == [3, 1, 2]
     assert content["stages"]["rectify"][0]["runs"] == 2
-    ls(surveyed)
+    ls(two_budgets)
     out = capsys.readouterr().out
     assert first["id"] in out
     assert content["stages"]["rectify"][0]["key"] in out
     assert "2 runs, 16 stores" in out
+    ls(two_budgets)
+    out = capsys.readouterr().out
+    assert max(map(len, out.splitlines())) <= 80
+    assert "age" in out
 
 
 def test_of_many_stores_the_newest_are_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -80,11 +78,14 @@ def test_of_many_stores_the_newest_are_shown(tmp_path: Path, capsys: pytest.Capt
     assert content["checked"] == content["whole"] == archive_tables.MOST_ROWS + 2
 
 
-def test_ages_are_told_in_days(surveyed: Path) -> None:
-    """And a clock that was set back gives no error."""
+def test_ages_are_told_in_days(two_budgets: Path) -> None:
+    """A clock that was set back gives no error; progress goes to the console, not among answers."""
     for days in (3, -3):
-        content = contents(Archive.open(surveyed), datetime.now(UTC) + timedelta(days=days))
+        content = contents(Archive.open(two_budgets), datetime.now(UTC) + timedelta(days=days))
         assert content["stages"]["rectify"][0]["age_s"] == pytest.approx(days * 86400, abs=1000)
+    told = io.StringIO()
+    run_verify(two_budgets, Console(file=told))
+    assert "reading again: 100%" in told.getvalue()
 
 
 @pytest.mark.parametrize(
@@ -123,9 +124,9 @@ def test_an_empty_and_a_damaged_archive_are_listed(archive: Path, capsys: pytest
     assert "has lost its manifest; run verify" in capsys.readouterr().out
 
 
-def test_explain_shows_lineage_and_what_changed(surveyed: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_explain_shows_lineage_and_what_changed(two_budgets: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The second map differs by its budget, which the plan turned into other sweeps."""
-    content = _json(capsys, lambda: explain(surveyed, "class_map", as_json=True))
+    content = _json(capsys, lambda: explain(two_budgets, "class_map", as_json=True))
     (top,) = content["lineage"]
     assert (top["stage"], top["called"], [one["stage"] for one in top["inputs"]]) == (
         "segment",
@@ -136,7 +137,7 @@ def test_explain_shows_lineage_and_what_changed(surveyed: Path, capsys: pytest.C
     assert content["before"].startswith("stages/segment/")
     kinds = {(one["where"], one["kind"], one["name"]) for one in content["changes"]}
     assert {("segment", "input", "patches"), ("attend", "parameter", "fine_s")} <= kinds
-    explain(surveyed, "class_map")
+    explain(two_budgets, "class_map")
     out = capsys.readouterr().out
     assert "segment" in out
     assert "└── capture" in out
@@ -144,26 +145,20 @@ def test_explain_shows_lineage_and_what_changed(surveyed: Path, capsys: pytest.C
     assert "fine_s" in out
 
 
-def test_a_fine_capture_is_not_taken_for_a_version_of_the_coarse_one(
-    surveyed: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Both are of the stage capture; the first survey's coarse sweeps are the first of their kind."""
-    assert _json(capsys, lambda: explain(surveyed, "raw_coarse", as_json=True))["before"] is None
-    explain(surveyed, "raw_coarse")
+def test_captures_and_runs_are_explained(two_budgets: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Coarse and fine sweeps are not versions of each other; a run has its command, and each store once."""
+    assert _json(capsys, lambda: explain(two_budgets, "raw_coarse", as_json=True))["before"] is None
+    explain(two_budgets, "raw_coarse")
     assert "no earlier version" in capsys.readouterr().out
-    fine = _json(capsys, lambda: explain(surveyed, "raw_fine", as_json=True))
-    (earlier,) = [run for run in contents(Archive.open(surveyed))["runs"] if run["budget"] == 0.8]
-    runs = _json(capsys, lambda: explain(surveyed, fine["before"], as_json=True))["runs"]
+    fine = _json(capsys, lambda: explain(two_budgets, "raw_fine", as_json=True))
+    (earlier,) = [run for run in contents(Archive.open(two_budgets))["runs"] if run["budget"] == 0.8]
+    runs = _json(capsys, lambda: explain(two_budgets, fine["before"], as_json=True))["runs"]
     assert runs == [f"runs/{earlier['id']}"]
-
-
-def test_a_run_is_explained_by_its_command_and_stores(surveyed: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Each store opens once; what nothing else was made of is at the top."""
-    (first, _) = (run["id"] for run in contents(Archive.open(surveyed))["runs"])
-    content = _json(capsys, lambda: explain(surveyed, first, as_json=True))
+    (first, _) = (run["id"] for run in contents(Archive.open(two_budgets))["runs"])
+    content = _json(capsys, lambda: explain(two_budgets, first, as_json=True))
     assert [tree["stage"] for tree in content["lineage"]] == ["evaluate", "turned"]
     assert "--budget 0.8" in content["run"]["command"]
-    explain(surveyed, first)
+    explain(two_budgets, first)
     out = capsys.readouterr().out
     assert "spectralzoom survey --scene" in " ".join(out.split())
     assert out.count("capture_coarse") == 1
@@ -263,13 +258,6 @@ def test_a_repair_that_could_do_some_of_it_says_so(archive: Path, capsys: pytest
     assert [one["uri"] for one in content["problems"]] == ["stages/ingest/cube"]
 
 
-def test_progress_is_told_on_the_console(surveyed: Path) -> None:
-    """Not on stdout, which is for the answer."""
-    told = io.StringIO()
-    run_verify(surveyed, Console(file=told))
-    assert "reading again: 100%" in told.getvalue()
-
-
 def test_commands_ask_for_the_settings_again(tmp_path: Path) -> None:
     """Only what differs from the defaults; tables are pointed at."""
     flags = {"scene": "farm", "size": "640x512", "bands": "3,4", "controls": False, "camera.exposure_ms": 50}
@@ -303,11 +291,3 @@ def test_an_archive_surveyed_by_relative_paths_is_repaired_from_anywhere(
     for run in Catalogue.read(tmp_path / "archive").runs:
         assert run.settings["scene"] == str(scene_files / "scene.png")
         assert (run.settings["source"], run.settings["mask"]) == ("sim", None)
-
-
-def test_tables_of_a_plain_archive_fit_a_narrow_terminal(surveyed: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """80 columns, into a pipe as well."""
-    ls(surveyed)
-    out = capsys.readouterr().out
-    assert max(map(len, out.splitlines())) <= 80
-    assert "age" in out

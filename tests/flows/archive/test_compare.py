@@ -32,15 +32,10 @@ from storage.archive.lineage import Catalogue
 from storage.archive.records import Run
 from storage.arrays.class_maps import ClassMap
 from tests.conftest import Survey, WeightsMaker
+from tests.flows.conftest import turned
 from tests.storage.small_archive import flip
 
 POSE = {"lon_deg": 9.5, "lat_deg": 52.1, "heading_deg": 25.0, "tilt_deg": 50.0, "height_m": 14.0}
-
-
-@pytest.fixture
-def surveyed(two_budgets: Path) -> Path:
-    """Not to be changed."""
-    return two_budgets
 
 
 def _compared(
@@ -57,20 +52,27 @@ def _map(classes: np.ndarray[Any, Any], names: tuple[str, ...], seed: int = 0) -
     return ClassMap(np.asarray(classes, np.uint8), np.ones(classes.shape, np.float32), names, colours)
 
 
-def test_a_run_is_the_same_as_itself(surveyed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Nothing differs, and every class agrees wholly."""
-    content = _compared(capsys, surveyed, "latest", "latest", tmp_path)
+def test_a_run_is_the_same_as_itself(two_budgets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Every class agrees wholly; the picture lies beside the archive, which is left as it is."""
+    content = _compared(capsys, two_budgets, "latest", "latest", tmp_path)
     assert content["differing"] == {"pixels": 0, "share": 0.0, "pairs": 0}
     assert (content["settings"], content["versions"], content["largest"]) == ([], [], [])
     assert {row["iou"] for row in content["classes"]} == {1.0}
     assert content["confidence"]["change"] == 0
-    assert compare(surveyed, "latest", "latest", out=tmp_path) == 0
+    assert compare(two_budgets, "latest", "latest", out=tmp_path) == 0
     assert "settings and versions are the same" in capsys.readouterr().out
+    old, new = (path.name for path in Archive.open(two_budgets).runs())
+    before = sorted(two_budgets.rglob("*"))
+    content = _compared(capsys, two_budgets, old, f"runs/{new}")
+    assert Path(content["picture"]) == two_budgets.parent / f"compare-{old}-{new}.png"
+    assert sorted(two_budgets.rglob("*")) == before
 
 
-def test_two_budgets_are_told_apart(surveyed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Areas add up to the field, pairs to the pixels that differ, and the setting that was changed is named."""
-    content = _compared(capsys, surveyed, "previous", "latest", tmp_path)
+def test_two_budgets_are_told_apart_either_way(
+    two_budgets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Areas add up to the field, the changed setting is named; swapped runs swap the figures, and agreement stays."""
+    content = _compared(capsys, two_budgets, "previous", "latest", tmp_path)
     assert content["settings"] == [{"name": "budget", "old": 0.8, "new": 0.7}]
     for side in (0, 1):
         assert sum(row["pixels"][side] for row in content["classes"]) == 96 * 128
@@ -80,18 +82,12 @@ def test_two_budgets_are_told_apart(surveyed: Path, tmp_path: Path, capsys: pyte
     with Image.open(content["picture"]) as picture:
         assert picture.format == "PNG"
         assert picture.width > 3 * 400
-    compare(surveyed, "previous", "latest", out=tmp_path)
+    compare(two_budgets, "previous", "latest", out=tmp_path)
     out = capsys.readouterr().out
     for words in ("budget", "time of capture", "IoU of A and B", "confidence", "compare-"):
         assert words in out
-
-
-def test_swapping_the_runs_swaps_the_figures(
-    surveyed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """And agreement stays."""
     one, other = (
-        _compared(capsys, surveyed, *runs, tmp_path) for runs in (("previous", "latest"), ("latest", "previous"))
+        _compared(capsys, two_budgets, *runs, tmp_path) for runs in (("previous", "latest"), ("latest", "previous"))
     )
     assert one["differing"] == other["differing"]
     assert [(row["name"], row["pixels"], row["iou"]) for row in one["classes"]] == [
@@ -100,15 +96,6 @@ def test_swapping_the_runs_swaps_the_figures(
     assert {(row["from"], row["to"], row["pixels"]) for row in one["largest"]} == {
         (row["to"], row["from"], row["pixels"]) for row in other["largest"]
     }
-
-
-def test_the_picture_lies_beside_the_archive(surveyed: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Named by both runs; the archive itself is left as it is."""
-    old, new = (path.name for path in Archive.open(surveyed).runs())
-    before = sorted(surveyed.rglob("*"))
-    content = _compared(capsys, surveyed, old, f"runs/{new}")
-    assert Path(content["picture"]) == surveyed.parent / f"compare-{old}-{new}.png"
-    assert sorted(surveyed.rglob("*")) == before
 
 
 def test_new_weights_and_hectares_are_told(
@@ -127,10 +114,8 @@ def test_new_weights_and_hectares_are_told(
 
 def test_runs_of_different_fields_are_refused(survey_png: Survey, scene_files: Path, tmp_path: Path) -> None:
     """Also by `previous`, which looks for the same field."""
-    turned = tmp_path / "turned.png"
-    with Image.open(scene_files / "scene.png") as image:
-        image.transpose(Image.Transpose.ROTATE_180).save(turned)
-    for scene in (scene_files / "scene.png", turned):
+    other = turned(scene_files / "scene.png", tmp_path / "turned.png")
+    for scene in (scene_files / "scene.png", other):
         survey_png(tmp_path / "archive", scene=str(scene), labels=None)
     old, new = (path.name for path in Archive.open(tmp_path / "archive").runs())
     with pytest.raises(SceneError, match=r"different fields.*turned\.png"):
@@ -153,9 +138,9 @@ def test_what_sets_two_farms_apart_is_told(tmp_path: Path) -> None:
         compare(tmp_path, old, new)
 
 
-def test_a_map_that_cannot_be_believed_is_not_compared(surveyed: Path, tmp_path: Path) -> None:
+def test_a_map_that_cannot_be_believed_is_not_compared(two_budgets: Path, tmp_path: Path) -> None:
     """Though its numbers can still be read."""
-    archive = Path(shutil.copytree(surveyed, tmp_path / "archive"))
+    archive = Path(shutil.copytree(two_budgets, tmp_path / "archive"))
     address = Catalogue.read(archive).runs[-1].products["class_map"]
     flip(archive / address.rpartition("/")[0] / "manifest.json", at=40)
     with pytest.raises(ArchiveError, match=r"the class map .* is missing or damaged; run verify --repair"):
@@ -163,7 +148,7 @@ def test_a_map_that_cannot_be_believed_is_not_compared(surveyed: Path, tmp_path:
 
 
 def test_previous_is_the_run_just_before(tmp_path: Path) -> None:
-    """Of the same field, whatever lies between; runs without a map do not count."""
+    """Of the same field, whatever lies between; runs without a map do not count; an empty archive has none."""
     archive = Archive.open(tmp_path)
     made = []
     for seed, product in ((0, "class_map"), (0, "class_map"), (0, "plan"), (1, "class_map"), (0, "class_map")):
@@ -173,28 +158,24 @@ def test_previous_is_the_run_just_before(tmp_path: Path) -> None:
             made.append(draft.id)
     catalogue = Catalogue.read(tmp_path)
     assert [find_run(catalogue, text).folder.name for text in ("latest", "previous")] == [made[4], made[1]]
+    Archive.open(tmp_path / "empty")
+    with pytest.raises(ArchiveError, match="no run of this archive"):
+        find_run(Catalogue.read(tmp_path / "empty"), "latest")
 
 
-def test_a_file_in_the_place_of_the_folder_is_refused(surveyed: Path, tmp_path: Path) -> None:
+def test_a_file_in_the_place_of_the_folder_is_refused(two_budgets: Path, tmp_path: Path) -> None:
     """And is left as it is."""
     (tmp_path / "mine").write_text("mine")
     with pytest.raises(SettingsError, match="lies in the archive, where nothing else belongs"):
-        compare(surveyed, "previous", "latest", out=surveyed / "runs")
+        compare(two_budgets, "previous", "latest", out=two_budgets / "runs")
     for out in (tmp_path / "mine", tmp_path / "mine" / "below"):
         with pytest.raises(ArchiveError, match=r"mine.* is or lies below a file, expected a folder; choose another"):
-            compare(surveyed, "previous", "latest", out=out)
+            compare(two_budgets, "previous", "latest", out=out)
     assert (tmp_path / "mine").read_text() == "mine"
 
 
-def test_an_empty_archive_has_no_latest(tmp_path: Path) -> None:
-    """It says so."""
-    Archive.open(tmp_path)
-    with pytest.raises(ArchiveError, match="no run of this archive"):
-        find_run(Catalogue.read(tmp_path), "latest")
-
-
 def test_classes_are_matched_by_name() -> None:
-    """The same map under another order of names is the same map; a class that only one list has stays its own."""
+    """In another order it is the same map; a class of one list alone stays its own; sizes have to agree."""
     classes = np.random.default_rng(3).integers(0, 3, (9, 7)).astype(np.uint8)
     classes[0, 0] = UNLABELLED
     order = np.full(256, UNLABELLED, np.uint8)
@@ -205,6 +186,8 @@ def test_classes_are_matched_by_name() -> None:
     np.testing.assert_array_equal(pair.maps.old, pair.maps.new)
     assert not pair.maps.pairs
     assert np.trace(pair.joint) == classes.size
+    with pytest.raises(ShapeError, match=r"\(4, 4\) and \(4, 5\)"):
+        _pair_of([_map(np.zeros((4, width)), ("a",)) for width in (4, 5)])
 
 
 def test_hectares_are_told_where_both_runs_have_them() -> None:
@@ -233,14 +216,8 @@ def test_confidence_is_compared_where_both_have_a_class() -> None:
     assert set(_confidence(old[2:3], new[2:3]).values()) == {None}
 
 
-def test_maps_of_different_sizes_are_refused() -> None:
-    """With both sizes."""
-    with pytest.raises(ShapeError, match=r"\(4, 4\) and \(4, 5\)"):
-        _pair_of([_map(np.zeros((4, width)), ("a",)) for width in (4, 5)])
-
-
 def test_changes_have_colours_of_their_own() -> None:
-    """The largest pairs each, the rest dark, what is the same light; pixels without a class count as a class."""
+    """The largest pairs each, the rest dark, what is the same light; maps of any shape and name are drawn."""
     rng = np.random.default_rng(1)
     names = tuple("abcdef")
     old, new = (rng.integers(0, 6, (40, 50)).astype(np.uint8) for _ in range(2))
@@ -252,6 +229,11 @@ def test_changes_have_colours_of_their_own() -> None:
     np.testing.assert_array_equal((picture == np.float32(SAME)).all(axis=-1), old == new)
     assert (picture == np.float32(OTHER)).all(axis=-1).any()
     assert (maps.name(0), maps.name(UNLABELLED)) == ("a", "no class")
+    for shape in ((1, 90), (300, 8)):
+        zero = np.zeros(shape, np.uint8)
+        drawn = draw_difference(MapPair(zero, zero, ("a $x$_b",), np.zeros((1, 3), np.uint8), []), ("A", "B", "none"))
+        with Image.open(io.BytesIO(drawn)) as picture:
+            assert picture.format == "PNG"
 
 
 @pytest.mark.parametrize(("step", "shape"), [(1, (6, 9)), (3, (2, 3)), (4, (2, 3)), (20, (1, 1))])
@@ -267,12 +249,3 @@ def test_no_change_is_left_out_of_a_thinned_picture(step: int, shape: tuple[int,
     assert (maps.old[tuple(place)], maps.new[tuple(place)]) == (old[4, 8], 7)
     if step == 3:
         np.testing.assert_array_equal(maps.old[0], old[0, ::3])
-
-
-def test_wide_tall_and_equal_maps_are_drawn() -> None:
-    """Names with dollar signs are text."""
-    for shape in ((1, 90), (300, 8)):
-        zero = np.zeros(shape, np.uint8)
-        drawn = draw_difference(MapPair(zero, zero, ("a $x$_b",), np.zeros((1, 3), np.uint8), []), ("A", "B", "none"))
-        with Image.open(io.BytesIO(drawn)) as picture:
-            assert picture.format == "PNG"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from storage.export.stac_items import stac_problems
 from storage.readers.envi_cubes import open_envi_cube
 from storage.remote.opening import verify_archive
 from tests.storage.export.stac_rules import extension_problems
+from tests.storage.small_archive import flip
 
 rasterio = pytest.importorskip("rasterio", reason="exports are written with rasterio, of the extra [geo]")
 pystac = pytest.importorskip("pystac", reason="exports are described with pystac, of the extra [geo]")
@@ -104,10 +106,19 @@ def posed(exports: list[Exported]) -> Exported:
 
 
 @pytest.mark.parametrize("number", [0, 1])
-def test_every_image_is_a_cloud_optimised_geotiff(exports: list[Exported], number: int) -> None:
-    """The four images of a run pass all checks of the layout."""
+def test_images_are_cloud_optimised_and_attention_keeps_its_seats(exports: list[Exported], number: int) -> None:
+    """All checks of the layout pass; one pixel a seat, from the scene's corner on, with the store's scores."""
     images = {key: cog_problems(exports[number].file(key)) for key in ("class_map", "confidence", "attention", "rgb")}
     assert [problems for problems in images.values() if problems] == []
+    done = exports[number]
+    score, scene = done.store("attention")["score"].values, done.store("class_map").attrs["spatial:transform"]
+    with rasterio.open(done.file("attention")) as file:
+        np.testing.assert_array_equal(file.read(1), score)
+        patch = int(file.tags()["seat_px"])
+        a, b, c, d, e, f = scene
+        assert file.transform[:6] == pytest.approx((patch * a, b, c, d, patch * e, f))
+        assert file.crs is None
+        assert file.tags()["policy"] == "gain"
 
 
 def test_with_a_pose_images_lie_where_the_zarr_store_lies(posed: Exported) -> None:
@@ -141,22 +152,8 @@ def test_without_a_pose_images_lie_on_angles(plain: Exported) -> None:
 
 
 @pytest.mark.parametrize("number", [0, 1])
-def test_attention_keeps_its_seats(exports: list[Exported], number: int) -> None:
-    """One pixel a seat, from the scene's corner on, with the scores of the store."""
-    done = exports[number]
-    score, scene = done.store("attention")["score"].values, done.store("class_map").attrs["spatial:transform"]
-    with rasterio.open(done.file("attention")) as file:
-        np.testing.assert_array_equal(file.read(1), score)
-        patch = int(file.tags()["seat_px"])
-        a, b, c, d, e, f = scene
-        assert file.transform[:6] == pytest.approx((patch * a, b, c, d, patch * e, f))
-        assert file.crs is None
-        assert file.tags()["policy"] == "gain"
-
-
-@pytest.mark.parametrize("number", [0, 1])
-def test_classes_bring_their_names_and_colours(exports: list[Exported], number: int) -> None:
-    """The legend of the archive stands in the file and in the catalogue."""
+def test_images_say_what_they_show_and_of_which_run(exports: list[Exported], number: int) -> None:
+    """Names and colours in file and catalogue; run, product, time and program in the tags."""
     done = exports[number]
     about = done.store("class_map").attrs
     with rasterio.open(done.file("class_map")) as file:
@@ -166,11 +163,6 @@ def test_classes_bring_their_names_and_colours(exports: list[Exported], number: 
     assert [list(table[number][:3]) for number in range(len(about["class_names"]))] == about["class_colours"]
     named = done.item()["assets"]["class_map"]["classification:classes"]
     assert [one["title"] for one in named] == about["class_names"]
-
-
-@pytest.mark.parametrize("number", [0, 1])
-def test_files_say_which_run_and_store_they_are_of(exports: list[Exported], number: int) -> None:
-    """Run, product, time and program stand in the tags."""
     done = exports[number]
     with rasterio.open(done.file("class_map")) as file:
         tags = file.tags()
@@ -258,27 +250,14 @@ def test_exported_again_nothing_changes(posed: Exported) -> None:
     assert changed == []
 
 
-def test_leftovers_of_a_killed_export_go(posed: Exported, tmp_path: Path) -> None:
-    """What an export left half written goes with the next one."""
-    for folder in (tmp_path, tmp_path / posed.id):
-        (folder / ".export-x.part").mkdir(parents=True)
-    run_export(posed.archive, posed.id, tmp_path, envi=False, console=QUIET)
-    assert not list(tmp_path.rglob("*.part"))
-    assert not list(tmp_path.rglob("*.lock"))
-
-
-def test_a_run_that_is_not_there_is_refused(posed: Exported, tmp_path: Path) -> None:
-    """The message names the runs that there are; an empty archive says that it has none."""
+def test_runs_and_places_that_are_none_are_refused(posed: Exported, tmp_path: Path) -> None:
+    """Runs that there are are named; a place in the archive or below a file is told; the archive verifies."""
     with pytest.raises(SettingsError, match=f"no run 'x'; its latest are .*{posed.id}"):
         run_export(posed.archive, "x", tmp_path / "out", envi=False, console=QUIET)
     Archive.open(tmp_path / "empty")
     with pytest.raises(SettingsError, match="has no published run; survey into it first"):
         run_export(tmp_path / "empty", None, tmp_path / "out", envi=False, console=QUIET)
     assert not (tmp_path / "out").exists()
-
-
-def test_places_that_cannot_be_written_are_refused(posed: Exported, tmp_path: Path) -> None:
-    """A folder of the archive, a file, and a folder below a file: one message each, and the archive verifies."""
     with pytest.raises(SettingsError, match="lies in the archive"):
         run_export(posed.archive, None, posed.archive / "export", envi=False, console=QUIET)
     (tmp_path / "file").write_text("mine")
@@ -289,20 +268,48 @@ def test_places_that_cannot_be_written_are_refused(posed: Exported, tmp_path: Pa
     assert all(finding.problem is None for finding in verify_archive(Archive.open(posed.archive)))
 
 
-def test_a_run_goes_by_the_names_that_other_verbs_give_it(posed: Exported, tmp_path: Path) -> None:
-    """Its address, with a slash or without, and latest."""
+def test_leftovers_of_a_killed_export_go(posed: Exported, tmp_path: Path) -> None:
+    """With the next export of the run, by whichever of its names."""
     for run in (f"runs/{posed.id}", f"{posed.id}/", "latest"):
         assert run_export(posed.archive, run, tmp_path / "out", envi=False, console=QUIET)["run"] == posed.id
+    for folder in (tmp_path, tmp_path / posed.id):
+        (folder / ".export-x.part").mkdir(parents=True)
+    run_export(posed.archive, posed.id, tmp_path, envi=False, console=QUIET)
+    assert not list(tmp_path.rglob("*.part"))
+    assert not list(tmp_path.rglob("*.lock"))
 
 
-def test_a_changed_receipt_is_not_believed(posed: Exported, tmp_path: Path) -> None:
-    """Readable as it is: what it says is not what was published."""
-    archive = tmp_path / "field-a"
-    shutil.copytree(posed.archive, archive)
-    receipt = archive / "runs" / posed.id / "receipt.json"
+def _change_receipt(archive: Path, published: Published) -> None:
+    receipt = archive / "runs" / published.folder.name / "receipt.json"
     receipt.write_text(receipt.read_text().replace('"seed": 1', '"seed": 2', 1))
-    with pytest.raises(IncompleteStoreError, match=r"is damaged: receipt.json has changed .*run verify"):
+
+
+def _flip_classes(archive: Path, published: Published) -> None:
+    classes = archive / published.receipt["products"]["ground_map"] / "classes"
+    flip(next(path for path in sorted(classes.rglob("*")) if path.is_file() and path.name != "zarr.json"), at=40)
+
+
+def _lose_mosaic(archive: Path, published: Published) -> None:
+    shutil.rmtree((archive / published.receipt["products"]["mosaic"]).parent)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (_change_receipt, "is damaged: receipt.json has changed .*run verify"),
+        (_flip_classes, "ground_map.*classes"),
+        (_lose_mosaic, "the mosaic of run .* does not; run its survey again"),
+    ],
+)
+def test_what_cannot_be_believed_is_named_and_gives_no_image(
+    posed: Exported, tmp_path: Path, spoil: Callable[[Path, Published], None], words: str
+) -> None:
+    """A receipt that was changed, a flipped bit, a store that is gone: what it is, what to do, and no image of it."""
+    archive = Path(shutil.copytree(posed.archive, tmp_path / "field-a"))
+    spoil(archive, posed.published)
+    with pytest.raises(IncompleteStoreError, match=words):
         run_export(archive, posed.id, tmp_path / "out", envi=False, console=QUIET)
+    assert not list((tmp_path / "out").rglob("*.tif"))
 
 
 @pytest.mark.parametrize("package", ["rasterio", "pystac"])
@@ -314,26 +321,3 @@ def test_without_the_extra_one_message_says_what_to_install(
     with pytest.raises(ArchiveError, match=rf"{package}.*pip install 'spectralzoom\[geo\]'"):
         run_export(posed.archive, None, tmp_path / "out", envi=False, console=QUIET)
     assert not (tmp_path / "out").exists()
-
-
-def test_a_damaged_store_is_named_and_gives_no_image(posed: Exported, tmp_path: Path) -> None:
-    """A flipped bit in the class map of the archive: an error with the store's address, no file of that name."""
-    archive = tmp_path / "field-a"
-    shutil.copytree(posed.archive, archive)
-    store = archive / posed.published.receipt["products"]["ground_map"]
-    shard = next(path for path in sorted((store / "classes").rglob("*")) if path.is_file() and path.name != "zarr.json")
-    content = bytearray(shard.read_bytes())
-    content[40] ^= 4
-    shard.write_bytes(content)
-    with pytest.raises(IncompleteStoreError, match=r"ground_map.*classes"):
-        run_export(archive, None, tmp_path / "out", envi=False, console=QUIET)
-    assert not list((tmp_path / "out").rglob("*.tif"))
-
-
-def test_a_store_that_is_gone_is_named(posed: Exported, tmp_path: Path) -> None:
-    """The message says which product is missing and what to do."""
-    archive = tmp_path / "field-a"
-    shutil.copytree(posed.archive, archive)
-    shutil.rmtree((archive / posed.published.receipt["products"]["mosaic"]).parent)
-    with pytest.raises(IncompleteStoreError, match=r"the mosaic of run .* does not; run its survey again"):
-        run_export(archive, None, tmp_path / "out", envi=False, console=QUIET)

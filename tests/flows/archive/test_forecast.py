@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +19,7 @@ from flows.terminal.progress import put_out
 from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from pipeline.simulator.simulated import SimulatedSource
 from storage.archive.archive import Archive
-from tests.flows.stage_doubles import be_version
+from tests.flows.conftest import be_version, python
 
 WAITS = {"locate": "capture_coarse", "rectify": "locate", "attend": "rectify", "capture_fine": "attend"}
 ON_REQUEST = ["register_coarse", "register_fine", "ground"]
@@ -81,8 +79,10 @@ def test_without_an_archive_the_plan_makes_none(settings: Settings, tmp_path: Pa
     assert {name: planned[name].why for name in WAITS} == {name: f"waits for {on}" for name, on in WAITS.items()}
 
 
-def test_planning_leaves_an_archive_as_it_is(settings: Settings, archive: Path) -> None:
-    """Every file and folder, the spool of a broken capture of the same key too."""
+def test_planning_leaves_an_archive_as_it_is(
+    settings: Settings, archive: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every file and folder, the spool of a broken capture too; not one line of light is asked for."""
     key = _plan(settings, archive)["capture_coarse"].key
     (archive / "spool" / str(key)).mkdir(parents=True)
     (archive / "spool" / str(key) / "lines").write_bytes(b"light")
@@ -91,10 +91,6 @@ def test_planning_leaves_an_archive_as_it_is(settings: Settings, archive: Path) 
     _plan(settings, archive, seed=9)
     assert _tree(archive) == before
 
-
-def test_no_light_is_simulated(settings: Settings, archive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Not one line of the scene is asked for."""
-
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError("the plan asked for light")
 
@@ -102,8 +98,10 @@ def test_no_light_is_simulated(settings: Settings, archive: Path, monkeypatch: p
     assert _plan(settings, archive, seed=9)["capture_coarse"].state == "to run"
 
 
-def test_the_reason_is_what_differs(settings: Settings, archive: Path, make_weights: Any) -> None:
-    """A parameter with both values, where it began for a store further down, and weights as such."""
+def test_the_reason_is_what_differs(
+    settings: Settings, archive: Path, make_weights: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A parameter with both values, where it began, weights as such, and the version of a stage."""
     planned = _plan(settings, archive, kernel="nearest")
     assert planned["rectify"].why == "kernel: catmull-rom before, nearest now"
     assert planned["attend"].why == "kernel of rectify: catmull-rom before, nearest now"
@@ -116,12 +114,6 @@ def test_the_reason_is_what_differs(settings: Settings, archive: Path, make_weig
     other = _plan(settings, archive, weights=str(make_weights(layers=2)))
     assert other["rectify"].state == "cached"
     assert other["attend"].why == "other weights than in the newest store"
-
-
-def test_a_stage_of_another_version_is_made_again(
-    settings: Settings, archive: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The reason names the version; the stage below is still read."""
     be_version(monkeypatch, "rectify", 99)
     planned = _plan(settings, archive)
     assert planned["locate"].state == "cached"
@@ -186,11 +178,10 @@ def test_a_field_beyond_this_machine_is_planned_without_drawing_it(
 
 
 def test_a_plan_loads_neither_torch_nor_figures_nor_maps() -> None:
-    """They take seconds: who needs one imports it in the function that does."""
-    heavy = {"torch", "matplotlib", "xarray", "odc.geo", "rasterio", "scipy", "pandas", "prefect", "distributed"}
+    """They take seconds: whoever needs one has it deferred."""
+    heavy = {"torch", "matplotlib", "xarray", "odc.geo", "rasterio", "scipy.stats", "pandas", "prefect", "distributed"}
     code = "import sys, flows.cli.main, flows.archive.plan_command; print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert not heavy & set(done.stdout.split())
+    assert not heavy & set(python(code).stdout.split())
 
 
 def _size(archive: Path, stage: str) -> int:
@@ -206,18 +197,14 @@ def test_judging_with_controls_is_not_estimated_by_judging_without(settings: Set
     assert row.seconds is None
 
 
-def test_a_damaged_store_blocks_what_needs_it(settings: Settings, archive: Path) -> None:
-    """With the archive's own words, which say what to do."""
+def test_a_damaged_store_blocks_what_needs_it(settings: Settings, archive: Path, tmp_path: Path) -> None:
+    """With the archive's own words; an archive that is a file is refused as a survey refuses it."""
     store = Archive(archive).refs("rectify")[0]
     (store.path / "lines.json").unlink()
     planned = _plan(settings, archive)
     assert planned["rectify"].state == "blocked"
     assert "verify --repair" in planned["rectify"].why
     assert planned["attend"].why == "waits for rectify"
-
-
-def test_what_the_survey_refuses_the_plan_refuses(settings: Settings, tmp_path: Path) -> None:
-    """An archive that is a file."""
     (tmp_path / "file").write_text("no archive")
     with pytest.raises(ArchiveError, match="is a file"):
         _plan(settings, tmp_path / "file")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from PIL import Image
 from rich.console import Console
 
 from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
@@ -20,27 +18,15 @@ from flows.publish import run_folder as publish
 from flows.publish.receipt import check_receipt, comparable, is_pending
 from flows.survey.stages import accuracy as evaluation
 from flows.survey.survey import STAGES
+from models.weights.files import save_weights
 from pipeline.errors import SettingsError
 from storage.archive.archive import Archive
-from storage.remote.opening import verify_archive
-from tests.conftest import WeightsMaker
-from tests.flows.conftest import CommandLine
-from tests.flows.stage_doubles import act_instead, be_version
+from tests.conftest import RGB_NM, random_weights
+from tests.flows.conftest import CommandLine, act_instead, be_version, problems, turned
 from tests.storage.small_archive import flip
 
 QUIET = Console(quiet=True)
 Refuse = Callable[[Path, Path, pytest.MonkeyPatch], None]
-
-
-def tells(pattern: str, lines: list[str]) -> bool:
-    """Whether the one error that was told matches."""
-    (line,) = lines
-    return re.search(pattern, line) is not None
-
-
-def problems(out: Path) -> list[str]:
-    """What verify finds."""
-    return [f"{one.uri} {one.problem}" for one in verify_archive(Archive.open(out)) if one.problem]
 
 
 def receipts(out: Path) -> list[Any]:
@@ -156,16 +142,28 @@ def test_where_accuracy_is_stored_the_run_is_published_once(
     assert comparable(first) == comparable(second)
 
 
-def test_a_survey_of_other_words_leaves_the_run_of_another(
+def test_a_stopped_run_is_judged_by_its_own_words(
     survey: Callable[..., Any], out: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It publishes one of its own; the stopped one is judged by its own words."""
+    """A survey of other words leaves it and publishes one of its own."""
     break_off(survey, monkeypatch, name="north")
     survey(name="south")
     assert {one["survey"]: is_pending(one) for one in receipts(out)} == {"north": True, "south": False}
     survey(name="north")
     assert {one["survey"]: is_pending(one) for one in receipts(out)} == {"north": False, "south": False}
     assert len(receipts(out)) == 2
+
+
+def test_reprocess_adds_what_a_stopped_survey_lacks(
+    survey: Callable[..., Any], out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The field is not as it would become: its run is judged, and no other is made."""
+    break_off(survey, monkeypatch)
+    for _ in range(2):
+        assert run_reprocess(ReprocessRequest(out), QUIET) == 0
+        (receipt,) = receipts(out)
+        assert receipt["accuracy_is"] == "judged"
+    assert problems(out) == []
 
 
 def test_a_run_that_is_being_judged_is_left_alone(
@@ -182,18 +180,6 @@ def test_a_run_that_is_being_judged_is_left_alone(
         assert ended.errors == [f"runs/{run.name} is being judged by another process; it adds the accuracy"]
         survey()
     assert [is_pending(one) for one in receipts(out)] == [True, False]
-
-
-def test_reprocess_adds_what_a_stopped_survey_lacks(
-    survey: Callable[..., Any], out: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The field is not as it would become: its run is judged, and no other is made."""
-    break_off(survey, monkeypatch)
-    for _ in range(2):
-        assert run_reprocess(ReprocessRequest(out), QUIET) == 0
-        (receipt,) = receipts(out)
-        assert receipt["accuracy_is"] == "judged"
-    assert problems(out) == []
 
 
 def test_ls_and_the_receipt_say_that_a_map_is_not_judged_yet(
@@ -247,7 +233,7 @@ def test_labels_may_come_later(
     survey(labels=None)
     monkeypatch.chdir(scene)
     ended = command_line("evaluate", out, "latest")
-    assert tells("there are no labels to judge runs/.* by; give --labels FILE", ended.errors)
+    ended.refused(1, "there are no labels to judge runs/.* by; give --labels FILE")
     assert command_line("evaluate", out, "latest", "--labels", "labels.png").code == 0
     (receipt,) = receipts(out)
     assert receipt["accuracy_is"] == "judged"
@@ -255,17 +241,8 @@ def test_labels_may_come_later(
     assert comparable(receipt)["accuracy"] == survey().receipt["accuracy"]
 
 
-def _other_scene(scene: Path, out: Path, patch: pytest.MonkeyPatch) -> None:
-    with Image.open(scene / "scene.png") as image:
-        image.transpose(Image.Transpose.ROTATE_180).save(scene / "scene.png")
-
-
-def _no_scene(scene: Path, out: Path, patch: pytest.MonkeyPatch) -> None:
-    (scene / "scene.png").unlink()
-
-
-def _damaged_receipt(scene: Path, out: Path, patch: pytest.MonkeyPatch) -> None:
-    flip(Archive.open(out).runs()[0] / "receipt.json")
+def _other_weights(scene: Path, out: Path, patch: pytest.MonkeyPatch) -> None:
+    save_weights(random_weights(RGB_NM, dim=32), scene / "w.safetensors")
 
 
 def _mosaic_gone(scene: Path, out: Path, patch: pytest.MonkeyPatch) -> None:
@@ -273,19 +250,24 @@ def _mosaic_gone(scene: Path, out: Path, patch: pytest.MonkeyPatch) -> None:
     archive.discard(archive.refs("rectify")[0])
 
 
-def _newer_stage(scene: Path, out: Path, patch: pytest.MonkeyPatch) -> None:
-    be_version(patch, "segment", 99)
-
-
-REFUSED: dict[str, tuple[Refuse, int, str]] = {
-    "another scene": (_other_scene, 1, "is another than runs/.* looked at; put that one back"),
-    "no scene": (_no_scene, 1, "there is no file .*scene.png"),
-    "a damaged receipt": (_damaged_receipt, 1, "receipt.json has changed .*; run verify --repair"),
-    "a store that is gone": (_mosaic_gone, 1, "the mosaic of runs/.* is missing or damaged; run verify --repair"),
+REFUSED: dict[str, tuple[Refuse, str]] = {
+    "another scene": (
+        lambda scene, *_: turned(scene / "scene.png", scene / "scene.png"),
+        "is another than runs/.* looked at; put that one back",
+    ),
+    "no scene": (lambda scene, *_: (scene / "scene.png").unlink(), "there is no file .*scene.png"),
+    "a damaged receipt": (
+        lambda scene, out, patch: flip(Archive.open(out).runs()[0] / "receipt.json"),
+        "receipt.json has changed .*; run verify --repair",
+    ),
+    "a store that is gone": (_mosaic_gone, "the mosaic of runs/.* is missing or damaged; run verify --repair"),
     "an older version": (
-        _newer_stage,
-        1,
+        lambda scene, out, patch: be_version(patch, "segment", 99),
         r"version \d+ of the stage segment, which is now 99: reprocess makes a new run",
+    ),
+    "other weights": (
+        _other_weights,
+        "w.safetensors are others than the map of runs/.* was drawn with; put those back",
     ),
 }
 
@@ -295,56 +277,32 @@ def test_what_cannot_be_judged_is_refused(
     case: str, unjudged: Path, scene: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One message, and the run stays as it was."""
-    spoil, code, message = REFUSED[case]
+    spoil, message = REFUSED[case]
     spoil(scene, unjudged, monkeypatch)
     (run,) = Archive.open(unjudged).runs()
     before = (run / "manifest.json").read_bytes()
-    ended = command_line("evaluate", unjudged, run.name)
-    assert (ended.code, len(ended.errors)) == (code, 1), ended.err
-    assert tells(message, ended.errors)
+    command_line("evaluate", unjudged, run.name).refused(1, message)
     assert (run / "manifest.json").read_bytes() == before
     assert Archive.open(unjudged).runs() == [run]
 
 
-def test_other_weights_are_refused(
-    unjudged: Path, scene: Path, make_weights: WeightsMaker, command_line: CommandLine
-) -> None:
-    """They stand where those lay that the map was drawn with."""
-    shutil.copy(make_weights(dim=32), scene / "w.safetensors")
-    ended = command_line("evaluate", unjudged, "latest")
-    assert tells("w.safetensors are others than the map of runs/.* was drawn with; put those back", ended.errors)
-
-
+JUDGED = "--weights is for weights that are judged"
 WORDS = {
-    "a data set without weights": ("evaluate farm", "give --weights FILE to judge weights on this data set, or a run"),
-    "an archive without a run": ("evaluate ARCHIVE", "such as evaluate .*archive latest, to judge its map"),
-    "a run with weights": (
-        "evaluate ARCHIVE latest --weights w.safetensors",
-        "--weights is for weights that are judged",
-    ),
-    "a run with shares": (
-        "evaluate ARCHIVE latest --shares 0.1",
-        "--shares is for weights that are judged on a data set",
-    ),
-    "a run with a folder": ("evaluate ARCHIVE latest -o out", "--out is for weights"),
-    "weights with controls": ("evaluate farm --weights w --controls", "--controls is for a run of an archive"),
+    "a data set without weights": (2, "farm", "give --weights FILE to judge weights on this data set, or a run"),
+    "an archive without a run": (2, "ARCHIVE", "such as evaluate .*archive latest, to judge its map"),
+    "a run with weights": (2, "ARCHIVE latest --weights w.safetensors", JUDGED),
+    "a run with shares": (2, "ARCHIVE latest --shares 0.1", "--shares is for weights that are judged on a data set"),
+    "a run with a folder": (2, "ARCHIVE latest -o out", "--out is for weights"),
+    "weights with controls": (2, "farm --weights w --controls", "--controls is for a run of an archive"),
+    "no such run": (1, "ARCHIVE 2020-gone", "there is no run 2020-gone in this archive; there is runs/"),
 }
 
 
 @pytest.mark.parametrize("case", WORDS)
 def test_words_that_mean_neither_are_refused(case: str, surveyed: Path, command_line: CommandLine) -> None:
-    """Wrong use: one message that says which of the two wants what."""
-    words, message = WORDS[case]
-    ended = command_line(*words.replace("ARCHIVE", str(surveyed)).split())
-    assert (ended.code, len(ended.errors)) == (2, 1), ended.err
-    assert tells(message, ended.errors)
-
-
-def test_a_run_that_is_not_there_is_refused(surveyed: Path, command_line: CommandLine) -> None:
-    """With those that are."""
-    ended = command_line("evaluate", surveyed, "20200101T000000-gone")
-    assert (ended.code, len(ended.errors)) == (1, 1)
-    assert tells("there is no run 20200101T000000-gone in this archive; there is runs/", ended.errors)
+    """One message that says which of the two wants what, or which runs there are."""
+    code, words, message = WORDS[case]
+    command_line("evaluate", *words.replace("ARCHIVE", str(surveyed)).split()).refused(code, message)
 
 
 @pytest.mark.parametrize(

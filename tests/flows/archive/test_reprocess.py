@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 from rich.console import Console
 
 from flows.archive import stale_runs as generations
@@ -27,7 +26,7 @@ from pipeline.simulator.scenes.farm.farm_plan import CLASSES
 from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 from tests.conftest import Survey, WeightsMaker
-from tests.flows.stage_doubles import be_version
+from tests.flows.conftest import be_version, turned
 from tests.storage.small_archive import flip
 
 QUIET = Console(quiet=True)
@@ -37,9 +36,7 @@ QUIET = Console(quiet=True)
 def surveyed(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey, scene_files: Path) -> Path:
     """Two fields, scene (two budgets) and turned, on an archive that is not to be changed."""
     folder = tmp_path_factory.mktemp("reprocessed")
-    scenes = [folder / "turned.png", scene_files / "scene.png"]
-    with Image.open(scenes[1]) as image:
-        image.transpose(Image.Transpose.ROTATE_180).save(scenes[0])
+    scenes = [turned(scene_files / "scene.png", folder / "turned.png"), scene_files / "scene.png"]
     for scene, budget in ((scenes[0], "0.8"), (scenes[1], "0.8"), (scenes[1], "0.7")):
         survey_png(folder / "archive", scene=str(scene), labels=None, budget=budget)
     return folder / "archive"
@@ -84,13 +81,25 @@ def _captures(archive: Path) -> list[str]:
     return [ref.uri for ref in Archive.open(archive).refs("capture")]
 
 
-def test_nothing_has_changed_and_nothing_runs(surveyed: Path, reprocess: Reprocess) -> None:
-    """The newest run of a field counts, whatever its budget."""
+def test_nothing_has_changed_in_fields_however_they_are_chosen(surveyed: Path, reprocess: Reprocess) -> None:
+    """By name, pattern, scene file or date; a name that is none is refused; the newest run of a field counts."""
     newest = Archive.open(surveyed).runs()[-1].name
     rows = reprocess(surveyed)
     assert [(row["field"], row["state"]) for row in rows] == [("turned", "skipped"), ("scene", "skipped")]
     assert rows[1]["old"] == newest
     assert len(Archive.open(surveyed).runs()) == 3
+    for field in ("turned", "tur*", "turned.png"):
+        assert reprocess.states(surveyed, field=field) == [("turned", "skipped")]
+    assert len(reprocess(surveyed, since="2020-01-01")) == 2
+    assert reprocess(surveyed, since="2999-01-01") == []
+    for wishes, words in (
+        ({"field": "none"}, r"--field none.*turned, scene"),
+        ({"since": "spring"}, "--since expects a date"),
+        ({"stage": "wish"}, "--stage wish.*segment"),
+        ({"weights": Path("nowhere.safetensors")}, "there is no such file"),
+    ):
+        with pytest.raises(SettingsError, match=words):
+            run_reprocess(ReprocessRequest(surveyed, **wishes), QUIET)
 
 
 def test_new_weights_make_a_generation_beside_the_old(archive: Path, other: Path, reprocess: Reprocess) -> None:
@@ -131,7 +140,7 @@ def test_an_interrupted_run_goes_on(archive: Path, other: Path, reprocess: Repro
 
 
 def test_a_newer_stage_is_run_for_those_that_rest_on_an_older(
-    archive: Path, reprocess: Reprocess, monkeypatch: pytest.MonkeyPatch
+    archive: Path, reprocess: Reprocess, monkeypatch: pytest.MonkeyPatch, surveyed: Path
 ) -> None:
     """A raised version makes it and what follows anew, and `--stage` finds the fields; light is not captured again."""
     assert reprocess(archive, stage="segment") == []
@@ -146,6 +155,9 @@ def test_a_newer_stage_is_run_for_those_that_rest_on_an_older(
     assert _captures(archive) == light
     assert reprocess.states(archive) == [("scene", "ran"), ("turned", "skipped")]
     assert _captures(archive) == light
+    be_version(monkeypatch, "rectify", 99)
+    assert len(reprocess(surveyed, stage="segment", dry_run=True)) == 2
+    assert reprocess(surveyed, stage="capture_coarse", dry_run=True) == []
 
 
 def test_one_field_fails_and_the_others_are_done(archive: Path, other: Path, reprocess: Reprocess) -> None:
@@ -182,22 +194,6 @@ def test_a_run_without_settings_is_told(archive: Path, reprocess: Reprocess) -> 
     rows = reprocess(archive, PARTLY)
     assert sorted(row["state"] for row in rows) == ["failed", "skipped"]
     assert any("cannot be read" in str(row["message"]) for row in rows)
-
-
-def test_fields_are_chosen(surveyed: Path, reprocess: Reprocess) -> None:
-    """By name, pattern or scene file, and by date; a name that is none is refused."""
-    for field in ("turned", "tur*", "turned.png"):
-        assert reprocess.states(surveyed, field=field) == [("turned", "skipped")]
-    assert len(reprocess(surveyed, since="2020-01-01")) == 2
-    assert reprocess(surveyed, since="2999-01-01") == []
-    for wishes, words in (
-        ({"field": "none"}, r"--field none.*turned, scene"),
-        ({"since": "spring"}, "--since expects a date"),
-        ({"stage": "wish"}, "--stage wish.*segment"),
-        ({"weights": Path("nowhere.safetensors")}, "there is no such file"),
-    ):
-        with pytest.raises(SettingsError, match=words):
-            run_reprocess(ReprocessRequest(surveyed, **wishes), QUIET)
 
 
 def test_a_date_counts_from_its_first_moment_in_utc(
@@ -269,15 +265,6 @@ def test_a_place_that_cannot_hold_the_summary_is_refused_first(
         run_reprocess(request, QUIET, survey=lambda settings, console: pytest.fail("surveyed"))
 
 
-def test_a_stage_is_made_anew_with_what_it_rests_on(
-    surveyed: Path, reprocess: Reprocess, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of a newer mosaic come a newer map and the same raw light."""
-    be_version(monkeypatch, "rectify", 99)
-    assert len(reprocess(surveyed, stage="segment", dry_run=True)) == 2
-    assert reprocess(surveyed, stage="capture_coarse", dry_run=True) == []
-
-
 def test_a_run_is_current_only_where_all_of_it_is_there(archive: Path) -> None:
     """With its own folder and without a stage that failed; what it asked for stands in its manifest too."""
     run = Catalogue.read(archive).runs[-1]
@@ -291,8 +278,14 @@ def test_a_run_is_current_only_where_all_of_it_is_there(archive: Path) -> None:
     assert not generations.is_current(Catalogue.read(archive), damaged, settings)
 
 
-def test_runs_that_do_not_tell_what_they_asked_for_are_fields_of_their_own(tmp_path: Path) -> None:
-    """Nobody knows whether one took the place of the other."""
+def test_fields_are_told_apart_by_what_they_asked_for_and_are_called(surveyed: Path, tmp_path: Path) -> None:
+    """Runs that do not tell are fields of their own; only the star stands for other letters."""
+    (one, _) = generations.newest_runs(Catalogue.read(surveyed))
+    odd = dataclasses.replace(one, field="field[1]?.png")
+    for pattern in ("field[1]?.png", "*[1]*", "*"):
+        assert generations.is_called(odd, pattern)
+    for pattern in ("field1?.png", "fiel?[1]?.png", "Field*"):
+        assert not generations.is_called(odd, pattern)
     archive = Archive.open(tmp_path)
     for asked in ({}, {}, {"seed": 1}, {"seed": 2}, {"seed": 1, "budget": 0.4}):
         archive.new_run("farm").publish(survey="farm", settings=asked)
@@ -300,23 +293,12 @@ def test_runs_that_do_not_tell_what_they_asked_for_are_fields_of_their_own(tmp_p
     assert [one.run for one in generations.newest_runs(Catalogue.read(tmp_path))] == [runs[n] for n in (0, 1, 3, 4)]
 
 
-def test_only_the_star_stands_for_other_letters(surveyed: Path) -> None:
-    """Brackets and question marks are themselves, as in the names of files."""
-    (one, _) = generations.newest_runs(Catalogue.read(surveyed))
-    odd = dataclasses.replace(one, field="field[1]?.png")
-    for pattern in ("field[1]?.png", "*[1]*", "*"):
-        assert generations.is_called(odd, pattern)
-    for pattern in ("field1?.png", "fiel?[1]?.png", "Field*"):
-        assert not generations.is_called(odd, pattern)
-
-
 def test_fields_of_one_file_name_are_told_apart(
     tmp_path: Path, survey_png: Survey, scene_files: Path, monkeypatch: pytest.MonkeyPatch, reprocess: Reprocess
 ) -> None:
     """Two folders with a scene.png each: relative paths alone would take them for one field."""
     (tmp_path / "b").mkdir()
-    with Image.open(scene_files / "scene.png") as image:
-        image.transpose(Image.Transpose.ROTATE_180).save(tmp_path / "b" / "scene.png")
+    turned(scene_files / "scene.png", tmp_path / "b" / "scene.png")
     for folder in (scene_files, tmp_path / "b"):
         monkeypatch.chdir(folder)
         survey_png(tmp_path / "archive", scene="scene.png", labels=None)

@@ -5,10 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
-import sys
 from functools import reduce
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -18,6 +15,7 @@ from flows.cli.app import GOES_ON, VERBS, build_app
 from flows.cli.survey_verbs import IN_TABLES
 from flows.settings.load import SURVEY, TABLES
 from flows.terminal.progress import print_json
+from tests.flows.conftest import python
 
 ONE_THREAD = """
 import os, sys
@@ -30,12 +28,12 @@ except SystemExit:
 """
 
 
-def test_numpy_computes_on_one_thread_whatever_the_shell_says() -> None:
-    """Sums split among threads round otherwise: one seed would give other light on a machine with more cores."""
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3]), "OPENBLAS_NUM_THREADS": "2"}
-    command = [sys.executable, "-c", ONE_THREAD]
-    ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+def test_a_process_begins_with_one_thread_and_ends_as_it_would_have() -> None:
+    """Sums split among threads round otherwise; SIGTERM has no effect once the exit code stands."""
+    ended = python(ONE_THREAD, OPENBLAS_NUM_THREADS="2")
     assert (ended.returncode, ended.stdout.split()[-1]) == (0, "1"), ended.stderr
+    ended = python(ENDING)
+    assert (ended.returncode, ended.stderr) == (0, "")
 
 
 def _flags(verb: str) -> dict[str, str | None]:
@@ -50,7 +48,7 @@ def test_help_lists_every_verb_and_loads_none(capsys: pytest.CaptureFixture[str]
     script = (
         "import sys\nfrom flows.cli.main import main\ntry:\n    main(sys.argv[1:])\nfinally:\n    print(*sys.modules)"
     )
-    ended = subprocess.run([sys.executable, "-c", script, "--help"], capture_output=True, text=True, check=True)
+    ended = python(script, "--help")
     shown, loaded = ended.stdout.rsplit("\n", 2)[0], ended.stdout.split()
     assert not {"numpy", "torch", "prefect", "matplotlib", *VERBS.values()} & set(loaded)
     assert all(verb.split()[0] in shown for verb in VERBS)
@@ -125,10 +123,3 @@ atexit.register(lambda: os.kill(os.getpid(), signal.SIGTERM))
 sys.argv[1:] = ["--version"]
 main()
 """
-
-
-def test_sigterm_has_no_effect_once_the_exit_code_stands() -> None:
-    """A command that has done its work and is ending, children and all, ends as it would have."""
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
-    ended = subprocess.run([sys.executable, "-c", ENDING], env=environment, capture_output=True, check=False)
-    assert (ended.returncode, ended.stderr) == (0, b"")

@@ -47,7 +47,7 @@ def _row(content: dict[str, Any], policy: str, share: float) -> dict[str, Any]:
 
 
 def test_every_row_is_there(drawn: tuple[Path, dict[str, Any]]):
-    """None, every policy at every share, pooled ones, the oracle, all: with figures, and the files of the folder."""
+    """Every policy at every share, with means of the seeds and their spread; and the files of the folder."""
     folder, content = drawn
     keys = [(row["policy"], row["share"]) for row in content["rows"]]
     names = ("entropy", "random", "entropy, pooled", ORACLE)
@@ -59,10 +59,6 @@ def test_every_row_is_there(drawn: tuple[Path, dict[str, Any]]):
     assert files >= {"evaluation.json", "evaluation.png", "worst.png", "frames"}
     kept = json.loads((folder / "out" / "evaluation.json").read_text())
     assert kept["rows"][1]["miou"] == content["rows"][1]["miou"]
-
-
-def test_seeds_give_mean_and_spread(drawn: tuple[Path, dict[str, Any]]):
-    """The figure is the mean of the weights', the spread that between them."""
     _, content = drawn
     row = _row(content, "entropy", 0.25)
     assert row["miou"] == pytest.approx(np.mean(row["by_seed"]))
@@ -70,8 +66,8 @@ def test_seeds_give_mean_and_spread(drawn: tuple[Path, dict[str, Any]]):
     assert len(row["by_seed"]) == 2
 
 
-def test_costs_stand_beside_all(drawn: tuple[Path, dict[str, Any]]):
-    """All five columns are there; none costs more than all but in capture, and more seats cost more."""
+def test_costs_stand_beside_all_and_the_oracle_has_all_the_gain(drawn: tuple[Path, dict[str, Any]]):
+    """More seats cost more, `all` costs all; what uses labels is marked, with a ratio and a rank of 1."""
     _, content = drawn
     cost = {share: _row(content, "entropy", share)["cost"] for share in (0.25, 0.5)}
     for column in ("samples", "bytes", "multiply_adds", "cpu_s", "frame_s", "rig_s"):
@@ -86,10 +82,6 @@ def test_costs_stand_beside_all(drawn: tuple[Path, dict[str, Any]]):
     assert _row(content, "all", 1.0)["cost"]["rig_s"]["ratio"] == 1
     adds = cost[0.25]["multiply_adds"]
     assert sum(adds[part] for part in ("glance", "score", "encode", "decode")) == adds["done"]
-
-
-def test_the_oracle_has_all_the_gain(drawn: tuple[Path, dict[str, Any]]):
-    """Its ratio (where any gain is to be had) and its rank are 1, and it is marked as using labels."""
     _, content = drawn
     row = _row(content, ORACLE, 0.5)
     assert row["uses_labels"]
@@ -241,11 +233,17 @@ def test_frames_without_a_label_are_refused(data: Path, tmp_path: Path):
         evaluate_weights(EvaluateRequest(str(data), weights, frames=("001",), **QUICK))
 
 
-def test_a_damaged_camera_is_named(tmp_path: Path):
-    """A record that is none of a camera is a matter of the file."""
+def test_weights_that_cannot_be_judged_together_are_refused(tmp_path: Path):
+    """A record that is none of a camera, the same file twice, and other classes."""
     (one,) = open_candidates((write_weights(tmp_path / "w.safetensors", camera={"lens": 1}),))
     with pytest.raises(WeightsError, match="its camera is damaged"):
         _ = one.camera
+    first, again = write_weights(tmp_path / "a.safetensors"), write_weights(tmp_path / "b.safetensors")
+    with pytest.raises(SettingsError, match="the same weights are given twice"):
+        open_candidates((first, again))
+    save_weights(make_weights(1, classes=3, columns=3), again)
+    with pytest.raises(SettingsError, match=r"differs from .* in sizes or classes"):
+        open_candidates((first, again))
 
 
 def test_one_frame_has_accuracies_over_its_pixels(
@@ -289,8 +287,8 @@ def test_a_look_does_not_depend_on_its_company(data: Path, tmp_path: Path):
     assert alone["rows"][1]["against_all"]["low"] is None
 
 
-def test_the_order_of_frames_does_not_matter():
-    """Records in another order add up to the same figures."""
+def test_records_count_by_their_pixels():
+    """In any order, and not by the figure that an earlier version kept of them."""
     rng = np.random.default_rng(0)
     records = [_record(f"{number:03d}", rng) for number in range(4)]
     trial = {"shares": (0.5,), "policies": (), "seed": 0, "draws": 10}
@@ -299,6 +297,12 @@ def test_the_order_of_frames_does_not_matter():
     whole = collect_row([records], "none", 0.0)
     assert whole is not None
     assert there["rows"][0]["miou"] == mean_iou(whole.counts.sum(axis=(0, 1)))
+    good, bad = (_record(name, np.random.default_rng(0)) for name in ("001", "002"))
+    for row in good["rows"]:
+        row |= {"counts": [[9, 0], [0, 9]], "miou": 0.1}
+    for row in bad["rows"]:
+        row |= {"counts": [[5, 4], [4, 5]], "miou": 0.9}
+    assert ends([[good, bad]], "none", 0.0) == [("worst", "002", 0), ("best", "001", 0)]
 
 
 def test_a_class_that_no_label_has_is_told_apart(
@@ -328,16 +332,6 @@ def test_a_class_that_no_label_has_is_told_apart(
     assert "the 2 classes of the labels" in text
 
 
-def test_the_ends_are_those_of_the_present_definition():
-    """Frames that were judged by an earlier version count by their pixels, not by the figure that was kept of them."""
-    good, bad = (_record(name, np.random.default_rng(0)) for name in ("001", "002"))
-    for row in good["rows"]:
-        row |= {"counts": [[9, 0], [0, 9]], "miou": 0.1}
-    for row in bad["rows"]:
-        row |= {"counts": [[5, 4], [4, 5]], "miou": 0.9}
-    assert ends([[good, bad]], "none", 0.0) == [("worst", "002", 0), ("best", "001", 0)]
-
-
 def _record(name: str, rng: np.random.Generator) -> dict[str, Any]:
     rows = [
         {
@@ -361,8 +355,8 @@ def _record(name: str, rng: np.random.Generator) -> dict[str, Any]:
     return {"frame": name, "seats": 4, "rows": rows, "ranking": [], "positive_seats": 1}
 
 
-def test_seconds_of_a_row():
-    """Glance, scores and map together; `all`, `none` and a control are the map alone."""
+def test_seconds_are_taken_in_turn_and_add_up():
+    """Whatever slows the machine meets all parts alike; glance, scores and map make a row."""
     timed = {
         "glance": 1.0,
         "score": {"entropy": 0.5},
@@ -374,10 +368,6 @@ def test_seconds_of_a_row():
     assert row_seconds(timed, "entropy", 0.1) == 4.5
     assert row_seconds(timed, ORACLE, 0.1) == 4
     assert (row_seconds(timed, "none", 0.0), row_seconds(timed, "all", 1.0)) == (2, 9)
-
-
-def test_everything_timed_goes_in_turn():
-    """Whatever slows the machine for a while meets all parts alike; rounds of warming up are not counted."""
     went: list[str] = []
     works = {("segment", name): lambda name=name: went.append(name) for name in ("a", "b")}  # type: ignore[misc]
     taken = cpu_seconds(works, 2, warm_up=1)
@@ -407,33 +397,20 @@ def test_the_farm_is_judged_on_seeds_of_its_own(tmp_path: Path, monkeypatch: pyt
         ({"timed_runs": 0}, "--timed-runs must be at least 1"),
         ({"seed": -1}, "--seed must be at least 0"),
         ({"scenes": 2}, "--scenes is for the built-in farm"),
+        ({"frames": ("099",)}, "has no frame 099; it has 001, 002, 003"),
     ],
 )
 def test_what_cannot_be_is_refused(data: Path, tmp_path: Path, change: dict[str, Any], words: str):
-    """The message names the flag."""
+    """The message names the flag, or the frames that there are."""
     request = EvaluateRequest(str(data), (write_weights(tmp_path / "w.safetensors"),), **QUICK)
-    with pytest.raises(SettingsError, match=words):
+    with pytest.raises(SceneError if "frames" in change else SettingsError, match=words):
         evaluate_weights(replace(request, **change))
 
 
-def test_several_weights_are_seeds_of_one_training(tmp_path: Path):
-    """Other classes, or the same file twice, are refused."""
-    first, again = write_weights(tmp_path / "a.safetensors"), write_weights(tmp_path / "b.safetensors")
-    with pytest.raises(SettingsError, match="the same weights are given twice"):
-        open_candidates((first, again))
-    save_weights(make_weights(1, classes=3, columns=3), again)
-    with pytest.raises(SettingsError, match=r"differs from .* in sizes or classes"):
-        open_candidates((first, again))
-
-
-def test_an_unknown_frame_is_refused(data: Path, tmp_path: Path):
-    """The message names those that there are."""
-    with pytest.raises(SceneError, match="has no frame 099; it has 001, 002, 003"):
-        evaluate_weights(EvaluateRequest(str(data), (write_weights(tmp_path / "w.safetensors"),), frames=("099",)))
-
-
-def test_the_table_prints(drawn: tuple[Path, dict[str, Any]], data: Path, capsys: pytest.CaptureFixture[str]):
-    """Rows, classes and what the figures mean on stdout; from what was kept, without judging again."""
+def test_figures_are_printed(
+    drawn: tuple[Path, dict[str, Any]], data: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+):
+    """Rows, classes and what the figures mean, from what was kept; with --json one object on stdout."""
     folder, _ = drawn
     weights = tuple(folder / f"w{seed}.safetensors" for seed in (0, 1))
     run_evaluate(EvaluateRequest(str(data), weights, folder / "out", **QUICK), Console(stderr=True))
@@ -441,10 +418,6 @@ def test_the_table_prints(drawn: tuple[Path, dict[str, Any]], data: Path, capsys
     for words in ("oracle*", "multiply-adds", "rig s", "crop", "uses labels", "paired bootstrap", "baseline: all"):
         assert words in shown.out
     assert "evaluation.json" in shown.err
-
-
-def test_the_verb_prints_one_object(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """`evaluate --json` gives the figures on stdout and leaves with 0; frames trained on leave with 1."""
     weights = write_weights(tmp_path / "w.safetensors")
     words = ["evaluate", str(data), "--weights", str(weights), "--shares", "0.5", "--policies", "entropy", "--json"]
     with pytest.raises(SystemExit) as left:

@@ -1,4 +1,4 @@
-"""One threshold for the scores of all frames: who buys what, whose maps are judged, and what is kept of it."""
+"""Rows of many frames: one threshold for the scores of all, seeds of a training, and one number for a curve."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ from flows.evaluate.rows import (
     pooled_policies,
     score_frame,
 )
+from flows.evaluate.series import Row, by_seed, collect_row, curve_figures, difference, seeds_of
 from models.policies.policies import score_seats
 from pipeline.planning.selection import seat_count
 from tests.flows.small_fields import FRAMES, QUICK, looked_at, scene_at, write_weights
@@ -61,17 +62,13 @@ def test_all_frames_together_buy_the_share(each: list[list[float]], share: float
         assert min(taken) == (-np.inf if bought[0]["threshold"] is None else bought[0]["threshold"])
 
 
-def test_bare_frames_buy_less_and_ties_go_to_the_first():
-    """Two of four seats are the rich frame's; of three equal scores the earlier frame's are bought."""
+def test_frames_of_one_seed_buy_together():
+    """Bare frames less, ties the first; weights with no frame in common share a threshold; scores are of one unit."""
     rich = [own[0]["seats"] for own in buy_together(_records([[0.1, 0.2], [0.9, 0.8]]), (0.5,))]
     assert rich == [0, 2]
     even = buy_together(_records([[0.3], [0.3], [0.3]]), (2 / 3,))
     assert [own[0]["seats"] for own in even] == [1, 1, 0]
     assert [own[0]["threshold"] for own in even] == [0.3] * 3
-
-
-def test_frames_of_one_seed_buy_together():
-    """Weights with no frame in common share a threshold; another seed has its own."""
     runs = [
         [{"frame": "a", "scores": {"gain": [0.1, 0.2]}}],
         [{"frame": "b", "scores": {"gain": [0.8, 0.9]}}],
@@ -84,10 +81,6 @@ def test_frames_of_one_seed_buy_together():
         (2, "a"): (1, 5.0),
     }
     assert buy_by_seed([[]], (0.5,)) == {}
-
-
-def test_only_scores_of_one_unit_are_pooled():
-    """Those in nats; edges and places mean something else on every frame."""
     assert pooled_policies(("sobel", "entropy", "random", "gain", "centre")) == ("entropy", "gain")
 
 
@@ -107,11 +100,11 @@ def _rows(content: dict[str, Any], policy: str) -> list[dict[str, Any]]:
     return [row for row in content["rows"] if row["policy"] == policy]
 
 
-def test_rows_say_what_frames_bought(judged: tuple[EvaluateRequest, dict[str, Any]]):
-    """As many seats as the share of all in the mean; least, most, a threshold of each seed, and paired intervals."""
+def test_rows_say_what_frames_bought_and_cost(judged: tuple[EvaluateRequest, dict[str, Any]]):
+    """Seats are the share of all in the mean, costs those of the policy at its own seats; lines are not told."""
     content = judged[1]
     for row, own in zip(_rows(content, POLICY), _rows(content, "entropy"), strict=True):
-        seats = row["seats_per_frame"]
+        seats, cost = row["seats_per_frame"], row["cost"]
         assert seats["mean"] == seat_count(row["share"], 45) / 3  # 15 seats of 8 px a frame
         assert seats["least"] <= seats["mean"] <= seats["most"]
         assert own["seats_per_frame"]["least"] == own["seats_per_frame"]["most"]
@@ -122,17 +115,9 @@ def test_rows_say_what_frames_bought(judged: tuple[EvaluateRequest, dict[str, An
         assert own["thresholds"] is own["against_share_per_frame"] is None
         assert row["captured_gain"] is row["ap_gain"] is None
         assert {one["frames"] for one in (row, own)} == {3}
-
-
-def test_costs_are_those_of_the_policy(judged: tuple[EvaluateRequest, dict[str, Any]]):
-    """Samples and multiply-adds of its own seats, seconds of the share; lines of the rig are not told."""
-    content = judged[1]
-    for row, own in zip(_rows(content, POLICY), _rows(content, "entropy"), strict=True):
-        cost, beside = row["cost"], own["cost"]
-        assert cost["cpu_s"] == beside["cpu_s"]
-        assert cost["frame_s"] == beside["frame_s"]
+        assert (cost["cpu_s"], cost["frame_s"]) == (own["cost"]["cpu_s"], own["cost"]["frame_s"])
         assert cost["rig_s"]["done"] is None
-        assert cost["samples"]["done"] == pytest.approx(12 * 20 + 64 * row["seats_per_frame"]["mean"])
+        assert cost["samples"]["done"] == pytest.approx(12 * 20 + 64 * seats["mean"])
 
 
 def test_pooled_rows_are_printed_and_drawn(
@@ -207,3 +192,67 @@ def test_what_needs_no_second_pass_has_none(data: Path, tmp_path: Path, choice: 
     weights = (write_weights(tmp_path / "w.safetensors"),)
     content = evaluate_weights(EvaluateRequest(str(data), weights, **{**FAST, **choice}))
     assert not any("pooled" in row["policy"] for row in content["rows"])
+
+
+TRIAL = {"draws": 30, "seed": 0}
+
+
+def _record(name: str, right: int, policy: str = "none") -> dict[str, Any]:
+    row = {"policy": policy, "share": 0.0, "draw": 0, "counts": [[right, 10 - right], [0, 10]]}
+    return {"frame": name, "rows": [row]}
+
+
+def test_frames_left_out_in_turn_are_one_seed():
+    """Weights without a frame in common belong together; a row that nobody has is none."""
+    folds = [[_record("a", 5)], [_record("b", 6)], [_record("a", 7)], [], [_record("b", 8)]]
+    assert seeds_of(folds) == [[0, 1], [2, 4]]
+    assert [[record["frame"] for record in records] for records in by_seed(folds)] == [["a", "b"], ["a", "b"]]
+    folds = [[_record("a", 5)]]
+    assert collect_row(folds, "entropy", 0.0) is None
+    assert not np.any(_row(folds, ["a"]).inside)
+
+
+def _row(folds: list[list[dict[str, Any]]], names: list[str], policy: str = "none") -> Row:
+    row = collect_row(by_seed(folds), policy, 0.0, names)
+    assert row is not None
+    return row
+
+
+def test_rows_are_of_runs_and_differ_over_shared_frames():
+    """Folds are one run, draws of a seed each their own; a control that lacks a frame is compared on the others."""
+    row = _row([[_record("a", 5)], [_record("b", 10)]], ["a", "b"])
+    assert row.counts.shape == (1, 2, 2, 2)
+    assert row.counts.sum(axis=(0, 1)).tolist() == [[15, 5], [0, 20]]
+    assert row.of_seed.tolist() == [0]
+    ours = _row([[_record("a", 10), _record("b", 0)]], ["a", "b"])
+    control = _row([[_record("a", 10)]], ["a", "b"])
+    found = difference(ours, control, TRIAL)
+    assert (found["difference"], found["frames"]) == (pytest.approx(0), 1)
+    nowhere = difference(_row([[_record("b", 1)]], ["a", "b"]), control, TRIAL)
+    assert (nowhere["difference"], nowhere["frames"]) == (None, 0)
+    seeds = [[_record("a", right), _record("a", right + 1)] for right in (2, 6)]
+    for one, other in seeds:
+        other["rows"][0]["draw"] = 1
+        one["rows"] += other["rows"]
+    row = collect_row([[one] for one, _ in seeds], "none", 0.0)
+    assert row is not None
+    assert row.counts[:, 0, 0, 0].tolist() == [2, 3, 6, 7]
+    assert row.of_seed.tolist() == [0, 0, 1, 1]
+
+
+def test_a_curve_by_hand():
+    """Half for the straight way from none to all; more for more; dearer points add nothing; no area without a gap."""
+    found = curve_figures((1.0, 0.5), [], (100.0, 0.7))
+    assert found.auc_gap == pytest.approx(0.5)
+    assert found.hypervolume == pytest.approx(0)
+    assert found.cost_to_enough == pytest.approx(1)
+    found = curve_figures((1.0, 0.5), [(10.0, 0.7)], (100.0, 0.7))
+    assert found.auc_gap == pytest.approx(0.75)
+    assert found.hypervolume == pytest.approx(0.2 * 0.9)
+    assert found.cost_to_enough == pytest.approx(0.1)
+    good = [(10.0, 0.8)]
+    assert curve_figures((1.0, 0.5), [*good, (50.0, 0.6)], (100.0, 0.7)).hypervolume == pytest.approx(
+        curve_figures((1.0, 0.5), [*good, (200.0, 0.9)], (100.0, 0.7)).hypervolume or 0
+    )
+    assert curve_figures((1.0, 0.5), [(2.0, 0.6)], (9.0, 0.505)).auc_gap is None
+    assert curve_figures((9.0, 0.5), [], (9.0, 0.7)).hypervolume is None

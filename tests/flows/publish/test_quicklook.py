@@ -50,24 +50,6 @@ def test_picture_has_a_readable_size(tmp_path: Path, height, width):
         assert 600 <= image.height <= 2000
 
 
-def test_parts_that_are_absent_are_left_out(tmp_path: Path):
-    """No truth, no confidence, no seat, no block, nothing scored and nothing seen still make a picture."""
-    data = make_data(64, 64)
-    empty = replace(
-        data,
-        truth=None,
-        confidence=None,
-        seats=np.array([], np.intp),
-        blocks=(),
-        score=np.full_like(data.score, np.nan),
-        rectified=np.full_like(data.rectified, np.nan),
-        class_map=np.full_like(data.class_map, 255),
-    )
-    draw_quicklook(tmp_path / "empty.png", empty)
-    draw_quicklook(tmp_path / "confidence.png", replace(data, truth=None))
-    assert (tmp_path / "empty.png").stat().st_size > 10_000
-
-
 @pytest.mark.parametrize("along", ["x", "y"])
 def test_raw_lines_lie_as_they_looked_at_the_field(along):
     """What is bright at the scene's top stands at the top of the raw lines, in either orientation; strips abut."""
@@ -90,18 +72,35 @@ def test_scores_without_a_range_are_drawn(score):
     FigureCanvasAgg(figure).draw()
 
 
-def test_same_data_gives_the_same_picture(tmp_path: Path):
-    """Nothing in the picture depends on when it was drawn."""
+def test_pictures_of_less_and_of_the_same(tmp_path: Path):
+    """No truth, seat, block or score still make a picture; the same data give the same bytes."""
     for name in ("one", "two"):
         draw_quicklook(tmp_path / name, make_data(32, 48))
     assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
+    data = make_data(64, 64)
+    empty = replace(
+        data,
+        truth=None,
+        confidence=None,
+        seats=np.array([], np.intp),
+        blocks=(),
+        score=np.full_like(data.score, np.nan),
+        rectified=np.full_like(data.rectified, np.nan),
+        class_map=np.full_like(data.class_map, 255),
+    )
+    draw_quicklook(tmp_path / "empty.png", empty)
+    draw_quicklook(tmp_path / "confidence.png", replace(data, truth=None))
+    assert (tmp_path / "empty.png").stat().st_size > 10_000
 
 
-def test_bands_nearest_to_true_colour():
-    """Sorted or not, the bands nearest 640, 550 and 460 nm are red, green and blue."""
+def test_colours_of_bands_and_of_pixels_without_a_class():
+    """The bands nearest 640, 550 and 460 nm, sorted or not; 255 and numbers without a name are grey."""
     assert choose_bands(WAVES)[0] == (24, 15, 6)
     order = np.random.default_rng(0).permutation(61)
     assert choose_bands(WAVES[order])[0] == tuple(np.argsort(order)[[24, 15, 6]])
+    picture = class_rgb(np.array([[0, 9, 255]], np.uint8), class_palette(2))
+    np.testing.assert_array_equal(picture[0, 1], picture[0, 2])
+    assert (picture[0, 0] != picture[0, 1]).any()
 
 
 @pytest.mark.parametrize(
@@ -152,13 +151,6 @@ def test_palette_colours_are_all_different(count):
     assert palette.max() <= 1
     given = np.array([[0, 255, 0]], np.uint8)
     np.testing.assert_array_equal(class_palette(1, given), [[0, 1, 0]])
-
-
-def test_unlabelled_pixels_are_grey():
-    """255 and numbers without a name get the same light grey."""
-    picture = class_rgb(np.array([[0, 9, 255]], np.uint8), class_palette(2))
-    np.testing.assert_array_equal(picture[0, 1], picture[0, 2])
-    assert (picture[0, 0] != picture[0, 1]).any()
 
 
 @pytest.mark.parametrize(("width", "length"), [(1, 1), (7, 1), (39, 5), (640, 100), (1280, 200), (2400, 500)])

@@ -1,7 +1,8 @@
-"""The receipt: complete, in order, fit for JSON, and the same for the same seed."""
+"""The receipt: complete, in order, fit for JSON, the same for the same seed; shown as a table and as a page."""
 
 from __future__ import annotations
 
+import base64
 import copy
 import io
 import json
@@ -12,10 +13,12 @@ from rich.console import Console
 
 from flows.publish.receipt import COSTS, Header, Receipt, build_receipt, check_receipt, comparable
 from flows.publish.receipt_table import area_words, headline, print_table
+from flows.publish.report import Picture, render_report
 from flows.settings.survey_settings import Settings
 from pipeline.errors import ShapeError
 from storage.archive.records import StageRecord
 from storage.archive.whole_files import to_json
+from tests.flows.conftest import Page
 
 
 def make_receipt(*, wall: float = 1.5, labels: bool = True) -> Receipt:
@@ -93,8 +96,8 @@ def make_receipt(*, wall: float = 1.5, labels: bool = True) -> Receipt:
     )
 
 
-def test_receipt_has_the_fields_of_the_design_in_order():
-    """The top level and the savings stand in the design's order, whatever order they came in."""
+def test_receipt_has_the_fields_of_the_design_and_reads_back():
+    """In the design's order, accuracy or none; what is not finite is null; the text gives the same receipt."""
     receipt = make_receipt()
     assert list(receipt) == [
         "survey",
@@ -113,19 +116,12 @@ def test_receipt_has_the_fields_of_the_design_in_order():
         "products",
     ]
     assert list(receipt["savings"]) == [*COSTS, "segment_wall_s"]
-
-
-def test_numbers_that_are_not_finite_become_null():
-    """JSON has no NaN: it is null, and numpy scalars are plain numbers."""
+    assert "accuracy" not in make_receipt(labels=False)
+    receipt = make_receipt()
+    assert check_receipt(json.loads(to_json(receipt))) == receipt
     text = to_json({"nan": float("nan"), "list": [np.float64("inf"), np.int64(3)], "tuple": (1.5, None, True)})
     assert json.loads(text) == {"nan": None, "list": [None, 3], "tuple": [1.5, None, True]}
     assert make_receipt()["accuracy"]["per_class_iou"] == {"soil": 0.9, "bare_weed": 0.6, "wheat": None}
-
-
-def test_json_reads_back_to_the_same_receipt():
-    """What is written is what was built, and it still passes the check."""
-    receipt = make_receipt()
-    assert check_receipt(json.loads(to_json(receipt))) == receipt
 
 
 @pytest.mark.parametrize(
@@ -167,11 +163,6 @@ def test_words_outside_the_design_are_refused():
         check_receipt(broken)
 
 
-def test_accuracy_and_effects_may_be_absent():
-    """Without labels there is no accuracy, and that is complete."""
-    assert "accuracy" not in make_receipt(labels=False)
-
-
 def test_comparable_leaves_times_out_and_nothing_else():
     """Two runs that differ in times agree; one that differs in a figure or the seed does not."""
     one, two = make_receipt(wall=1.5), make_receipt(wall=2.5)
@@ -186,11 +177,13 @@ def test_comparable_leaves_times_out_and_nothing_else():
     assert comparable(one) != comparable({**one, "seed": 8})
 
 
-def test_table_shows_savings_accuracy_and_stages():
-    """The terminal block holds the figures with their units, 'predicted', the controls and every stage."""
+def test_table_shows_savings_accuracy_and_stages_in_80_columns():
+    """Figures with their units, 'predicted', the controls, every stage; small areas in square metres."""
     text = _printed(make_receipt())
     for words in ("104 s", "209 s", "50 %", "predicted", "75.0", "93.4", "± 1.2", "67 %", "capture", "cached"):
         assert words in text, words
+    assert max(map(len, _printed(make_receipt(), 80).splitlines())) <= 80
+    assert [area_words(hectares) for hectares in (2.5, 0.1, 0.0999, 0.0012)] == ["2.5 ha", "0.1 ha", "999 m²", "12 m²"]
 
 
 def _printed(receipt: Receipt, width: int = 100) -> str:
@@ -199,17 +192,13 @@ def _printed(receipt: Receipt, width: int = 100) -> str:
     return console.file.getvalue()
 
 
-def test_table_lists_false_classes_with_their_pixels_and_both_definitions():
-    """What the truth lacks is told beside the mean over the classes that it has, and beside the mean of before."""
+def test_table_shows_both_definitions_where_they_differ():
+    """With false classes and their pixels; where no map shows one there is no second column."""
     text = _printed(make_receipt(), 200)
     assert "mean over the 2 classes of the truth" in text
     assert "Shown although the truth has none: this survey wheat 2 px." in text
     (row,) = [line.split() for line in text.splitlines() if "this survey " in line and "75.0" in line]
     assert row[-3:] == ["75.0", "93.4", "50.0"]
-
-
-def test_a_table_in_which_both_definitions_agree_shows_one():
-    """Where no map shows a false class there is no second column, and nothing to say of one."""
     receipt = make_receipt()
     accuracy = receipt["accuracy"]
     for one in (accuracy, *accuracy["controls"].values()):
@@ -218,36 +207,64 @@ def test_a_table_in_which_both_definitions_agree_shows_one():
     assert "shown" not in _printed(receipt).lower()
 
 
-def test_a_table_is_not_wider_than_a_terminal():
-    """80 columns, with both definitions and a control's long name."""
-    assert max(map(len, _printed(make_receipt(), 80).splitlines())) <= 80
-
-
-def test_small_areas_are_told_in_square_metres():
-    """A hectare has ten thousand of them."""
-    assert [area_words(hectares) for hectares in (2.5, 0.1, 0.0999, 0.0012)] == ["2.5 ha", "0.1 ha", "999 m²", "12 m²"]
-
-
 def test_headline_is_one_paragraph_with_the_figures():
-    """The first sentence that a farmer reads says where, how long and how well."""
+    """Where, how long, how well, and the worst class of the truth; what was not judged is not mentioned."""
     text = headline(make_receipt(), 0.23)
     assert text.startswith("The camera looked twice at 23 % of the field. Capture took 104 s instead of 209 s")
     assert "75.0 of 100" in text
     assert "93.4 % of its pixels are right" in text
     assert headline(make_receipt(), 0.0).startswith("The camera looked twice at nothing: no run of fine lines fits")
     assert "truth" not in headline(make_receipt(labels=False))
-
-
-def test_headline_names_the_worst_class_of_the_truth():
-    """The class of the truth with the lowest IoU, without detail, in this map and with all of it; no false class."""
     words = "Its worst class is bare weed with 60.0: the coarse look alone gives 20.0, detail everywhere 80.0."
     assert headline(make_receipt()).endswith(words)
-
-
-def test_headline_without_controls_says_nothing_of_detail_everywhere():
-    """What was not judged is not mentioned."""
     receipt = make_receipt()
     receipt["accuracy"]["all"] = {"miou": None, "per_class_iou": {}}
     text = headline(receipt)
     assert "the coarse look alone gives 50.0. Its worst class" in text
     assert text.endswith("bare weed with 60.0: the coarse look alone gives 20.0.")
+
+
+PNG = b"\x89PNG\r\n\x1a\nnot a real picture"
+
+
+def test_page_loads_nothing_from_anywhere():
+    """Every address is data of the page, the quicklook the bytes given; no script, no import, no link."""
+    page = render_report(make_receipt(), PNG, [Picture(PNG, "spectra")])
+    loaded = Page(page).loaded
+    assert len(loaded) == 2
+    assert all(source.startswith("data:image/png;base64,") for source in loaded)
+    assert "http" not in page
+    assert "@import" not in page
+    assert "url(" not in page
+    source = Page(render_report(make_receipt(), PNG)).loaded[0]
+    assert base64.b64decode(source.partition(",")[2]) == PNG
+
+
+def test_words_are_escaped():
+    """A survey, a class, a policy and a setting with markup in their names stay words."""
+    receipt = copy.deepcopy(make_receipt())
+    bad = '<script>alert("1")</script>&'
+    receipt["survey"] = receipt["scene"] = receipt["settings"]["out"] = receipt["stages"][0]["name"] = bad
+    receipt["versions"] = {bad: bad}
+    receipt["accuracy"]["per_class_iou"] = {bad: 0.5}
+    receipt["accuracy"]["false_classes"] = {bad: 1}
+    receipt["accuracy"]["controls"] = {bad: {"miou": 0.5, "spread": None}}
+    receipt["effects"][0]["why"] = bad
+    page = render_report(receipt, PNG, [Picture(PNG, bad + '" onload="x')])
+    Page(page)
+    assert '" onload="' not in page
+    assert page.count("&lt;script&gt;") >= 11
+
+
+def test_page_has_the_figures():
+    """Savings, accuracy, settings and versions; without a truth nothing of accuracy; dollar signs survive."""
+    page = render_report(make_receipt(), PNG, looked_twice=0.23)
+    figures = ("104 s", "predicted", "50 %", "75.0", "93.4", "56.2 ± 1.2", "67 %", "budget", "torch", "Class by class")
+    for words in (*figures, "this survey wheat 2 px", "2 of 3 classes are in the truth"):
+        assert words in page, words
+    receipt = make_receipt(labels=False)
+    receipt["survey"] = "field $title"
+    page = render_report(receipt, PNG)
+    Page(page)
+    assert "How good the map is" not in page
+    assert "field $title" in page

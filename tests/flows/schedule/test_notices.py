@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import socket
 from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import timedelta
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
@@ -22,20 +23,21 @@ from tests.flows.schedule.schedule_days import NOON, HandClock, field_schedule, 
 LATER = NOON + timedelta(hours=33)
 
 
-@pytest.fixture
-def listener() -> Iterator[tuple[str, list[dict[str, Any]]]]:
-    """An address on this machine, and what was posted to it."""
+@contextmanager
+def listening(code: int = 204, elsewhere: str = "") -> Iterator[tuple[str, list[dict[str, Any]]]]:
+    """An address on this machine that answers with a code, and what was posted to it or asked."""
     posted: list[dict[str, Any]] = []
 
     class Handler(BaseHTTPRequestHandler):
         def do_POST(self) -> None:
             posted.append(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
-            self.send_response(204)
-            self.end_headers()
+            self.do_GET()
 
         def do_GET(self) -> None:  # as what follows a redirect of a POST asks
-            posted.append({"asked": self.path})
-            self.send_response(204)
+            if self.command == "GET":
+                posted.append({"asked": self.path})
+            self.send_response(code)
+            self.send_header("Location", elsewhere)
             self.end_headers()
 
         def log_message(self, *words: object) -> None:
@@ -48,6 +50,13 @@ def listener() -> Iterator[tuple[str, list[dict[str, Any]]]]:
     server.shutdown()
     server.server_close()
     thread.join()
+
+
+@pytest.fixture
+def listener() -> Iterator[tuple[str, list[dict[str, Any]]]]:
+    """An address that takes notices."""
+    with listening() as one:
+        yield one
 
 
 def test_notices_are_of_trouble_only_and_never_needed(listener: tuple[str, list[dict[str, Any]]]) -> None:
@@ -84,13 +93,9 @@ def stranger() -> Iterator[str]:
     thread.join()
 
 
-def test_an_answer_that_is_none_ends_nothing(stranger: str) -> None:
-    """An address at which something else listens gets no notice, and nobody is the wiser."""
+def test_who_speaks_another_protocol_does_not_answer(stranger: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A notice to it is lost without a word; a Prefect server that is none is refused in one message."""
     assert not send_notice(stranger, Outcome("north", NOON, "failed", "no reply"), "archive")
-
-
-def test_a_named_server_that_speaks_another_protocol(stranger: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is refused in one message, as one that does not answer."""
     from flows.schedule.server import server_for
 
     for url in (stranger, "http://127.0.0.1:port/api"):
@@ -146,34 +151,21 @@ def test_an_address_may_stand_in_a_file_or_the_environment(tmp_path: Path, monke
 @pytest.mark.parametrize("code", [301, 302, 303, 307, 308])
 def test_a_notice_follows_no_redirect(listener: tuple[str, list[dict[str, Any]]], code: int) -> None:
     """An answer that names another address, such as a port of this machine, has nothing posted or asked there."""
+    with listening(code, listener[0]) as (address, asked):
+        sent = send_notice(f"{address}hook", Outcome("north", NOON, "failed", "no reply"), "archive")
+    assert (sent, len(asked), listener[1]) == (False, 1, [])
+
+
+def test_what_ended_alike_is_one_notice_that_counts(listener: tuple[str, list[dict[str, Any]]]) -> None:
+    """For each field and ending; what ended alone is as it was, counts as one, and keeps its reason."""
     address, posted = listener
-    asked: list[str] = []
-
-    class Elsewhere(BaseHTTPRequestHandler):
-        def do_POST(self) -> None:
-            asked.append(self.path)
-            self.rfile.read(int(self.headers["Content-Length"]))
-            self.send_response(code)
-            self.send_header("Location", address)
-            self.end_headers()
-
-        def log_message(self, *words: object) -> None:
-            pass
-
-    server = HTTPServer(("127.0.0.1", 0), Elsewhere)
-    thread = Thread(target=server.serve_forever)
-    thread.start()
-    sent = send_notice(
-        f"http://127.0.0.1:{server.server_port}/hook", Outcome("north", NOON, "failed", "no reply"), "archive"
-    )
-    server.shutdown()
-    server.server_close()
-    thread.join()
-    assert (sent, asked, posted) == (False, ["/hook"], [])
-
-
-def test_what_ended_alike_is_one_notice() -> None:
-    """For each field and ending one that counts; what ended alone is as it was, and keeps its reason."""
+    outcomes = [Outcome("north", NOON + timedelta(hours=number), "skipped", "too late") for number in range(2)]
+    for outcome in (outcomes[0], *together(outcomes)):
+        assert send_notice(address, outcome, "archive")
+    lone, several = posted
+    assert (lone["count"], "since" in lone) == (1, False)
+    assert lone.keys() < several.keys()
+    assert (several["count"], several["since"], several["due"]) == (2, "2026-06-01T12:00:00Z", "2026-06-01T13:00:00Z")
     skipped = [Outcome("north", NOON + timedelta(hours=number), "skipped", f"late by {number}") for number in range(3)]
     failed, other = Outcome("north", NOON, "failed", "no reply"), Outcome("south", NOON, "skipped", "too late")
     many, one, two = together([*skipped[:2], failed, skipped[2], other])
@@ -183,18 +175,6 @@ def test_what_ended_alike_is_one_notice() -> None:
     assert many.words() == (
         "north, 3 due between 2026-06-01 12:00:00 and 2026-06-01 14:00:00 UTC, skipped: the last one: late by 2"
     )
-
-
-def test_a_notice_of_several_counts_them(listener: tuple[str, list[dict[str, Any]]]) -> None:
-    """It has what a notice of one has, how many there are and since when; a lone one counts as one."""
-    address, posted = listener
-    outcomes = [Outcome("north", NOON + timedelta(hours=number), "skipped", "too late") for number in range(2)]
-    for outcome in (outcomes[0], *together(outcomes)):
-        assert send_notice(address, outcome, "archive")
-    lone, several = posted
-    assert (lone["count"], "since" in lone) == (1, False)
-    assert lone.keys() < several.keys()
-    assert (several["count"], several["since"], several["due"]) == (2, "2026-06-01T12:00:00Z", "2026-06-01T13:00:00Z")
 
 
 def test_an_outage_is_one_notice_and_the_next_run_does_not_wait(tmp_path: Path) -> None:

@@ -81,8 +81,8 @@ def test_three_users_with_folders_of_their_own(tmp_path: Path) -> None:
     assert lock_of().holder() == "another process"
 
 
-def test_two_names_of_one_port_are_one_rig(tmp_path: Path) -> None:
-    """A link to the device, as udev makes them, is the device; ports whose names are long are told apart."""
+def test_locks_are_of_the_port_and_say_their_holder(tmp_path: Path) -> None:
+    """A link to the device is the device; words of a killed process are not kept."""
     (tmp_path / "tty").touch()
     (tmp_path / "by-id").symlink_to(tmp_path / "tty")
     assert lock_of(str(tmp_path / "by-id")).place == lock_of(str(tmp_path / "tty")).place
@@ -91,6 +91,12 @@ def test_two_names_of_one_port_are_one_rig(tmp_path: Path) -> None:
     assert other.take()
     one.release()
     other.release()
+    path = tmp_path / "rig.lock"
+    path.write_text("a survey of a field with a very long name indeed (process 1)\n")
+    lock = RigLock(path)
+    assert lock.take("x")
+    assert path.read_text() == f"x (process {os.getpid()})\n"
+    lock.release()
 
 
 def test_a_rig_that_cannot_be_locked_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -135,16 +141,6 @@ def test_what_a_lock_points_at_is_left_alone(tmp_path: Path, kind: str) -> None:
             lock.take("a survey")
     assert target.exists() == (kind != "to nothing")
     assert not target.exists() or target.read_text() == "bytes"
-
-
-def test_words_of_a_lock_are_its_holders(tmp_path: Path) -> None:
-    """A file left by a killed process with longer words keeps none of them."""
-    path = tmp_path / "rig.lock"
-    path.write_text("a survey of a field with a very long name indeed (process 1)\n")
-    lock = RigLock(path)
-    assert lock.take("x")
-    assert path.read_text() == f"x (process {os.getpid()})\n"
-    lock.release()
 
 
 def test_locks_and_ledgers_of_an_archive_follow_no_link(tmp_path: Path) -> None:

@@ -15,20 +15,6 @@ from tests.flows.schedule.schedule_days import NOON, HandClock, accounted, field
 FIRST, SECOND, THIRD = (NOON + timedelta(minutes=20 * number) for number in (1, 2, 3))
 
 
-@pytest.mark.parametrize("back_s", [61, 120, 300])
-def test_a_clock_set_back_keeps_what_is_pending(tmp_path: Path, back_s: int) -> None:
-    """A due time that waits to be begun waits also after that, and what was skipped before it is not due again."""
-    clock, schedule = opened(tmp_path)
-    clock.sleep(45 * 60)
-    assert schedule.pending() == [SECOND]
-    clock.moment -= timedelta(seconds=back_s)
-    assert schedule.pending() == [SECOND]
-    assert [line["event"] for line in schedule.ledger.lines()] == ["opened", "skipped", "clock"]
-    assert schedule.begin(SECOND) == 1
-    assert schedule.end(SECOND, "done")
-    assert schedule.pending() == []
-
-
 def test_what_ended_is_not_due_again_after_the_clock_was_set_back(tmp_path: Path) -> None:
     """Neither what was done later than the clock shows now, nor what was done before."""
     clock, schedule = opened(tmp_path)
@@ -42,30 +28,6 @@ def test_what_ended_is_not_due_again_after_the_clock_was_set_back(tmp_path: Path
     assert schedule.pending() == []
     assert [schedule.begin(due) for due in (FIRST, SECOND)] == [None, None]
     assert [line["event"] for line in schedule.ledger.lines()].count("begun") == 2
-
-
-def test_a_run_that_ends_after_the_clock_was_set_back_hides_nothing(tmp_path: Path) -> None:
-    """Its due time lies ahead then: those that come before it are due all the same."""
-    clock, schedule = opened(tmp_path)
-    clock.moment = THIRD
-    schedule.begin(THIRD)
-    clock.moment = NOON + timedelta(minutes=10)
-    schedule.pending()
-    schedule.end(THIRD, "done")
-    clock.moment = FIRST
-    assert schedule.pending() == [FIRST]
-
-
-def test_a_run_resumed_after_the_clock_was_set_back_hides_nothing(tmp_path: Path) -> None:
-    """Another attempt at a due time that lies ahead then: those that come before it are due all the same."""
-    clock, schedule = opened(tmp_path)
-    clock.moment = THIRD
-    assert schedule.begin(THIRD) == 1
-    clock.moment = NOON + timedelta(minutes=10)
-    assert schedule.reap() == [THIRD]
-    assert schedule.begin(THIRD) == 2
-    clock.moment = FIRST
-    assert schedule.pending() == [FIRST]
 
 
 def test_a_clock_that_is_put_right_is_no_event(tmp_path: Path) -> None:
@@ -91,18 +53,6 @@ def test_a_due_time_that_has_not_come_is_not_begun(tmp_path: Path) -> None:
     assert schedule.begin(FIRST - timedelta(minutes=1)) is None
     assert [line["event"] for line in schedule.ledger.lines()] == ["opened"]
     assert schedule.begin(FIRST) == 1
-
-
-def test_what_very_many_due_times_passed_with_is_not_begun(tmp_path: Path) -> None:
-    """One line accounts for all of them: none of them begins after it."""
-    clock, schedule = opened(tmp_path)
-    clock.sleep(30 * 86400)
-    schedule.pending()
-    lines = schedule.ledger.lines()
-    assert lines[-1]["event"] == "passed"
-    assert schedule.begin(FIRST) is None
-    assert schedule.begin(clock.now() - timedelta(minutes=20)) is None
-    assert schedule.ledger.lines() == lines
 
 
 def test_the_newest_of_very_many_begins_at_once(tmp_path: Path) -> None:
@@ -147,16 +97,6 @@ def test_an_ending_accounts_for_nothing_that_was_not_served(tmp_path: Path) -> N
     clock.moment = THIRD
     assert schedule.end(SECOND, "skipped", "the rig was in use")
     assert list(schedule.state().ended) == [SECOND]
-
-
-def test_an_earlier_run_leaves_the_later_one(tmp_path: Path) -> None:
-    """Where both may begin, and they begin in turn, both are done."""
-    clock, schedule = opened(tmp_path, late=1.0)
-    clock.moment = SECOND
-    for due in (FIRST, SECOND):
-        assert schedule.begin(due) == 1
-        assert schedule.end(due, "done")
-    assert [line["event"] for line in schedule.ledger.lines()] == ["opened", *("begun", "done") * 2]
 
 
 def test_a_run_skipped_as_it_was_to_begin_says_why(tmp_path: Path) -> None:

@@ -208,6 +208,8 @@ def test_very_many_missed_due_times_have_one_line(tmp_path: Path) -> None:
     assert lines[-1]["count"] == 30 * 72 - 1
     assert schedule.pending() == [NOON + timedelta(days=30)]
     assert schedule.ledger.lines() == lines
+    assert schedule.begin(NOON + timedelta(minutes=20)) is None
+    assert schedule.begin(clock.now() - timedelta(minutes=21)) is None
     assert schedule.begin(NOON + timedelta(days=30)) == 1
     assert [line["event"] for line in schedule.ledger.lines()] == ["opened", "passed", "begun"]
 
@@ -271,8 +273,11 @@ def test_the_kernel_frees_the_rig_of_a_killed_process(tmp_path: Path) -> None:
     lock.release()
 
 
-def test_a_survey_by_hand_outlasts_a_look(tmp_path: Path) -> None:
-    """A schedule that looks whether the rig is free does not keep a survey off; one that surveys does."""
+def test_each_rig_has_one_lock(tmp_path: Path) -> None:
+    """The simulated one is the archive's own; a look does not keep a survey off, a survey does."""
+    rig = replace(Settings(), source="rig")
+    assert rig_lock(rig, tmp_path / "a").place == rig_lock(rig, tmp_path / "b").place
+    assert rig_lock(Settings(), tmp_path / "a").place != rig_lock(Settings(), tmp_path / "b").place
     looking, survey = RigLock(tmp_path / "rig.lock"), RigLock(tmp_path / "rig.lock")
     assert looking.take("a look at the schedule")
     later = threading.Timer(0.2, looking.release)
@@ -281,10 +286,3 @@ def test_a_survey_by_hand_outlasts_a_look(tmp_path: Path) -> None:
     later.join()
     assert not RigLock(tmp_path / "rig.lock").take_soon("another")
     survey.release()
-
-
-def test_each_rig_has_one_lock(tmp_path: Path) -> None:
-    """The rig's is the same for every archive; that of the simulated one is the archive's own."""
-    rig = replace(Settings(), source="rig")
-    assert rig_lock(rig, tmp_path / "a").place == rig_lock(rig, tmp_path / "b").place
-    assert rig_lock(Settings(), tmp_path / "a").place != rig_lock(Settings(), tmp_path / "b").place

@@ -1,4 +1,4 @@
-"""Serving: what is refused before anything runs, plain serving and artifacts."""
+"""Serving: what is refused before anything runs, schedules without a server, and artifacts."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import base64
 import io
 import json
 import os
-import re
 import signal
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
@@ -21,6 +20,8 @@ from PIL import Image
 from flows.publish.survey_command import MOST_BYTES, artifact_key, savings_rows, small_jpeg, survey_markdown
 from flows.schedule import serve_command
 from flows.schedule import server as serve_prefect
+from flows.schedule.due_runs import Outcome
+from flows.schedule.rig_lock import RigLock
 from flows.schedule.serve_command import alone_on, load_fields, serve_plain
 from flows.schedule.served import ServedField, ServeRequest
 from flows.schedule.times import parse_timetable
@@ -29,7 +30,7 @@ from pipeline.errors import ArchiveError
 from storage.archive.archive import Archive
 from storage.archive.ledger import Ledger
 from storage.remote.opening import verify_archive
-from tests.flows.schedule.schedule_days import NOON, HandClock
+from tests.flows.schedule.schedule_days import NOON, HandClock, field_schedule
 
 EVERY = parse_timetable(None, "20m", "UTC")
 
@@ -61,19 +62,21 @@ def test_refused_before_anything_is_served(
     field_file("gone", scene="gone.png")
     field_file("named", name="../north")
     given = [word.strip("'").replace("_", " ") for word in words.split()]
-    ended = command_line("serve", *(tmp_path / f"{name}.toml" for name in names), *given)
-    assert (ended.code, len(ended.errors)) == (code, 1), ended.err
-    assert re.search(message, ended.errors[0]), ended.errors[0]
+    command_line("serve", *(tmp_path / f"{name}.toml" for name in names), *given).refused(code, message)
     assert not (tmp_path / "archive" / "schedule").exists()
 
 
 def test_two_serves_on_one_archive(field_file: Callable[..., Path], command_line: Any) -> None:
-    """The second is refused, and nothing of the first is changed."""
+    """The second is refused while the first serves, and not after it."""
     file = field_file()
     with alone_on(load_fields([file])):
         ended = command_line("serve", file, "--every", "30m", "--engine", "plain")
-    assert (ended.code, len(ended.errors)) == (1, 1)
-    assert "another serve works on the archive" in ended.errors[0]
+    ended.refused(1, "another serve works on the archive")
+    fields = load_fields([field_file()])
+    with alone_on(fields), pytest.raises(ArchiveError, match="another serve"), alone_on(fields):
+        pass
+    with alone_on(fields):
+        pass
 
 
 def test_two_serves_of_one_rig(field_file: Callable[..., Path], tmp_path: Path, command_line: Any) -> None:
@@ -85,8 +88,7 @@ def test_two_serves_of_one_rig(field_file: Callable[..., Path], tmp_path: Path, 
         file.write_text(file.read_text() + rig)
     with alone_on(load_fields(files[:1])):
         ended = command_line("serve", files[1], "--every", "30m", "--engine", "plain")
-    assert (ended.code, len(ended.errors)) == (1, 1), ended.err
-    assert f"another serve uses the rig at {port}: give all its fields to that one" in ended.errors[0]
+    ended.refused(1, f"another serve uses the rig at {port}: give all its fields to that one")
 
 
 @pytest.mark.parametrize(
@@ -108,8 +110,7 @@ def test_a_server_that_cannot_be_had(
     monkeypatch.setenv("PREFECT_API_URL", url)
     file = field_file()
     ended = command_line("serve", file, "--every", "30m", *words)
-    assert (ended.code, len(ended.errors)) == (2, 1), ended.err
-    assert message in " ".join(ended.errors[0].split())
+    ended.refused(2, message.replace(" ", r"\s+"))
     assert "serving" not in ended.err
     assert load_fields([file])[0].schedule(EVERY, 0.5).ledger.lines() == []
 
@@ -148,15 +149,11 @@ def test_sigterm_stops_a_schedule(
     assert ended.err.splitlines()[-1].startswith("stopped: nothing is due any more; the same command serves again")
 
 
-def test_the_flag_for_the_archive_wins(field_file: Callable[..., Path], tmp_path: Path) -> None:
-    """Fields keep their own archives, unless one is given for all."""
+def test_fields_are_asked_for_by_archive_and_day(field_file: Callable[..., Path], tmp_path: Path) -> None:
+    """One archive given for all wins; each due time is a visit, and the farm is as on that day."""
     files = [field_file("north"), field_file("south", out=str(tmp_path / "other"))]
     assert [Path(one.settings.out).name for one in load_fields(files)] == ["archive", "other"]
     assert {one.settings.out for one in load_fields(files, "all")} == {"all"}
-
-
-def test_a_farm_that_grows_is_seen_on_its_day() -> None:
-    """Each due time is a visit of its own; the built-in farm is as on that day, unless the settings say another."""
     due = datetime(2026, 2, 1, 23, 30, tzinfo=UTC)
     one = ServedField("farm", Path("farm.toml"), Settings(scene="farm@2"))
     berlin = parse_timetable("30 0 * * *", None, "Europe/Berlin")
@@ -234,10 +231,92 @@ def test_the_picture_of_an_artifact_is_small(survey_png: Any, tmp_path: Path) ->
     assert artifact_key("North_field 7") == "north-field-7"
 
 
-def test_alone_means_alone(field_file: Callable[..., Path]) -> None:
-    """The lock of a serve is free again after it."""
-    fields = load_fields([field_file()])
-    with alone_on(fields), pytest.raises(ArchiveError, match="another serve"), alone_on(fields):
-        pass
-    with alone_on(fields):
-        pass
+def refuse(monkeypatch: pytest.MonkeyPatch, field: str, event: str) -> None:
+    """Let the disk refuse one kind of line of one field."""
+    real = Ledger.append
+
+    def append(self: Ledger, line: dict[str, object]) -> None:
+        if (self.field, line["event"]) == (field, event):
+            raise ArchiveError("the disk is full")
+        real(self, line)
+
+    monkeypatch.setattr(Ledger, "append", append)
+
+
+def test_what_waited_too_long_for_another_field_is_told_with_its_reason(tmp_path: Path) -> None:
+    """One line a run, with how it ended: also where it was too late as its turn came."""
+    clock, told, noted = HandClock(), list[str](), list[Outcome]()
+    schedules = {name: field_schedule(tmp_path, clock, name) for name in ("north", "south")}
+    lock = RigLock(tmp_path / "rig.lock")
+
+    def survey(field: str, due: datetime) -> Path:
+        clock.sleep(11 * 60)
+        return tmp_path / "run"
+
+    serve_plain(
+        schedules,
+        dict.fromkeys(schedules, lock),
+        survey,
+        told.append,
+        clock=clock,
+        note=noted.append,
+        until=NOON + timedelta(minutes=35),
+    )
+    assert told == [
+        "north, due 2026-06-01 12:20:00 UTC, done: runs/run",
+        "south, due 2026-06-01 12:20:00 UTC, skipped: it could not begin in time (noted 11.0 min after it was due)",
+    ]
+    assert [(one.field, one.ending) for one in noted] == [("north", "done"), ("south", "skipped")]
+
+
+def test_an_ending_from_elsewhere_is_told(tmp_path: Path) -> None:
+    """A run that could not be resumed here, and that another process ended in the same look, is told as that."""
+    clock, told, due = HandClock(), list[str](), NOON + timedelta(minutes=20)
+    schedules = {name: field_schedule(tmp_path, clock, name, late=1.0) for name in ("south", "north", "west")}
+    locks, other = {name: RigLock(tmp_path / name) for name in schedules}, RigLock(tmp_path / "north")
+
+    def survey(field: str, due: datetime) -> Path:
+        if field == "south":
+            assert other.take("another process")
+        elif field == "west":
+            schedules["north"].end(due, "failed", "no reply")
+        return tmp_path / "run"
+
+    schedules["north"].open()
+    clock.moment = due
+    schedules["north"].begin(due)
+    for name in ("south", "west"):
+        schedules[name].open(due)
+    serve_plain(schedules, locks, survey, told.append, clock=clock, until=due + timedelta(minutes=20))
+    other.release()
+    assert told == [
+        "south, due 2026-06-01 12:20:00 UTC, done: runs/run",
+        "north, due 2026-06-01 12:20:00 UTC, was not begun here",
+        "west, due 2026-06-01 12:20:00 UTC, done: runs/run",
+        "north, due 2026-06-01 12:20:00 UTC, failed: no reply",
+    ]
+
+
+def test_a_schedule_that_cannot_be_closed_is_told_of_and_the_others_are_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Serving ends as it was asked to; the field whose ledger refuses is named."""
+    clock, told = HandClock(), list[str]()
+    schedules = {name: field_schedule(tmp_path, clock, name) for name in ("north", "south")}
+    locks = dict.fromkeys(schedules, RigLock(tmp_path / "rig.lock"))
+    refuse(monkeypatch, "north", "closed")
+    serve_plain(schedules, locks, lambda *given: tmp_path, told.append, clock=clock, until=NOON + timedelta(minutes=1))
+    assert {name: schedule.state().serving for name, schedule in schedules.items()} == {"north": True, "south": False}
+    assert told == ["north: the disk is full"]
+
+
+def test_a_schedule_that_cannot_be_opened_leaves_none_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is served then: those that were opened before it are closed, and the message is the disk's."""
+    clock = HandClock()
+    schedules = {name: field_schedule(tmp_path, clock, name) for name in ("north", "south", "west")}
+    locks = dict.fromkeys(schedules, RigLock(tmp_path / "rig.lock"))
+    refuse(monkeypatch, "south", "opened")
+    with pytest.raises(ArchiveError, match="the disk is full"):
+        serve_plain(schedules, locks, lambda *given: tmp_path, lambda words: None, clock=clock)
+    assert [line["event"] for line in schedules["north"].ledger.lines()] == ["opened", "closed"]
+    assert not any(schedules[name].ledger.lines() for name in ("south", "west"))

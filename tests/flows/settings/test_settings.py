@@ -40,55 +40,49 @@ def toml(tmp_path: Path):
     return write
 
 
-def test_nothing_given_is_the_default():
-    """No file and no flag gives the defaults of the design."""
+def test_defaults_and_parts_are_read_back():
+    """No file and no flag gives the design's defaults; every part is read back; effects are those that exist."""
     found = load_settings()
     assert found == Settings()
     assert (found.scene, found.budget, found.policy, found.memory) == ("farm", 0.5, "gain", 4 * 2**30)
-
-
-def test_every_field_of_the_dataclasses_can_be_set():
-    """Every part of the survey and of the rig is read back from its plain values."""
     for name in ("camera", "cost", "optics", "mirror", "detector", "air", "sky"):
         assert parse_settings({name: asdict(getattr(Settings(), name))}) == Settings()
-
-
-def test_words_are_those_of_the_parts_that_use_them():
-    """Effects that the settings accept are exactly those that exist."""
     every = ",".join(effect.name for effect in EFFECTS)
     assert parse_settings({"effects": every}).effects == every
 
 
-def test_flags_win_over_the_file(toml):
-    """A flag replaces the file's value and leaves the others."""
+def test_flags_and_files_say_the_same(toml):
+    """Flags win over the file, commas are lists, and relative paths of a file start at its folder."""
     path = toml('budget = 0.4\npolicy = "sobel"\n[camera]\nexposure_ms = 50\nbits = 10\n')
     found = load_settings(path, {"budget": "0.3", "camera.exposure_ms": 20, "seed": None})
     assert (found.budget, found.policy, found.seed) == (0.3, "sobel", 0)
     assert (found.camera.exposure_ms, found.camera.bits) == (20.0, 10)
-
-
-def test_paths_of_a_file_start_at_its_folder(toml):
-    """Relative paths move with the settings file; built-in names and flags stay as they are."""
     path = toml('scene = "field.npy"\nlabels = "/data/labels.png"\nsource = "sim"\n')
     found = load_settings(path, {"out": "here"})
     assert found.scene == str(path.parent / "field.npy")
     assert (found.labels, found.source, found.out) == ("/data/labels.png", "sim", "here")
     assert load_settings(toml('scene = "farm"')).scene == "farm"
+    one = load_settings(flags={"bands": "0, 2", "wavelengths": "660,800.5", "size": "300x20", "effects": "shot,slit"})
+    two = parse_settings({"bands": [0, 2], "wavelengths": [660, 800.5], "size": [300, 20], "effects": ["slit", "shot"]})
+    assert one == two
+    assert (one.shape, one.effects) == ((20, 300), "slit,shot")
 
 
-def test_example_in_the_project_is_valid():
-    """The example that the README points to is accepted and says the defaults."""
+def test_the_example_says_every_default():
+    """It is what `python -m flows.settings.documents > survey.example.toml` makes, and valid."""
     found = load_settings(EXAMPLE)
     assert replace(found, out=Settings.out) == Settings()
-
-
-def test_example_is_what_the_declarations_say():
-    """The file is made of them; after a change: python -m flows.settings.documents > survey.example.toml."""
     assert EXAMPLE.read_text(encoding="utf-8") == example_toml()
+    lines = [line.removeprefix("# ") for line in EXAMPLE.read_text(encoding="utf-8").splitlines()]
+    named = {line.partition("=")[0].strip() for line in lines if "=" in line}
+    assert {item.name for item in fields(Settings)} - set(TABLES) <= named
+    for name, keys in TABLES.items():
+        assert f"[{name}]" in lines
+        assert set(keys) <= named, name
 
 
-def test_the_table_of_documents_has_every_setting():
-    """With its default, what it may be, and a line of help, in as many cells everywhere."""
+def test_documents_have_every_setting_with_its_default():
+    """A line of help each, in as many cells everywhere, and a default that its own range does not refuse."""
     rows = [line.split(" | ") for line in settings_table().splitlines() if line.startswith("| `")]
     assert [row[0].strip("| `") for row in rows] == [
         *(name for name in SURVEY if name not in TABLES),
@@ -96,25 +90,11 @@ def test_the_table_of_documents_has_every_setting():
     ]
     assert {len(row) for row in rows} == {4}
     assert ["| `samples`", "`640`", "a whole number from 16 to 65536", "Pixels of a line [px] |"] in rows
-
-
-def test_every_setting_says_what_it_is_and_takes_its_default():
-    """A line of help each, and a default (or an example) that its own range does not refuse."""
     for keys in ({name: one for name, one in SURVEY.items() if name not in TABLES}, *TABLES.values()):
         for name, one in keys.items():
             assert one.item.metadata["description"], name
             value = one.told["example"] if one.item.default in (None, MISSING) else one.item.default
             assert one.read(str(value) if isinstance(value, Tolerance) else value, name) is not None
-
-
-def test_example_lists_every_setting():
-    """Those without a default, and whole tables, stand in comments."""
-    lines = [line.removeprefix("# ") for line in EXAMPLE.read_text(encoding="utf-8").splitlines()]
-    named = {line.partition("=")[0].strip() for line in lines if "=" in line}
-    assert {item.name for item in fields(Settings)} - set(TABLES) <= named
-    for name, keys in TABLES.items():
-        assert f"[{name}]" in lines
-        assert set(keys) <= named, name
 
 
 @pytest.mark.parametrize(
@@ -191,6 +171,8 @@ def test_memory_reads_units(text, count):
         ({"memory": "4"}, "at least 256MiB"),
         ({"scheduler": "dask"}, "'scheduler': .* threads, processes, or the address of a dask scheduler such as tcp:"),
         ({"workers": 0}, "a whole number from 1 to 1024, got 0; one process or thread each"),
+        ({"scheduler": ""}, "^'scheduler' must be text that is not empty"),
+        ({"scheduler": 3}, "^'scheduler' must be text that is not empty"),
         ({"rounds": 1}, r"unknown setting 'rounds'; there is one round of detail: .* was removed; leave it out$"),
         ({"rounds": 2}, r"unknown setting 'rounds'; there is one round of detail: .* was removed; leave it out$"),
         ({"threshold": -1}, "threshold' must be a number from 0 to 1e\\+09 nat per second, got -1"),
@@ -259,16 +241,12 @@ def test_wrong_values_are_refused(table, words):
 
 
 def test_a_pose_and_its_map_are_read(toml):
-    """The tables become the pose and the choice of the map; without them there is no pose."""
+    """Without the tables there is no pose; those of the example are valid without their comment signs."""
     found = load_settings(toml("[pose]\nlon_deg = -3.25\nlat_deg = 57\nheading_deg = 350\ntilt_deg = 20\nrange_m = 40"))
     assert found.pose == RigPose(lon_deg=-3.25, lat_deg=57.0, heading_deg=350.0, tilt_deg=20.0, range_m=40.0)
     assert (found.map, Settings().pose) == (MapChoice(), None)
     found = parse_settings({"pose": POSE, "map": {"epsg": 25832, "resolution_m": 0.05}})
     assert found.map == MapChoice(25832, 0.05)
-
-
-def test_the_commented_pose_of_the_example_is_valid():
-    """Taking off the comment signs of [pose] and [map] gives a posed survey (with one of height and range)."""
     text = EXAMPLE.read_text(encoding="utf-8")
     lines = [line.removeprefix("# ") for line in text[text.index("# [pose]") :].splitlines()]
     table = tomllib.loads(
@@ -338,14 +316,6 @@ def test_file_that_cannot_be_read_is_one_message(toml, tmp_path):
         load_settings(toml("budget 0.5"))
 
 
-def test_text_and_lists_say_the_same():
-    """What a flag says with commas is what a file says with a list."""
-    one = load_settings(flags={"bands": "0, 2", "wavelengths": "660,800.5", "size": "300x20", "effects": "shot,slit"})
-    two = parse_settings({"bands": [0, 2], "wavelengths": [660, 800.5], "size": [300, 20], "effects": ["slit", "shot"]})
-    assert one == two
-    assert (one.shape, one.effects) == ((20, 300), "slit,shot")
-
-
 @given(
     budget=st.floats(0, 1, exclude_min=True),
     seed=st.integers(0, 2**63 - 1),
@@ -375,10 +345,3 @@ def test_receipt_settings_read_back_the_same(budget, seed, bands, memory, exposu
     )
     assert parse_settings(settings.to_dict()) == settings
     assert parse_settings(json.loads(to_json(settings.to_dict()))) == settings
-
-
-@pytest.mark.parametrize("value", ["", 3])
-def test_a_scheduler_that_is_no_text_is_named_once(value):
-    """A setting stands once in its message."""
-    with pytest.raises(SettingsError, match=r"^'scheduler' must be text that is not empty"):
-        parse_settings({"scheduler": value})

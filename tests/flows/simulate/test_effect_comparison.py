@@ -1,4 +1,4 @@
-"""A scan beside everything on: figures that hold together, lines that are affordable, a picture, words refused."""
+"""Effects: what the stage that decides on them keeps, and a scan beside everything on."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from flows.simulate.command import open_simulation
 from flows.simulate.effect_comparison import Comparison, View, compare_with_everything, everything
 from flows.simulate.effect_picture import Words, draw_comparison
 from flows.survey.run import CaptureRun
-from flows.survey.stages.effects import load_manifest
-from pipeline.errors import BoundError
+from flows.survey.stages import effects as effect_choice
+from flows.survey.stages.effects import choose_effects, chosen_effects, load_manifest, source_with
+from pipeline.errors import BoundError, IncompleteStoreError
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.effects.registry import BY_NAME
+from pipeline.simulator.effects.registry import BY_NAME, EFFECTS
+from pipeline.simulator.scenes.scene import RasterScene
 from storage.archive.keys import StageRef
-from tests.flows.simulate.test_effect_choice import choose
 
 ASKED = "rotation,vignetting,shot,read-noise"
 
@@ -77,16 +78,14 @@ def made_up(measured: float = 0.02, tolerance: float | None = 0.1) -> Comparison
     )
 
 
-def test_everything_is_what_the_rig_has_in_exact_variants(scan: tuple[CaptureRun, list[Sweep], StageRef]) -> None:
-    """What was not asked for is there as well; what the rig has none of is not."""
+def test_figures_are_beside_all_that_the_rig_has(
+    scan: tuple[CaptureRun, list[Sweep], StageRef], found: Comparison
+) -> None:
+    """What was not asked for is there exactly; all lines are compared and the greatest change keeps its bound."""
     names = {effect.name: variant for effect, variant in everything(scan[2]).items()}
     assert {"rotation", "slit", "smear", "diffraction", "shot", "quantisation"} <= set(names)
     assert {"wind", "cloud", "defects"}.isdisjoint(names)
     assert all(variant == BY_NAME[name].variants[0] for name, variant in names.items())
-
-
-def test_figures_hold_together(found: Comparison) -> None:
-    """All lines are compared, the greatest change keeps its bound and is the greatest of the view about it."""
     assert found.lines == found.of_lines
     assert found.bound is not None
     assert 0 < found.rms < found.measured <= found.bound
@@ -109,10 +108,10 @@ def test_what_is_exact_differs_by_nothing(scene_files: Path, tmp_path: Path) -> 
     assert (same.left_out, same.cheaper) == ((), ())
 
 
-def test_a_scan_that_takes_too_long_is_compared_in_part(
+def test_a_scan_is_compared_in_part_and_a_broken_bound_has_its_place(
     scan: tuple[CaptureRun, list[Sweep], StageRef], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Blocks evenly out of all; what that is of is said."""
+    """Blocks evenly out of all, which is said; a bound that does not hold is told where."""
     said: list[str] = []
     monkeypatch.setattr(effect_comparison, "MOST_S", 1e-9)
     monkeypatch.setattr(effect_comparison, "BLOCK_LINES", 4)
@@ -120,12 +119,7 @@ def test_a_scan_that_takes_too_long_is_compared_in_part(
     assert part.lines == 4 < part.of_lines
     assert said[0].startswith(f"4 of {part.of_lines} lines are taken both ways: ")
     assert "all would take about" in said[0]
-
-
-def test_a_bound_that_does_not_hold_is_told_with_its_place(
-    scan: tuple[CaptureRun, list[Sweep], StageRef], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The whole scan is a harder check than the worst chips."""
+    monkeypatch.undo()
 
     def believing(effects: StageRef) -> dict[str, Any]:
         manifest = load_manifest(effects)
@@ -171,9 +165,7 @@ def test_pictures_that_cannot_be_written_are_refused_first(
     (tmp_path / "folder.png").mkdir()
     (tmp_path / "file").touch()
     scene, out = scene_files / "scene.png", tmp_path / "none"
-    ended = command_line("simulate", scene, "-o", out, "--compare", tmp_path / name)
-    assert (ended.code, len(ended.errors)) == (code, 1)
-    assert message in ended.err
+    command_line("simulate", scene, "-o", out, "--compare", tmp_path / name).refused(code, message)
     assert not out.exists()
 
 
@@ -189,3 +181,100 @@ def test_the_command_writes_the_picture_and_tells_its_figures(
     assert record["picture"] == str(picture)
     assert width_of(picture) == 1600
     assert "Everything on, exact, takes" in " ".join(ended.err.split())
+
+
+def choose(run: CaptureRun) -> StageRef:
+    """The stage's store, made in the run's archive."""
+    return choose_effects.produce(run.archive, choose_effects.needed(run))[0]
+
+
+def key_of(run: CaptureRun) -> str:
+    """The key that the stage asks for, without making anything."""
+    return choose_effects.key(choose_effects.needed(run))
+
+
+def opened(scene_files: Path, out: Path, **flags: Any) -> CaptureRun:
+    """A simulation of the small picture."""
+    given = {"scene": str(scene_files / "scene.png"), "out": str(out), "effects": ASKED}
+    return open_simulation(load_settings(None, given | flags))[0]
+
+
+@pytest.fixture(scope="module")
+def decided(scene_files: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, StageRef]:
+    """An archive with a decision, and its store."""
+    out = tmp_path_factory.mktemp("decided")
+    return out, choose(opened(scene_files, out))
+
+
+def test_the_manifest_and_the_source_have_what_was_decided(decided: tuple[Path, StageRef], scene_files: Path) -> None:
+    """Every effect in the chain's order, those left out within their bounds; the source has variants and clock."""
+    manifest = load_manifest(decided[1])
+    rows = {row["name"]: row for row in manifest["effects"]}
+    assert list(rows) == [effect.name for effect in EFFECTS]
+    assert {name for name, row in rows.items() if row["state"] == "on"} == {
+        *ASKED.split(","),
+        "quantisation",
+        "saturation",
+    }
+    assert rows["diffraction"]["bound"] >= rows["diffraction"]["measured"] > 0
+    assert (manifest["total"]["asked"], manifest["total"]["tolerance"]) == (ASKED, 0.1)
+    source = source_with(opened(scene_files, decided[0]).simulated, decided[1], {"a": 3.0})
+    on = {row["name"]: row["variant"] for row in load_manifest(decided[1])["effects"] if row["state"] == "on"}
+    assert {effect.name: variant for effect, variant in source.choice.effects} == on
+    assert (source.clock, list(chosen_effects(decided[1]))) == (
+        {"a": 3.0},
+        [effect for effect, _ in source.choice.effects],
+    )
+
+
+def test_a_decision_that_is_there_draws_nothing(
+    scene_files: Path, decided: tuple[Path, StageRef], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither probe nor chips; not one point of the scene is asked for."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("the scene was looked at")
+
+    run = opened(scene_files, decided[0], budget="0.9", policy="random")
+    monkeypatch.setattr(RasterScene, "sample", refuse)
+    monkeypatch.setattr(effect_choice, "probe_survey", refuse)
+    assert choose(run) == decided[1]
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        {"tol": "0.2"},
+        {"tol": "0.1dn"},
+        {"effects": "auto"},
+        {"seed": "1"},
+        {"camera.exposure_ms": "50"},
+        {"optics.smile_nm": 0.5},
+        {"sky.started": "2026-06-01T12:00:00Z"},
+    ],
+    ids=str,
+)
+def test_what_the_decision_depends_on_is_its_key(
+    scene_files: Path, decided: tuple[Path, StageRef], flags: dict[str, Any]
+) -> None:
+    """Tolerance with its unit, what was asked, seed, camera and rig."""
+    assert key_of(opened(scene_files, decided[0])) == decided[1].key
+    assert key_of(opened(scene_files, decided[0], **flags)) != decided[1].key
+
+
+def test_broken_bounds_and_unknown_effects_are_refused(
+    scene_files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, decided: tuple[Path, StageRef]
+) -> None:
+    """What cannot be trusted is not kept; an effect that this version does not know is named."""
+
+    def broken(*_: object) -> None:
+        raise BoundError("smile: what was left out changes light by 3")
+
+    monkeypatch.setattr(effect_choice, "_verified", broken)
+    with pytest.raises(BoundError, match="smile"):
+        choose(opened(scene_files, tmp_path))
+    assert not list((tmp_path / "stages").glob("effects/*"))
+    row = {"name": "glare", "state": "on", "variant": "exact"}
+    monkeypatch.setattr(effect_choice, "load_manifest", lambda effects: {"effects": [row]})
+    with pytest.raises(IncompleteStoreError, match="the effect glare, exact, which this version does not know"):
+        chosen_effects(decided[1])

@@ -51,15 +51,14 @@ def test_values_grow_with_the_bands(unit: Unit) -> None:
     assert replace(SMALL, bands=60).work(unit) == 2 * SMALL.work(unit)
 
 
-def test_operations_of_the_map_are_bounded_by_regions() -> None:
-    """Beyond one region they grow with the field alone, but for the halo around each."""
+def test_operations_of_the_map_are_those_of_its_regions() -> None:
+    """Beyond one region they grow with the field; without fine lines they are a glance's."""
     one, many = _larger(2), _larger(8)  # 2560 px a side at most, and 5 x that
     assert 1 < many.work("operations of the map") / (16 * one.work("operations of the map")) < 1.4
-
-
-def test_a_map_without_fine_lines_reads_the_coarse_look() -> None:
-    """Each map does, for nothing is kept of the glance: without a patch it is all there is to do."""
     assert replace(SMALL, fine_lines=0).work("operations of the map") == SMALL.work("operations of a glance") > 0
+    coarse = replace(SMALL, fine_lines=None, fine_runs=None)
+    assert [coarse.work(unit) for unit in ("fine values", "patch values", "operations of the map")] == [0, 0, 0]
+    assert coarse.run_lines == SMALL.grid.height
 
 
 @pytest.mark.parametrize(("seconds", "run_lines"), list(product((0.0, 0.5, 40.0, 1000.0), (20.0, 63.5, 700.0))))
@@ -81,16 +80,12 @@ def test_seconds_buy_no_more_lines_than_they_pay_for(seconds: float, run_lines: 
     assert price(bought + 1) > seconds
 
 
-def test_no_more_lines_are_bought_than_the_full_scan_has() -> None:
-    """Whatever the seconds."""
+def test_a_large_field_is_counted_region_by_region() -> None:
+    """Sixteen times the field takes as many fields and their halos, and no more lines than the full scan."""
     assert SMALL.buying(1e6, run_lines=50, most=321).fine_lines == 321
-
-
-def test_nothing_is_known_of_a_fine_pass_that_is_not() -> None:
-    """A coarse pass alone has no fine values, patches, nor a map."""
-    coarse = replace(SMALL, fine_lines=None, fine_runs=None)
-    assert [coarse.work(unit) for unit in ("fine values", "patch values", "operations of the map")] == [0, 0, 0]
-    assert coarse.run_lines == SMALL.grid.height
+    small, large = (work_of_map(run, run.grid.valid_seats()) for run in (_run(2560, "gain"), _run(10240, "gain")))
+    assert 16 * small.decode < large.decode < 16 * 1.3 * small.decode
+    assert 16 * small.total < large.total < 16 * 1.3 * small.total
 
 
 CONFIG, BANDS = SegmenterConfig(classes=4), 8
@@ -118,10 +113,3 @@ def test_a_policy_that_asks_the_glance_reads_the_coarse_look_once_more(policy: s
     done, closed = work_done(run, np.array([3, 8])), multiply_adds(CONFIG, run.grid, 2, BANDS, score=score)
     assert done.glance == looks * closed.glance
     assert (done.score, done.encode, done.decode) == (closed.score, closed.encode, closed.decode)
-
-
-def test_a_large_field_is_counted_region_by_region() -> None:
-    """Sixteen times the field takes what sixteen such fields take, and its halos: attention ends with a region."""
-    small, large = (work_of_map(run, run.grid.valid_seats()) for run in (_run(2560, "gain"), _run(10240, "gain")))
-    assert 16 * small.decode < large.decode < 16 * 1.3 * small.decode
-    assert 16 * small.total < large.total < 16 * 1.3 * small.total

@@ -92,16 +92,12 @@ def test_scores_of_regions_make_those_of_the_field(surveyed: tuple[SurveyRun, Pa
         assert (load_attention(_store(stages, "attend/*/attention.zarr")).score == whole).all()
 
 
-def test_edges_need_one_patch_of_halo(surveyed: tuple[SurveyRun, Path]) -> None:
-    """The edge score looks one pixel around: with a halo of one coarse patch regions give the field's own."""
+def test_edges_need_one_patch_of_halo_and_work_travels_as_paths(surveyed: tuple[SurveyRun, Path]) -> None:
+    """With one coarse patch regions give the field's own edges; what another process gets is small."""
     run, stages = surveyed
     mosaic = _store(stages, "rectify/*/mosaic.zarr")
     whole = FieldWork.of(run).score("sobel", mosaic, lambda done: None)
     np.testing.assert_allclose(_work(run, Crew(), 1).score("sobel", mosaic, lambda done: None), whole, rtol=1e-5)
-
-
-def test_work_travels_as_paths(surveyed: tuple[SurveyRun, Path]) -> None:
-    """What another process gets is small, and gives there what it gives here."""
     run, stages = surveyed
     work = FieldWork.of(run)
     scoring = Scoring(work.weights, _store(stages, "rectify/*/mosaic.zarr"), "entropy")
@@ -111,10 +107,10 @@ def test_work_travels_as_paths(surveyed: tuple[SurveyRun, Path]) -> None:
     assert (there(region) == scoring(work.regions[0])).all()
 
 
-def test_a_worker_at_regions_keeps_no_tiles(
+def test_a_worker_goes_region_by_region(
     surveyed: tuple[SurveyRun, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What it held for the mosaic is given back before a region is read: the memory was promised once."""
+    """What it held for the mosaic is given back before a region is read; each region moves the bar."""
     run, stages = surveyed
     let_go: list[bool] = []
     monkeypatch.setattr("flows.survey.field_work.let_tiles_go", lambda: let_go.append(True))
@@ -123,6 +119,13 @@ def test_a_worker_at_regions_keeps_no_tiles(
     assert len(let_go) == 2
     _draw(work, run, stages, tmp_path / "m.zarr")
     assert len(let_go) == 4
+    run, stages = surveyed
+    told: list[float] = []
+    work = _work(run, Crew(workers=1), 1)
+    work.score("entropy", _store(stages, "rectify/*/mosaic.zarr"), told.append)
+    assert told == [0.5, 1.0]
+    regions: Sequence[Region] = work.regions
+    assert sum(region.kept.shape[0] for region in regions) == 96
 
 
 @pytest.mark.parametrize(("crew", "words"), [(Crew(), "the process itself"), (Crew("processes"), "each of two proc")])
@@ -158,14 +161,3 @@ def test_weights_that_changed_are_refused(tmp_path: Path, weights: Path) -> None
 def test_only_keys_of_fields_that_are_cut_know_of_regions(size: tuple[int, int]) -> None:
     """What was stored of a field up to the limit is found again; a larger one is another result than read whole."""
     assert bool(region_params(SceneGrid(*size, 16, 4))) == (max(size) > 2560)
-
-
-def test_progress_counts_regions(surveyed: tuple[SurveyRun, Path]) -> None:
-    """Each region moves the bar."""
-    run, stages = surveyed
-    told: list[float] = []
-    work = _work(run, Crew(workers=1), 1)
-    work.score("entropy", _store(stages, "rectify/*/mosaic.zarr"), told.append)
-    assert told == [0.5, 1.0]
-    regions: Sequence[Region] = work.regions
-    assert sum(region.kept.shape[0] for region in regions) == 96

@@ -93,14 +93,18 @@ def grid_of(run: Run) -> GroundGrid:
     return grid
 
 
-def test_without_a_pose_there_is_no_ground(run: Run, stores: tuple[StageRef, StageRef]) -> None:
-    """Nothing is written, nothing is looked at."""
+def test_without_ground_nothing_is_written(run: Run, stores: tuple[StageRef, StageRef]) -> None:
+    """No pose is no map; a pose that looks at the sky is refused by its name."""
     assert ground(replace(run, settings=Settings()), *stores) is None
+    assert run.archive.refs() == []
+    sky = Settings(pose=replace(POSE, tilt_deg=-30.0))
+    with pytest.raises(PoseError, match=r"no ray of the field meets the ground .*tilt_deg -30"):
+        draw(replace(run, settings=sky), stores)
     assert run.archive.refs() == []
 
 
-def test_the_map_shows_the_class_map_where_the_rays_end(run: Run, stores: tuple[StageRef, StageRef]) -> None:
-    """Every scene pixel's class is found again on the map at the place where its ray meets the ground."""
+def test_map_and_picture_lie_where_the_rays_end(run: Run, stores: tuple[StageRef, StageRef]) -> None:
+    """Each scene pixel's class is found where its ray meets the ground; the mosaic's ramp rises towards the rig."""
     ref = draw(run, stores)
     found = load_ground_map(ref.path / STORE)
     grid = grid_of(run)
@@ -113,21 +117,6 @@ def test_the_map_shows_the_class_map_where_the_rays_end(run: Run, stores: tuple[
     sure = found.confidence[row, column]
     np.testing.assert_array_equal(np.isnan(sure), wanted == UNLABELLED)
     assert sure[wanted == 1] == pytest.approx(0.75)
-
-
-def test_hectares_are_those_of_the_pixels_footprints(run: Run, stores: tuple[StageRef, StageRef]) -> None:
-    """Each class's area is the sum of its scene pixels' footprints, whatever the map's resolution."""
-    ref = draw(replace(run, settings=Settings(pose=POSE, map=MapChoice(resolution_m=0.02))), stores)
-    areas = load_ground_map(ref.path / STORE).areas
-    grid = grid_of(run)
-    exact = grid.frame.view.area_m2(np.stack(np.meshgrid(*pixel_places(SHAPE), indexing="ij"), axis=-1))
-    assert areas["weed"]["m2"] == pytest.approx(exact[:, :80].sum(), rel=1e-12)
-    assert areas["crop"]["m2"] == pytest.approx(exact[30:, 80:].sum(), rel=1e-12)
-    assert areas["crop"]["ha"] == pytest.approx(areas["crop"]["m2"] / 10_000)
-
-
-def test_the_picture_brightens_towards_the_rig(run: Run, stores: tuple[StageRef, StageRef]) -> None:
-    """The coarse mosaic's ramp lies on the ground, 1 to 255 where seen, 0 where neither rays nor light were."""
     ref = draw(run, stores)
     found = load_ground_map(ref.path / STORE)
     tones = coarse_colours(stores[1])
@@ -139,6 +128,22 @@ def test_the_picture_brightens_towards_the_rig(run: Run, stores: tuple[StageRef,
     row, column = np.nonzero(seen)
     along = row * np.cos(np.deg2rad(25)) - column * np.sin(np.deg2rad(25))  # towards the rig on a north-up map
     assert np.corrcoef(along, found.picture[row, column, 0])[0, 1] > 0.95
+
+
+def test_the_store_has_hectares_and_where_it_was_seen_from(run: Run, stores: tuple[StageRef, StageRef]) -> None:
+    """Areas are sums of footprints at any resolution; plain xarray reads pose, counts of pixels and CRS."""
+    ref = draw(replace(run, settings=Settings(pose=POSE, map=MapChoice(resolution_m=0.02))), stores)
+    areas = load_ground_map(ref.path / STORE).areas
+    grid = grid_of(run)
+    exact = grid.frame.view.area_m2(np.stack(np.meshgrid(*pixel_places(SHAPE), indexing="ij"), axis=-1))
+    assert areas["weed"]["m2"] == pytest.approx(exact[:, :80].sum(), rel=1e-12)
+    assert areas["crop"]["m2"] == pytest.approx(exact[30:, 80:].sum(), rel=1e-12)
+    assert areas["crop"]["ha"] == pytest.approx(areas["crop"]["m2"] / 10_000)
+    ref = draw(replace(run, settings=Settings(pose=POSE, map=MapChoice(epsg=25832))), stores)
+    with xr.open_zarr(ref.path / STORE, consolidated=False) as content:
+        assert content.attrs["proj:code"] == "EPSG:25832"
+        assert content.attrs["rig_pose"]["tilt_deg"] == 50.0
+        assert content.attrs["scene_pixels"] == {"mapped_px": 120 * 160, "beyond_reach_px": 0, "no_ground_px": 0}
 
 
 def test_the_key_follows_pose_and_map(run: Run, stores: tuple[StageRef, StageRef]) -> None:
@@ -153,20 +158,3 @@ def test_the_key_follows_pose_and_map(run: Run, stores: tuple[StageRef, StageRef
     keys = [ref.key for ref in refs]
     assert keys[0] == keys[3]
     assert len(set(keys)) == 3
-
-
-def test_the_store_says_where_it_was_seen_from(run: Run, stores: tuple[StageRef, StageRef]) -> None:
-    """Plain xarray reads pose, counts of pixels and the CRS asked for."""
-    ref = draw(replace(run, settings=Settings(pose=POSE, map=MapChoice(epsg=25832))), stores)
-    with xr.open_zarr(ref.path / STORE, consolidated=False) as content:
-        assert content.attrs["proj:code"] == "EPSG:25832"
-        assert content.attrs["rig_pose"]["tilt_deg"] == 50.0
-        assert content.attrs["scene_pixels"] == {"mapped_px": 120 * 160, "beyond_reach_px": 0, "no_ground_px": 0}
-
-
-def test_a_pose_that_sees_no_ground_is_refused_and_leaves_nothing(run: Run, stores: tuple[StageRef, StageRef]) -> None:
-    """The error names the pose; the archive stays empty."""
-    sky = Settings(pose=replace(POSE, tilt_deg=-30.0))
-    with pytest.raises(PoseError, match=r"no ray of the field meets the ground .*tilt_deg -30"):
-        draw(replace(run, settings=sky), stores)
-    assert run.archive.refs() == []

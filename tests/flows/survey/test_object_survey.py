@@ -145,10 +145,14 @@ def _refuse(*given: object, **more: object) -> None:
     raise SceneError("the scene is gone")
 
 
-def test_a_run_is_exported_from_a_bucket(
-    bucket: str, survey_png: Survey, tmp_path: Path, command_line: CommandLine
+def test_cubes_go_into_a_bucket_and_exports_come_out(
+    bucket: str, survey_png: Survey, tmp_path: Path, command_line: CommandLine, scene_files: Path
 ) -> None:
-    """The catalogue is that of a run in a folder, and is called after the prefix."""
+    """Ingested once and found again; the catalogue is that of a folder, called after the prefix."""
+    words = ("ingest", scene_files / "cube.npy", bucket, "--wavelengths", "450,500,550,600,650,700", "--json")
+    records = [json.loads(command_line(*words).out) for _ in range(2)]
+    assert [record["cached"] for record in records] == [False, True]
+    assert records[0]["uri"] == records[1]["uri"]
     pytest.importorskip("rasterio", reason="rasterio is not installed (extra geo)")
     pytest.importorskip("pystac", reason="pystac is not installed (extra geo)")
     survey_png(bucket)
@@ -156,14 +160,6 @@ def test_a_run_is_exported_from_a_bucket(
     assert (ended.code, ended.errors) == (0, [])
     assert "class_map" in json.loads(ended.out)["files"]
     assert json.loads((tmp_path / "export" / "collection.json").read_text())["id"] == bucket.rpartition("/")[2]
-
-
-def test_a_cube_is_ingested_into_a_bucket(bucket: str, scene_files: Path, command_line: CommandLine) -> None:
-    """The same content is stored once, and found there again."""
-    words = ("ingest", scene_files / "cube.npy", bucket, "--wavelengths", "450,500,550,600,650,700", "--json")
-    records = [json.loads(command_line(*words).out) for _ in range(2)]
-    assert [record["cached"] for record in records] == [False, True]
-    assert records[0]["uri"] == records[1]["uri"]
 
 
 def test_a_bucket_that_cannot_be_reached_is_one_error(

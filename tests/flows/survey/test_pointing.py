@@ -1,8 +1,9 @@
-"""A mirror that looks beside the plan: what the survey finds, puts right, and tells."""
+"""A mirror that looks beside the plan: what is laid out for it, found, put right and told."""
 
 from __future__ import annotations
 
 import json
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,11 +14,15 @@ from rich.console import Console
 
 from flows.publish.receipt_table import sentences
 from flows.publish.survey_command import run_survey
-from flows.settings.load import load_settings
+from flows.settings.load import load_settings, parse_settings
+from flows.survey.run import plan_capture
 from flows.survey.stages.maps import patch_columns
 from models.network.spectral import SpectralBasis
 from models.reading.inference import Glance
+from pipeline.errors import SettingsError
 from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import Sweep
+from pipeline.planning.coverage import coarse_sweeps, full_sweeps, reach_px
 from pipeline.simulator.effects.pointing import PointingErrors
 from storage.archive.keys import StageRef
 from storage.arrays.layout import open_group, read_array
@@ -46,19 +51,15 @@ def surveyed(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], 
     return json.loads(json.dumps(found)), archive
 
 
-def test_coarse_sweeps_are_put_right_by_their_seams(surveyed: tuple[dict[str, Any], Path]) -> None:
-    """What registration finds of every sweep beside the one it held is what the simulator got wrong."""
-    coarse, errors = surveyed[0]["pointing"]["coarse"], PointingErrors(OFF_PX, 0.0, SEED)
+def test_sweeps_are_put_right_by_seams_and_on_the_mosaic(surveyed: tuple[dict[str, Any], Path]) -> None:
+    """What registration finds beside the sweep it held is what the simulator got wrong, within half a pixel."""
+    pointing, errors = surveyed[0]["pointing"], PointingErrors(OFF_PX, 0.0, SEED)
+    coarse = pointing["coarse"]
     assert len(coarse["sweeps"]) > 1
     for name, offset in coarse["sweeps"].items():
         assert np.abs(errors.offset(name) - errors.offset(coarse["held"]) - offset).max() < 0.4
     assert coarse["residual_rms_px"] is None  # windows are no more than unknowns: that they fit says nothing
-
-
-def test_fine_sweeps_are_put_right_on_the_mosaic(surveyed: tuple[dict[str, Any], Path]) -> None:
-    """Every fine sweep that could be compared lies on the mosaic within half a pixel."""
-    pointing, errors = surveyed[0]["pointing"], PointingErrors(OFF_PX, 0.0, SEED)
-    held = errors.offset(pointing["coarse"]["held"])
+    held = errors.offset(coarse["held"])
     told = {
         name: offset for name, offset in pointing["fine"]["sweeps"].items() if name not in pointing["fine"]["not_found"]
     }
@@ -67,23 +68,15 @@ def test_fine_sweeps_are_put_right_on_the_mosaic(surveyed: tuple[dict[str, Any],
         assert np.abs(errors.offset(name) - held - offset).max() < 0.5
 
 
-def test_what_the_mirror_missed_is_told(surveyed: tuple[dict[str, Any], Path]) -> None:
-    """Seats that the fine sweeps saw in part are counted, as their patches say."""
+def test_what_the_mirror_missed_is_told_and_detail_still_helps(surveyed: tuple[dict[str, Any], Path]) -> None:
+    """Seats seen in part are counted, either pass has its sentence, and with patches the map is better than without."""
     receipt, archive = surveyed
     values = read_array(open_group(archive / receipt["products"]["patches"]), "values")
     partly = np.isnan(values).all(axis=3).any(axis=(1, 2))
     assert receipt["pointing"]["fine"]["partly_seen"] == np.count_nonzero(partly)
-
-
-def test_the_mirror_is_told_of_in_words(surveyed: tuple[dict[str, Any], Path]) -> None:
-    """Terminal and report have a sentence for either pass."""
     words = " ".join(sentences(surveyed[0]))
     assert "The coarse sweeps were put right by up to" in words
     assert "The fine sweeps were put right by up to" in words
-
-
-def test_detail_still_helps(surveyed: tuple[dict[str, Any], Path]) -> None:
-    """Patches lie where the map says: with them the map is better than without."""
     accuracy = surveyed[0]["accuracy"]
     assert accuracy["miou"] > accuracy["none"]["miou"]
 
@@ -149,6 +142,38 @@ def test_every_finding_has_its_sentence(case: str) -> None:
     assert sentences(found_of(**told)) == [words]
 
 
-def test_no_fine_sweep_says_nothing() -> None:
-    """A pass without a sweep has no sentence."""
+GRID = SceneGrid(300, 1500, 16, 4)
+OFF = 20.0
+
+
+def shared_px(sweeps: list[Sweep]) -> float:
+    """The least that neighbouring strips share [px]."""
+    camera = parse_settings({}).camera
+    reach = [one.strip_px + reach_px(one.strip_px, GRID.height, camera, one.binning) for one in sweeps]
+    return min(float(left[1] - right[0]) for left, right in pairwise(reach))
+
+
+def test_either_pass_overlaps_and_reaches_by_what_it_needs() -> None:
+    """Neighbours that look as far apart as they can share 64 px, and both ends of the field are seen."""
+    plan = plan_capture(parse_settings({"pointing_px": OFF, "budget": 1.0}), GRID)
+    assert plan.along == "x"
+    assert (plan.overlap_px, plan.margin_px) == (2 * OFF + 64 * 4, 2 * OFF)
+    assert shared_px(plan.coarse) >= plan.overlap_px - 1e-3
+    assert shared_px(plan.full) >= 2 * OFF + 64 - 1e-3
+    assert len(plan.full) == int(np.ceil(1500 / (640 - 2 * OFF - 64)))
+    for sweep in (*plan.coarse, *plan.full):
+        held = sweep.held_px()
+        assert held[0, 0] <= -GRID.height / 2 - 2 * OFF
+        assert held[-1, -1] >= GRID.height / 2 + 2 * OFF
+
+
+def test_a_mirror_that_is_believed_costs_nothing() -> None:
+    """Neither overlaps nor margins nor words; overlaps of a whole line are refused with what could be put right."""
+    settings = parse_settings({"budget": 1.0})
+    plan = plan_capture(settings, GRID)
+    assert plan.overlap_px == 0
+    assert plan.full == full_sweeps(GRID, settings.camera, plan.along)
+    assert plan.coarse == coarse_sweeps(GRID, settings.camera, plan.along)
+    with pytest.raises(SettingsError, match=r"^--pointing-px 192: .* overlap by 640 px .* give less than 192$"):
+        plan_capture(parse_settings({"pointing_px": 192.0}), GRID)
     assert sentences(found_of(held="the mosaic", sweeps={})) == []

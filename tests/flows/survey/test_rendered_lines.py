@@ -56,14 +56,20 @@ def expected() -> list[Line]:
     return list(source_of().lines(SWEEP))
 
 
-@pytest.mark.parametrize(("workers", "size"), [(1, 64), (2, 1), (2, 70), (5, 7)])
-def test_neither_workers_nor_blocks_change_a_number(
-    expected: list[Line], monkeypatch: pytest.MonkeyPatch, workers: int, size: int
+@pytest.mark.parametrize(
+    ("scheduler", "workers", "size"),
+    [  # crews without this process's memory, even of a scheduler that is not there, leave it to threads here
+        *(("threads", 1, 64), ("threads", 2, 1), ("threads", 2, 70), ("threads", 5, 7)),
+        *(("processes", 2, 16), ("tcp://192.0.2.1:8786", 2, 16)),
+    ],
+)
+def test_neither_crew_nor_blocks_change_a_number(
+    expected: list[Line], monkeypatch: pytest.MonkeyPatch, scheduler: str, workers: int, size: int
 ) -> None:
-    """With every effect on, rendered in blocks of 1, 7, 64 and all lines, with nothing remembered from before."""
+    """With every effect on, in blocks of 1, 7, 64 and all lines, with nothing remembered from before."""
     monkeypatch.setattr(simulated, "BLOCK_LINES", size)
     render._looker.cache_clear()
-    assert_same(taken(source_of(), Crew("threads", workers), at_once=size), expected)
+    assert_same(taken(source_of(), Crew(scheduler, workers), at_once=size), expected)
 
 
 @pytest.mark.parametrize("first", [23, 69, 70])
@@ -103,58 +109,43 @@ def test_blocks_wait_for_earlier_ones(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("workers", [2, 4])
 def test_few_blocks_are_held(monkeypatch: pytest.MonkeyPatch, workers: int) -> None:
-    """Begun and not yet taken there is one a worker and one more at most, however slowly lines are taken."""
-    real, begun, count, most = SimulatedSource.lines_of, [], 0, 0
-
-    def counted(self: SimulatedSource, sweep: Sweep, numbers: range) -> list[Line]:
-        begun.append(numbers)
-        return real(self, sweep, numbers)
-
-    def take(line: Line) -> None:
-        nonlocal count, most
-        most = max(most, len(begun) - count // 2)
-        count += 1
-
-    monkeypatch.setattr(SimulatedSource, "lines_of", counted)
-    take_lines(source_of("rotation"), SWEEP, take, Crew("threads", workers), at_once=2)
-    assert (count, len(begun)) == (70, 35)
-    assert most <= workers + 1
-
-
-def test_no_more_are_rendered_at_a_time_than_there_are_workers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The block that is one more is begun when another is done."""
-    real, guard, now, most = SimulatedSource.lines_of, threading.Lock(), 0, 0
+    """One a worker is rendered at a time, and one more waits at most to be taken, however slowly lines are."""
+    real, guard, begun, count = SimulatedSource.lines_of, threading.Lock(), [], 0
+    now = held = most = 0
 
     def counted(self: SimulatedSource, sweep: Sweep, numbers: range) -> list[Line]:
         nonlocal now, most
         with guard:
+            begun.append(numbers)
             now, most = now + 1, max(most, now + 1)
         lines = real(self, sweep, numbers)
         with guard:
             now -= 1
         return lines
 
+    def take(line: Line) -> None:
+        nonlocal held, count
+        held = max(held, len(begun) - count // 2)
+        count += 1
+
     monkeypatch.setattr(SimulatedSource, "lines_of", counted)
-    taken(source_of("rotation"), Crew("threads", 3), at_once=2)
-    assert 1 <= most <= 3
-
-
-def failing_from(line: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let every block with this line or a later one fail."""
-    real: Callable[..., list[Line]] = SimulatedSource.lines_of
-
-    def failing(self: SimulatedSource, sweep: Sweep, numbers: range) -> list[Line]:
-        if numbers[-1] >= line:
-            raise SceneError(f"line {numbers.start} and on")
-        return real(self, sweep, numbers)
-
-    monkeypatch.setattr(SimulatedSource, "lines_of", failing)
+    take_lines(source_of("rotation"), SWEEP, take, Crew("threads", workers), at_once=2)
+    assert (count, len(begun)) == (70, 35)
+    assert 1 <= most <= workers
+    assert held <= workers + 1
 
 
 @pytest.mark.parametrize("workers", [2, 4])
 def test_an_error_comes_when_it_is_its_turn(monkeypatch: pytest.MonkeyPatch, workers: int) -> None:
     """Lines before the first block that fails are taken, and its error is told: no later one's."""
-    failing_from(30, monkeypatch)
+    real: Callable[..., list[Line]] = SimulatedSource.lines_of
+
+    def failing(self: SimulatedSource, sweep: Sweep, numbers: range) -> list[Line]:
+        if numbers[-1] >= 30:
+            raise SceneError(f"line {numbers.start} and on")
+        return real(self, sweep, numbers)
+
+    monkeypatch.setattr(SimulatedSource, "lines_of", failing)
     lines: list[Line] = []
     with pytest.raises(SceneError, match="line 28 and on"):
         take_lines(source_of("rotation"), SWEEP, lines.append, Crew("threads", workers), at_once=7)
@@ -175,9 +166,3 @@ def test_nothing_is_rendered_after_lines_are_refused(error: BaseException) -> No
         take_lines(source_of("rotation"), SWEEP, take, TWO, at_once=7)
     assert lines == list(range(40))
     assert threading.active_count() == before
-
-
-@pytest.mark.parametrize("scheduler", ["processes", "tcp://192.0.2.1:8786"])
-def test_lines_are_rendered_where_the_scene_lies(expected: list[Line], scheduler: str) -> None:
-    """Crews without this process's memory, even of a scheduler that is not there, leave it to threads here."""
-    assert_same(taken(source_of(), Crew(scheduler, 2)), expected)

@@ -1,9 +1,15 @@
-"""What a stage's code is: which definitions are reached, and what leaves their digest alone."""
+"""What a stage is: a module in the folder, and all code that is reached from it; what leaves its digest alone."""
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import pytest
 
+from flows.survey import stages
+from flows.survey.stage import all_stages
+from storage.archive.keys import StageRef
 from tests.flows.survey.stage_closure import Sources
 
 STAGE = """
@@ -63,9 +69,11 @@ def edited(module: str, old: str, new: str) -> dict[str, str]:
     return {module: TEXTS[module].replace(old, new)}
 
 
-def test_names_are_followed_through_imports() -> None:
-    """Default values, annotations, base classes, modules' attributes and imports in functions lead on."""
+def test_names_are_followed_through_imports_up_to_barriers() -> None:
+    """Defaults, annotations, bases, modules' attributes lead on; what is behind a barrier alone is not reached."""
     assert Sources(TEXTS).closure(["stage"]) == REACHED
+    behind = {("models.light", "Lamp"), ("models.light", "STEP"), ("pipeline.shapes", "Shape")}
+    assert Sources(TEXTS).closure(["stage"], ["Lamp"]) == REACHED - behind
 
 
 @pytest.mark.parametrize(
@@ -123,9 +131,7 @@ def test_a_moved_definition_leaves_the_digest() -> None:
     assert digest(moved) == digest({})
 
 
-def test_local_names_are_no_imports() -> None:
-    """A parameter, a loop's variable and a comprehension's that are called as a definition do not reach it."""
-    text = """
+LOCAL_NAMES = """
 from models.light import Lamp, brighter, STEP
 
 def stage(Lamp):
@@ -133,18 +139,8 @@ def stage(Lamp):
         print(brighter)
     return [STEP for STEP in Lamp] + [(lambda stage: stage)(1)]
 """
-    assert Sources(TEXTS | {"flows.survey.stages": text}).closure(["stage"]) == {("flows.survey.stages", "stage")}
-
-
-def test_a_global_beside_a_comprehension_is_reached() -> None:
-    """A comprehension's variable hides a definition in the comprehension alone."""
-    text = "from models.light import STEP\n\ndef stage(x):\n    return [STEP for STEP in x], STEP\n"
-    assert ("models.light", "STEP") in Sources(TEXTS | {"flows.survey.stages": text}).closure(["stage"])
-
-
-def test_registrations_come_with_their_module() -> None:
-    """What registers itself, by a bare statement or a decorator of our own, counts once its module is reached."""
-    text = """
+BESIDE = "from models.light import STEP\n\ndef stage(x):\n    return [STEP for STEP in x], STEP\n"
+REGISTERED = """
 from pipeline.table import KNOWN, register
 
 def stage():
@@ -155,14 +151,7 @@ def one(): return 1
 
 KNOWN.append(2)
 """
-    table = "KNOWN = []\n\ndef register(one):\n    KNOWN.append(one)\n    return one\n"
-    found = Sources({"flows.survey.stages": text, "pipeline.table": table}).closure(["stage"])
-    assert {("flows.survey.stages", ""), ("flows.survey.stages", "one"), ("pipeline.table", "register")} <= found
-
-
-def test_names_in_casts_are_followed() -> None:
-    """A type imported for the checker alone leads to its class."""
-    text = """
+CAST = """
 from typing import TYPE_CHECKING, cast
 
 if TYPE_CHECKING:
@@ -171,13 +160,38 @@ if TYPE_CHECKING:
 def stage(lamp):
     return cast("Lamp", lamp).lit()
 """
-    assert ("pipeline.shapes", "Shape") in Sources(TEXTS | {"flows.survey.stages": text}).closure(["stage"])
+TABLE = "KNOWN = []\n\ndef register(one):\n    KNOWN.append(one)\n    return one\n"
+STAGES_OWN = ("flows.survey.stages", "stage")
 
 
-def test_a_barrier_ends_the_way() -> None:
-    """What is behind a barrier alone is not reached, nor the barrier."""
-    behind = {("models.light", "Lamp"), ("models.light", "STEP"), ("pipeline.shapes", "Shape")}
-    assert Sources(TEXTS).closure(["stage"], ["Lamp"]) == REACHED - behind
+@pytest.mark.parametrize(
+    ("text", "reached"),
+    [
+        (BESIDE, {STAGES_OWN, ("models.light", "STEP")}),
+        (LOCAL_NAMES, {STAGES_OWN}),
+        (
+            CAST,
+            {
+                STAGES_OWN,
+                *(REACHED & {("models.light", name) for name in ("Lamp", "STEP")}),
+                ("pipeline.shapes", "Shape"),
+            },
+        ),
+        (
+            REGISTERED,
+            {
+                *((STAGES_OWN[0], name) for name in ("stage", "one", "")),
+                ("pipeline.table", "KNOWN"),
+                ("pipeline.table", "register"),
+            },
+        ),
+    ],
+    ids=["a global beside a comprehension", "local names", "a type in a cast", "registrations"],
+)
+def test_what_names_lead_to(text: str, reached: set[tuple[str, str]]) -> None:
+    """Local names hide definitions; what registers itself comes with its module; types for the checker count."""
+    code = Sources(TEXTS | {"flows.survey.stages": text, "pipeline.table": TABLE})
+    assert code.closure(["stage"]) == reached
 
 
 def test_a_name_must_say_which() -> None:
@@ -188,3 +202,38 @@ def test_a_name_must_say_which() -> None:
         code.named("stage")
     with pytest.raises(LookupError, match="called gone, found it in no module"):
         code.named("gone")
+
+
+ADDED = """
+from flows.survey.stage import Product, Wanted, stage
+
+@stage("count_pixels", "pixels counted", Product("count", 1), of=("draw_map",), after=("ground",), unit="pixels")
+def count_pixels(run, class_map):
+    return Wanted(lambda path: None, {}, [class_map])
+"""
+
+
+def test_stages_run_once_what_they_are_made_of_has() -> None:
+    """The order of a survey follows from the records; what judges comes last."""
+    order = list(all_stages())
+    for name, one in all_stages().items():
+        assert all(order.index(before) < order.index(name) for before in (*one.of, *one.after))
+    assert [name for name, one in all_stages().items() if one.judges] == order[-1:]
+
+
+def test_a_module_is_all_that_a_stage_takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is found and stands after what it names; nothing else had to know of it."""
+    (tmp_path / "counting.py").write_text(ADDED)
+    monkeypatch.setattr(stages, "__path__", [*stages.__path__, str(tmp_path)])
+    found = all_stages.__wrapped__()
+    monkeypatch.delitem(sys.modules, "flows.survey.stages.counting")
+    assert set(found) - set(all_stages()) == {"count_pixels"}
+    assert list(found).index("count_pixels") > list(found).index("ground")
+    assert found["count_pixels"].addresses(StageRef("count", "abc", tmp_path)) == {"count_pixels": "stages/count/abc"}
+
+
+def test_every_stage_says_once_what_receipts_call_its_store() -> None:
+    """No two stages share a name in receipts, and each has one at least."""
+    named = [one.addresses(StageRef(one.product.name, "abc", Path())) for one in all_stages().values()]
+    assert all(named)
+    assert len({name for one in named for name in one}) == sum(map(len, named))

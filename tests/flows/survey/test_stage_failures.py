@@ -29,8 +29,7 @@ from pipeline.errors import ArchiveError, RigError
 from storage.archive.archive import Archive
 from storage.archive.ledger import Ledger
 from storage.arrays.class_maps import load_class_map
-from storage.remote.opening import verify_archive
-from tests.flows.conftest import Ended
+from tests.flows.conftest import Ended, problems
 
 CAPTURES = ("capture_coarse", "capture_fine")
 NO_REPLY = "no reply from the camera after 2 s; is it on?"
@@ -59,11 +58,6 @@ def failing(stage: str, error: Exception, tried: Callable[[], None] = lambda: No
         return replace(wanted, build=broken)
 
     return replace(real, wants=fail)
-
-
-def problems(out: Path) -> list[Any]:
-    """What a full verification of an archive finds."""
-    return [finding for finding in verify_archive(Archive.open(out)) if finding.problem]
 
 
 def class_map(out: Path) -> np.ndarray:

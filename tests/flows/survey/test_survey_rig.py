@@ -356,15 +356,11 @@ def told_on_the_command_line(command_line: CommandLine, tmp_path: Path, **rig: A
 
 @pytest.mark.parametrize(
     ("port", "words"),
-    [
-        ("/dev/ttyNONE", "/dev/ttyNONE"),
-        ("/dev/null", "/dev/null cannot be opened"),
-        ("/dev/null", "is it a serial port"),
-    ],
+    [("/dev/ttyNONE", "/dev/ttyNONE"), ("/dev/null", "/dev/null cannot be opened.*is it a serial port")],
 )
 def test_what_is_no_port(command_line: CommandLine, tmp_path: Path, port: str, words: str):
     """A port that is not there, and a name that opens and is none."""
-    assert words in told_on_the_command_line(command_line, tmp_path, port=port)
+    assert re.search(words, told_on_the_command_line(command_line, tmp_path, port=port))
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import pytest
 
 from pipeline.errors import RigError
 from storage.archive.archive import Archive
-from storage.remote.opening import verify_archive
+from tests.flows.conftest import problems
 
 
 # (1) What your flow does, as plain functions: arrays and files stay in here, an address and a key go out.
@@ -67,4 +67,4 @@ def test_the_flow(server: None, tmp_path: Path) -> None:
     assert state.is_failed()
     with pytest.raises(RigError, match="is it on"):
         state.result()
-    assert [finding for finding in verify_archive(Archive.open(tmp_path / "archive")) if finding.problem] == []
+    assert problems(tmp_path / "archive") == []

@@ -86,25 +86,21 @@ def test_a_folder_that_is_not_ours_alone_is_not_used(trap: str, temporary: Path,
     assert not any((tmp_path / "theirs").iterdir()) if trap == "link" else True
 
 
-def test_a_user_unknown_to_the_system_has_a_home_that_is_not_there(
-    temporary: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As Debian's users without one: libraries that ask where it is are told, and cannot write there."""
+def test_users_without_anything_are_told(temporary: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A home that is not there as on Debian; where nothing can be written, what to set."""
     monkeypatch.setattr(pwd, "getpwuid", lambda number: {}[number])
     environment: dict[str, str] = {}
     assert place_caches(environment) is not None
     assert environment["HOME"] == "/nonexistent"
-
-
-def test_nothing_to_write_to_is_one_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It names what to set."""
     monkeypatch.setattr(tempfile, "tempdir", NOWHERE)
     with pytest.raises(SettingsError, match=r"neither a home nor a temporary folder .* set XDG_CACHE_HOME to a folder"):
         place_caches({"HOME": NOWHERE})
 
 
-def test_prefects_pages_are_unpacked_where_that_is_possible(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Beside Prefect's code where that can be written, else in the cache folder."""
+def test_prefect_writes_where_that_is_possible(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, temporary: Path
+) -> None:
+    """Pages beside its code or in the cache folder; the runner's folder goes with the process."""
     environment = {"XDG_CACHE_HOME": str(tmp_path)}
     monkeypatch.setattr(os, "access", lambda *_: True)
     assert place_pages(environment) == {}
@@ -112,10 +108,6 @@ def test_prefects_pages_are_unpacked_where_that_is_possible(tmp_path: Path, monk
     assert place_pages(environment) == {
         "PREFECT_SERVER_UI_STATIC_DIRECTORY": str(tmp_path / "spectralzoom" / "prefect-pages")
     }
-
-
-def test_prefects_runner_has_a_temporary_folder_of_its_own(temporary: Path) -> None:
-    """Its /tmp/runner_storage belongs to the first user who runs one; ours goes with the process."""
     from prefect.runner import Runner
 
     with own_temporary_folder():

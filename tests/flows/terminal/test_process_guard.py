@@ -1,7 +1,8 @@
-"""Processes bound to this one: they end with it, are let go of when they have ended, and are started again."""
+"""Processes: bound to this one, they end with it; what a machine refuses them is one message."""
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
@@ -13,7 +14,8 @@ from pathlib import Path
 import pytest
 
 from flows.terminal import processes
-from flows.terminal.processes import KeptProcess, end_with_us
+from flows.terminal.processes import KeptProcess, end_with_us, refusal_words
+from tests.flows.conftest import python
 from tests.soak.processes import children_of, is_alive
 
 SLEEPS = [sys.executable, "-c", "import time; print('up', flush=True); time.sleep(60)"]
@@ -36,10 +38,7 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 def killed_beside_a_child(*words: str) -> int:
     """Have a process killed that bound another to itself; gives the other."""
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
-    ended = subprocess.run(
-        [sys.executable, "-c", ENDS, *words], env=environment, capture_output=True, text=True, check=False
-    )
+    ended = python(ENDS, *words)
     assert ended.returncode == -signal.SIGKILL
     return int(ended.stdout)
 
@@ -65,13 +64,9 @@ def held() -> tuple[int, list[int]]:
     return len(list(Path("/proc/self/fd").iterdir())), children_of(os.getpid())
 
 
-def test_a_killed_process_leaves_none_behind() -> None:
-    """What was bound to end with a process does so when it is killed."""
+def test_a_killed_process_leaves_none_behind_but_what_it_let_go_of() -> None:
+    """What was bound to it ends with it; a number that was let go of may be a stranger's."""
     assert wait_until_gone(killed_beside_a_child())
-
-
-def test_what_was_let_go_of_is_left_alone() -> None:
-    """A number that was let go of may be a stranger's: nothing is sent to it when the process that held it ends."""
     stranger = killed_beside_a_child("let go")
     try:
         assert not wait_until_gone(stranger, 0.5)
@@ -116,8 +111,10 @@ def test_a_kept_process_is_started_again_and_nothing_piles_up(kept: KeptProcess)
     assert held() == before
 
 
-def test_a_kept_process_that_does_not_listen_is_killed(tmp_path: Path) -> None:
-    """After its patience it is ended all the same."""
+def test_a_kept_process_is_ended_and_its_log_begun_anew(
+    tmp_path: Path, kept: KeptProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What does not listen is ended all the same; what was said is kept until it is too much."""
     deaf = KeptProcess(DEAF, tmp_path / "log", 0.1)
     before = held()
     deaf.keep_up()
@@ -126,10 +123,6 @@ def test_a_kept_process_that_does_not_listen_is_killed(tmp_path: Path) -> None:
     deaf.stop()
     assert held() == before
     assert "over" not in deaf.log.read_text()
-
-
-def test_a_log_that_has_grown_is_begun_anew(kept: KeptProcess, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What was said is kept from start to start until it is too much."""
     kept.log.parent.mkdir()
     kept.log.write_text("before\n")
     kept.keep_up()
@@ -139,3 +132,46 @@ def test_a_log_that_has_grown_is_begun_anew(kept: KeptProcess, monkeypatch: pyte
     kept.keep_up()
     kept.stop()
     assert "before" not in kept.log.read_text()
+
+
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (MemoryError("Unable to allocate 25.3 MiB for an array"), "memory ran out: Unable to allocate 25.3 MiB"),
+        (MemoryError(), "memory ran out: the machine has no more"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 8 bytes."), "ask for less"),
+        (RuntimeError("can't start new thread"), "memory ran out: can't start new thread"),
+        (OSError(errno.EFBIG, "File too large", "/a/b"), "read or write /a/b: a file may not grow so large here"),
+        (OSError(errno.ENOSPC, "No space left on device"), "the disk is full"),
+        (OSError(errno.ENOENT, "No such file"), None),
+        (ImportError("libx.so: failed to map segment from shared object"), None),
+        (ZeroDivisionError("division by zero"), None),
+    ],
+)
+def test_words(error: Exception, words: str | None) -> None:
+    """What was refused and what to do; other errors stay what they are."""
+    found = refusal_words(error)
+    assert found is None if words is None else words in str(found)
+
+
+@pytest.mark.parametrize(
+    ("limit", "words"),
+    [
+        ("ulimit -v 1000000", "error: memory ran out: "),
+        ("ulimit -f 100", "may not grow so large here: raise ulimit -f"),
+    ],
+)
+def test_a_survey_within_narrow_limits(tmp_path: Path, limit: str, words: str) -> None:
+    """An address space of 1 GB, files of 100 kB: one message, exit code 1, and no report of a defect."""
+    survey = (
+        f"{sys.executable} -m flows.cli.main survey --scene farm --size 64x64 --engine plain --out {tmp_path / 'a'}"
+    )
+    command = ["sh", "-c", f"{limit}; exec {survey}"]
+    ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    errors = [line for line in ended.stderr.splitlines() if line.startswith("error: ")]
+    assert (ended.returncode, len(errors)) == (1, 1), ended.stderr
+    assert words in errors[0]
+    assert "defect" not in ended.stderr

@@ -1,4 +1,4 @@
-"""What reaches terminal and pages: names and devices' words as escapes, whatever prints them."""
+"""What reaches terminal, log and pages: progress, and names and devices' words as escapes, whatever prints them."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 from rich.markup import escape
 from rich.panel import Panel
 from rich.progress import Progress
@@ -18,7 +19,7 @@ from rich.tree import Tree
 
 from flows.publish.report import render_markdown
 from flows.schedule.history import FieldHistory, render_history, render_index
-from flows.terminal.progress import Terminal
+from flows.terminal.progress import StageProgress, Terminal
 from pipeline.errors import is_visible
 from storage.archive.whole_files import to_json
 
@@ -51,17 +52,13 @@ def test_nothing_that_is_printed_steers_the_terminal(thing: Callable[[str], Any]
     assert "\\u202e" in file.getvalue()
 
 
-def test_bars_show_names_as_escapes() -> None:
-    """A bar moves the cursor itself, and nothing else does."""
+def test_bars_and_json_show_names_as_escapes() -> None:
+    """A bar moves the cursor itself, nothing else does; JSON reads back as it was."""
     file = io.StringIO()
     with Progress(console=Terminal(file=file, width=200, force_terminal=True, color_system=None)) as bars:
         bars.add_task(escape(HOSTILE), total=1)
     assert "\x1b]0" not in file.getvalue()
     assert "\u202e" not in file.getvalue()
-
-
-def test_json_says_the_same_in_escapes() -> None:
-    """Printed JSON steers no terminal, and reads back as it was."""
     content = {HOSTILE: [HOSTILE, "Süd 🌾"]}
     text = to_json(content)
     assert all(is_visible(letter) for letter in text)
@@ -137,3 +134,70 @@ def test_every_console_is_a_terminal() -> None:
             if isinstance(node, ast.ImportFrom) and node.module in ("html", "jinja2") and path.name != "report.py":
                 made.append(path.name)
     assert made == []
+
+
+TERMINAL = {"force_terminal": True, "color_system": None, "width": 160}
+
+
+def progress_of(steps: Callable[[StageProgress], None], **console: Any) -> str:
+    """What is written while stages go on; in a log, unless the console is a terminal."""
+    out = io.StringIO()
+    with StageProgress(Console(file=out, **console), {"rectify": "mosaic"}) as progress:
+        steps(progress)
+    return out.getvalue()
+
+
+def test_a_log_gets_one_line_when_a_stage_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where there is no terminal nothing is drawn over; of a long stage the words come with the line that is due."""
+
+    def steps(progress: StageProgress) -> None:
+        for done in (0.1, 0.5, 0.9):
+            progress.show("rectify", done)
+        progress.show("rectify", 1.0, "ran", ended=True)
+
+    def long(progress: StageProgress) -> None:
+        progress.show("rectify", 0.0)
+        progress.say("fetching 3 of 55 MB")
+
+    assert progress_of(steps).splitlines() == ["mosaic: 100% ran"]
+    monkeypatch.setattr("flows.terminal.progress.LINE_EVERY_S", -1.0)
+    assert progress_of(long).splitlines()[-1] == "mosaic: 0% fetching 3 of 55 MB"
+
+
+@pytest.mark.parametrize("console", [{}, TERMINAL], ids=["log", "terminal"])
+def test_words_of_a_scene_are_not_markup(console: dict[str, Any]) -> None:
+    """A name in square brackets is shown, not read as a style."""
+    assert "[red]field[/]" in progress_of(lambda one: one.show("looking", 1.0, "[red]field[/]", ended=True), **console)
+    bar = progress_of(lambda one: one.show("looking", 0.5, "[red]field[/]"), **TERMINAL)
+    assert "[red]field[/]" in bar
+
+
+def test_words_go_beside_the_stage_that_runs() -> None:
+    """What is said while nothing counts stands beside the stage that runs, and nowhere once that has ended."""
+
+    def steps(progress: StageProgress) -> None:
+        progress.say("before any stage")
+        progress.show("looking", 0.25)
+        progress.say("fetching 3 of 55 MB")
+        progress.show("looking", 1.0, "ran", ended=True)
+        progress.say("afterwards")
+
+    told = progress_of(steps, **TERMINAL)
+    assert [words in told for words in ("before any stage", "afterwards", "looking", "ran")] == [
+        False,
+        False,
+        True,
+        True,
+    ]
+
+
+def test_a_narrow_terminal_keeps_bars_and_times() -> None:
+    """In 80 columns words stand where the time left would, cut off at the end of the line; nothing else gives way."""
+
+    def steps(progress: StageProgress) -> None:
+        progress.show("what lines turned by 90 degrees would show", 0.5)
+        progress.say("fetching a file of a long name: 12.3 of 129.0 MB")
+
+    lines = progress_of(steps, **{**TERMINAL, "width": 80}).splitlines()
+    assert any("━" in line and "0:00:00 fetching a file" in line and "…" in line for line in lines)
+    assert any("0:00:00 left" in line for line in lines)

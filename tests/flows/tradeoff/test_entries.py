@@ -48,17 +48,13 @@ from pipeline.rectify.registration.shifts import PairShift
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 
 
-def test_waves_are_what_they_claim():
-    """The analytic scene holds periods of 4 to 40 px only and is the same for the same seed."""
+def test_waves_and_noise_levels_are_what_they_claim():
+    """Periods of 4 to 40 px, the same for a seed; a tenth of shot and read noise, and half a step."""
     waves = draw_waves(3, 64, PERIODS_PX)
     period = 1 / np.hypot(*waves.frequency.T)
     assert period.min() >= 4
     assert period.max() <= 40
     np.testing.assert_array_equal(waves.at(np.ones((1, 2))), draw_waves(3, 64, PERIODS_PX).at(np.ones((1, 2))))
-
-
-def test_noise_levels_follow_the_camera():
-    """Half the converter's range at a contrast of 0.2: a tenth of shot and read noise, and half a step."""
     camera = LineCamera()
     electrons = camera.full_well_e / 2
     noise, step = (level.error * 0.2 * electrons for level in noise_levels(camera))
@@ -66,22 +62,14 @@ def test_noise_levels_follow_the_camera():
     assert step == pytest.approx(2.5)
 
 
-def test_resampling_kernels_rank_by_error():
-    """More taps are more exact on 4-40 px content; nearest errs by 24 % of the scene's deviation (erratum E10)."""
+def test_errors_of_rectification_are_those_known():
+    """Kernels by their taps (erratum E10), line models of a large field, ties with the square of their distance."""
     result = measure_tradeoff(RESAMPLE, repeats=1)
     nearest, bilinear, cubic = (point.error for point in result.points)
     assert (nearest, bilinear, cubic) == pytest.approx((0.24, 0.093, 0.029), rel=0.03)
-
-
-def test_line_models_get_better_to_the_exact():
-    """Over the field of 10240 x 10240 px no rotation errs by 307 px, the slope by 185, exact rays by nothing."""
     errors = [point.error for point in measure_tradeoff(LINE_MODEL, repeats=1).points]
     assert errors[:4] == pytest.approx([307, 185, 183, 12.2], rel=0.01)
     assert errors[4] == 0
-
-
-def test_ties_sixteen_apart_keep_the_goal():
-    """The greatest error grows with the square of the distance, is 1.6e-3 px at 16, and rounding without ties."""
     errors = {point.setting: point.error for point in measure_tradeoff(TIE_SPACING, repeats=1).points}
     assert errors[1] < 1e-9
     assert errors[16] == pytest.approx(1.61e-3, rel=0.02)
@@ -89,14 +77,10 @@ def test_ties_sixteen_apart_keep_the_goal():
 
 
 def test_wider_overlaps_find_shifts_better():
-    """Every overlap finds the known shifts to 0.1 px, and the widest at least three times better than the narrowest."""
+    """All find them to 0.1 px, the widest three times better; where most are not decided there is no error."""
     errors = [point.error for point in measure_tradeoff(OVERLAP, repeats=1).points]
     assert max(errors) < 0.1
     assert errors[-1] < errors[0] / 3
-
-
-def test_undecided_shifts_count_as_infinitely_far():
-    """Where most pairs are not decided there is no error to tell."""
     state = Seams([], np.zeros((3, 2)))
     unknown = np.full(2, np.nan)
     undecided, decided = PairShift("undecidable", unknown, unknown), PairShift("found", np.array([0.0, 0.3]), unknown)
@@ -125,8 +109,8 @@ def test_a_larger_budget_takes_more_seconds_and_draws_a_better_map(monkeypatch):
     assert 0 < whole.error < half.error < 0.5
 
 
-def test_fewer_bits_are_smaller_and_change_more_of_the_map(monkeypatch):
-    """Kept bits of the mosaic: at eleven hardly a class changes, at three many do, in fewer bytes."""
+def test_fewer_bits_and_codecs_are_smaller(monkeypatch):
+    """At eleven kept bits hardly a class changes, at three many; every codec stores a sample in under two bytes."""
     monkeypatch.setattr(tradeoff_farm, "STORE_SHAPE", (128, 192))
     state = BITS.prepare(0)
     judged = {kept: BITS.judge(state, kept, BITS.run(state, kept)) for kept in (23.0, 11.0, 3.0)}
@@ -134,10 +118,6 @@ def test_fewer_bits_are_smaller_and_change_more_of_the_map(monkeypatch):
     assert judged[23.0] == 0
     assert judged[11.0] < 2e-3 < judged[3.0]
     assert sizes[3.0] < sizes[11.0] < sizes[23.0]
-
-
-def test_codecs_give_back_raw_lines_in_fewer_bytes(monkeypatch):
-    """Every codec but none stores a sample of uint16 in less than two bytes."""
     monkeypatch.setattr(tradeoff_farm, "STORE_SHAPE", (128, 192))
     state = CODEC.prepare(0)
     sizes = {codec: CODEC.judge(state, codec, CODEC.run(state, codec)) for codec in CODEC.settings}
@@ -178,37 +158,21 @@ def errors(farm: Farm, number: int) -> dict[object, float]:
     return {setting: entry.judge(farm, setting, entry.run(farm, setting)) for setting in entry.settings}
 
 
-def test_the_stage_has_its_knobs_against_labels_and_against_everything():
-    """Seats, precision and bands are registered with both errors, the reference's setting first."""
+def test_knobs_and_levels_of_segmenting(farm: Farm):
+    """Seats, precision and bands with both errors; the map of everything captured again differs."""
     assert find_tradeoffs("segment") == (SEATS, PRECISION, BAND_COUNT, *AGREEMENT)
     assert (SHARES[0], PRECISIONS[0], BANDS[0]) == (1.0, "float32", 270.0)
-
-
-def test_every_seat_is_the_reference_and_fewer_are_not(farm: Farm):
-    """Nothing differs with all seats; with none the map differs most."""
-    found = errors(farm, 0)
-    assert found[1.0] == 0
-    assert 0 < found[0.35] < found[0.0] == max(found.values())
-
-
-def test_half_precision_agrees_nearly_everywhere(farm: Farm):
-    """At most half a percent of the classes change."""
-    found = errors(farm, 1)
-    assert found["float32"] == 0
-    assert 0 <= found["bfloat16"] <= 0.005
-
-
-def test_all_bands_are_the_reference_and_few_differ_most(farm: Farm):
-    """The same pixels in fewer bands change more of the map."""
-    found = errors(farm, 2)
-    assert found[270.0] == 0
-    assert found[90.0] < found[4.0]
-
-
-def test_levels_are_those_of_the_reference_and_of_noise(farm: Farm):
-    """The map of everything captured again differs, and both errs against the labels as they are."""
     (noise,) = AGREEMENT[0].levels(farm)
     everything, again = SEATS.levels(farm)
     assert 0 < noise.error < 0.5
     assert everything.error == SEATS.judge(farm, 1.0, SEATS.run(farm, 1.0))
     assert 0 < again.error < 1
+
+
+def test_the_first_setting_is_the_reference_and_less_differs(farm: Farm):
+    """Nothing differs with all seats, floats or bands; with no seat most does, by half precision 0.5 % at most."""
+    seats, precision, bands = (errors(farm, number) for number in range(3))
+    assert seats[1.0] == precision["float32"] == bands[270.0] == 0
+    assert 0 < seats[0.35] < seats[0.0] == max(seats.values())
+    assert 0 <= precision["bfloat16"] <= 0.005
+    assert bands[90.0] < bands[4.0]

@@ -84,50 +84,29 @@ def spend(clock, seconds):
     return 0.0
 
 
-def test_errors_are_judged_against_the_reference():
-    """The error of a series that stops is its known remainder."""
+def test_every_setting_is_judged_and_runs_in_turn():
+    """A series that stops errs by its remainder; rounds start at another setting each; at least one is needed."""
     for point in measure_tradeoff(SERIES, repeats=1).points:
         assert point.error == pytest.approx(1 / float(point.setting), rel=1e-3)
+    with pytest.raises(SettingsError, match="at least 1, got 0"):
+        measure_tradeoff(SERIES, repeats=0)
+    seen: list[float] = []
+    watched = replace(SERIES, settings=(1.0, 2.0, 3.0), run=lambda truth, terms: seen.append(float(terms)) or 0.0)
+    measure_tradeoff(watched, repeats=2)
+    assert seen == [1, 2, 3, 1, 2, 3, 2, 3, 1]
 
 
-def test_only_run_is_timed(clock):
-    """Preparing, warming up and judging take long without a setting's price knowing of it."""
-    timed = replace(
-        SERIES,
-        settings=(1.0, 4.0),
-        prepare=lambda seed: spend(clock, 100),
-        work=lambda truth, terms: 5.0,
-        run=lambda truth, terms: spend(clock, terms),
-        judge=lambda truth, terms, out: spend(clock, 100),
-    )
-    first, second = measure_tradeoff(timed, repeats=2).points
-    assert (first.cpu_min_s, first.wall_min_s, second.cpu_min_s, second.wall_min_s) == (1, 2, 4, 8)
-    assert (second.price_s, second.ratio, second.ns_per_unit) == (4, 4, 0.8e9)
-
-
-def test_least_time_is_the_price_and_median_ratio_stands_beside(clock):
-    """A machine that halts for a while raises neither: rounds of 4, 2 and 9 s against 2, 2 and 3 s."""
+def test_least_times_are_the_price_and_the_floor(clock, monkeypatch):
+    """A machine that halts for a while raises neither price nor the floor of copying the bytes."""
     turns = iter((1.0, 1.0, 2.0, 4.0, 2.0, 2.0, 3.0, 9.0))  # the second round begins with the second setting
     halting = replace(SERIES, settings=(1.0, 2.0), run=lambda truth, terms: spend(clock, next(turns)))
     second = measure_tradeoff(halting, repeats=3).points[1]
     assert (second.cpu_min_s, second.cpu_median_s, second.wall_median_s) == (2, 4, 8)
     assert second.ratio == 2
-
-
-def test_memory_floor_is_the_least_time_of_copying_the_bytes(clock, monkeypatch):
-    """A copy reads and writes every byte: 64 MiB in 2^27 ns are 1 ns a byte, and the slower rounds do not count."""
     turns = iter((3.0, 1.0, 2.0))
     monkeypatch.setattr(tradeoff_module.np, "copyto", lambda *_: spend(clock, next(turns) * 2**27 * 1e-9))
     result = measure_tradeoff(replace(SERIES, moved_bytes=6.0), repeats=3)
     assert result.memory_floor_ns == pytest.approx(6.0)
-
-
-def test_repeats_are_interleaved():
-    """Every round runs every setting once and starts at another one; one run of each comes before, to be judged."""
-    seen: list[float] = []
-    watched = replace(SERIES, settings=(1.0, 2.0, 3.0), run=lambda truth, terms: seen.append(float(terms)) or 0.0)
-    measure_tradeoff(watched, repeats=2)
-    assert seen == [1, 2, 3, 1, 2, 3, 2, 3, 1]
 
 
 def test_settings_run_on_one_thread():
@@ -142,8 +121,8 @@ def test_settings_run_on_one_thread():
         torch.set_num_threads(before)
 
 
-def test_modelled_seconds_are_the_price(clock):
-    """A stage whose time is not spent here is priced by its model, ratio included; the clock's figures stay beside."""
+def test_only_run_is_timed_or_its_modelled_seconds(clock):
+    """Preparing, warming up and judging cost nothing; a stage whose time is not spent here is priced by its model."""
     modelled = replace(
         SERIES,
         settings=(1.0, 3.0),
@@ -152,6 +131,17 @@ def test_modelled_seconds_are_the_price(clock):
     )
     point = measure_tradeoff(modelled, repeats=1).points[1]
     assert (point.price_s, point.ratio, point.wall_min_s) == (180, 3, 1)
+    timed = replace(
+        SERIES,
+        settings=(1.0, 4.0),
+        prepare=lambda seed: spend(clock, 100),
+        work=lambda truth, terms: 5.0,
+        run=lambda truth, terms: spend(clock, terms),
+        judge=lambda truth, terms, out: spend(clock, 100),
+    )
+    first, second = measure_tradeoff(timed, repeats=2).points
+    assert (first.cpu_min_s, first.wall_min_s, second.cpu_min_s, second.wall_min_s) == (1, 2, 4, 8)
+    assert (second.price_s, second.ratio, second.ns_per_unit) == (4, 4, 0.8e9)
 
 
 @given(st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), min_size=1, max_size=12))
@@ -167,16 +157,12 @@ def test_pareto_points_are_those_that_nobody_beats(pairs):
         assert bool(better) != point.pareto
 
 
-def test_point_without_an_error_never_wins():
-    """A setting that failed (NaN) is not on the front and is never recommended."""
+def test_one_number_finds_the_cheapest_setting():
+    """An accuracy gives the cheapest setting that reaches it, or None; one that failed never wins."""
     points = mark_pareto([make_point(math.nan, 0.1), make_point(0.5, 1.0)])
     assert [point.pareto for point in points] == [False, True]
     result = replace(measure_tradeoff(SERIES, repeats=1), points=points)
     assert cheapest_within(result, 10) is points[1]
-
-
-def test_one_number_finds_the_setting():
-    """An accuracy gives the cheapest setting that reaches it; out of reach is None."""
     points = tuple(make_point(error, price) for error, price in ((0.3, 1.0), (0.1, 2.0), (0.1, 3.0), (0.01, 9.0)))
     result = replace(measure_tradeoff(SERIES, repeats=1), points=points)
     assert cheapest_within(result, 0.1) is points[1]
@@ -196,21 +182,11 @@ def test_registry_finds_all_knobs_of_a_stage(monkeypatch):
         find_tradeoffs("serie")
 
 
-def test_no_repeats_are_refused():
-    """At least one timed round is needed."""
-    with pytest.raises(SettingsError, match="at least 1, got 0"):
-        measure_tradeoff(SERIES, repeats=0)
-
-
 def test_result_is_json_and_names_the_machine():
-    """The result survives JSON with load, threads and versions."""
+    """With load, threads and versions; neither NaN nor infinity is in it."""
     found = json.loads(json.dumps(measure_tradeoff(SERIES, repeats=1).to_dict()))
     assert {"processor", "cores", "threads", "versions", "load_before"} <= set(found["machine"])
     assert found["points"][0]["ns_per_unit"] > 0
-
-
-def test_errors_that_json_cannot_hold_become_null():
-    """Neither NaN nor infinity, which other readers of JSON refuse, is in the result."""
     points = (make_point(math.nan, 1.0), make_point(math.inf, 1.0), make_point(0.5, 1.0))
     result = replace(measure_tradeoff(SERIES, repeats=1), points=points)
     found = json.loads(json.dumps(result.to_dict(), allow_nan=False))
@@ -228,9 +204,12 @@ def printed(result: Result, width: int = 140) -> str:
 
 
 def test_table_goes_from_the_most_exact_setting_down():
-    """What comes first errs least."""
+    """What errs least comes first; 80 columns cut no setting's name; a single repeat is one."""
     words = printed(measure_tradeoff(SERIES, repeats=1))
     assert words.index("64000.0") < words.index("16000.0") < words.index(" 4000.0")
+    words = printed(replace(measure_tradeoff(SERIES, repeats=1), points=(NAMED,)), width=80)
+    assert NAMED.setting in words
+    assert "1 repeat in turn" in words
 
 
 def test_floors_are_those_that_an_entry_declares(tmp_path):
@@ -248,13 +227,6 @@ def test_floors_are_those_that_an_entry_declares(tmp_path):
     bare = measure_tradeoff(SERIES, repeats=1)
     assert (bare.levels, bare.memory_floor_ns) == ((), None)
     assert "within" not in printed(bare)
-
-
-def test_settings_are_read_in_full_on_a_narrow_terminal():
-    """80 columns cut no setting's name, and a single repeat is one."""
-    words = printed(replace(measure_tradeoff(SERIES, repeats=1), points=(NAMED,)), width=80)
-    assert NAMED.setting in words
-    assert "1 repeat in turn" in words
 
 
 def test_figure_tells_winners_from_beaten_and_exact_from_small():

@@ -59,14 +59,10 @@ def errors(entry: Tradeoff, state: object) -> dict[object, float]:
 
 
 def test_the_stage_has_its_knobs_the_exact_setting_first():
-    """Tolerance, slit, groups of bands, bands, supersampling and noise are what the simulator trades."""
+    """Tolerance, slit, groups, bands, supersampling and noise; a variant that an effect gains is measured unasked."""
     found = find_tradeoffs("simulate")
     assert set(found) == {TOLERANCE, FOOTPRINT, GROUP_COUNT, BAND_COUNT, SUPERSAMPLING, NOISE, DIM_NOISE}
     assert [entry.settings[0] for entry in (TOLERANCE, FOOTPRINT, GROUP_COUNT)] == [EXACT, SLIT.variants[0], EACH]
-
-
-def test_variants_are_those_that_effects_have():
-    """A variant that an effect gains is measured without a word here."""
     assert FOOTPRINT.settings == (*SLIT.variants, OFF)
     assert NOISE.settings == (*SHOT.variants, OFF)
     assert set(SLIT.variants) < set(SUPERSAMPLING.settings)
@@ -84,30 +80,13 @@ def test_what_is_chosen_keeps_its_bound_and_the_bound_its_tolerance(lines: FarmL
     assert found[TOLERANCES[-1]] > 0
 
 
-def test_finer_boxes_are_nearer_to_the_footprint(lines: FarmLines):
-    """The finest is the reference, and a mere ray errs by the most."""
-    found = errors(FOOTPRINT, Seen(lines, seen_by(lines)))
-    assert found[SLIT.variants[0]] == 0
-    assert found[OFF] == max(found.values()) > 10 * found[SLIT.variants[1]]
-
-
-def test_figures_of_a_change_by_hand():
-    """Two samples of 400 and 10,000 electrons, the first 30 brighter: in its noise, by the root of two less, in DN."""
+def test_figures_by_hand():
+    """Of a change of 30 electrons, and of keystone shared by two, one, or as many groups as bands."""
     against = Against(np.array([[[400.0, 1e4]]], np.float32), np.array([[[30.0, 100.0]]], np.float32), 5.0)
     light = against.exact + np.array([30.0, 0.0], np.float32)
     assert (against.greatest(light), against.greatest_dn(light)) == pytest.approx((1.0, 6.0))
     assert against.rms(light) == pytest.approx(math.sqrt(0.5))
     assert [level.error for level in against.levels()] == pytest.approx([0.1, 2.5 / 30])
-
-
-def test_an_effect_is_put_in_another_variant_or_left_out(lines: FarmLines):
-    """The order of the others stays."""
-    assert list(with_variant(lines.footprint, SLIT, "1x1")) == list(lines.footprint)
-    assert SLIT not in with_variant(lines.footprint, SLIT, OFF)
-
-
-def test_bands_of_a_group_share_the_mean_blur():
-    """Keystone from -k/2 to k/2 in two groups is -k/4 and k/4; in one nothing; and in as many as bands its own."""
     rig, nm = Rig(), np.linspace(400, 1000, 270)
     k = rig.optics.keystone_px
     two = Shared(KEYSTONE, 2).moments(rig, nm, "linear").shift[0]
@@ -118,8 +97,21 @@ def test_bands_of_a_group_share_the_mean_blur():
     np.testing.assert_allclose(Shared(KEYSTONE, 270).moments(rig, nm, "linear").shift, own)
 
 
+def test_finer_boxes_are_nearer_to_the_footprint(lines: FarmLines):
+    """The finest is the reference, a mere ray errs most; an effect changed or left out leaves the others' order."""
+    assert list(with_variant(lines.footprint, SLIT, "1x1")) == list(lines.footprint)
+    assert SLIT not in with_variant(lines.footprint, SLIT, OFF)
+    found = errors(FOOTPRINT, Seen(lines, seen_by(lines)))
+    assert found[SLIT.variants[0]] == 0
+    assert found[OFF] == max(found.values()) > 10 * found[SLIT.variants[1]]
+
+
 def test_more_bands_and_more_groups_err_less(lines: FarmLines):
-    """All are the reference itself."""
+    """All are the reference itself; bands taken come out as they went in, ends among them."""
+    fewer = some_bands(lines, 30)
+    assert fewer.bands[[0, -1]].tolist() == [0, 269]
+    np.testing.assert_array_equal(fewer.scene.electrons, lines.scene.electrons[:, fewer.bands])
+    np.testing.assert_allclose(fewer.spline[:, fewer.bands], np.eye(30), atol=1e-6)
     against = seen_by(lines)
     groups, bands = (
         errors(GROUP_COUNT, Seen(lines, against)),
@@ -128,14 +120,6 @@ def test_more_bands_and_more_groups_err_less(lines: FarmLines):
     assert groups[EACH] == bands[270] == 0
     assert 0 < groups[6] < groups[1]
     assert 0 < bands[135] < bands[60] < bands[15]
-
-
-def test_a_scene_in_fewer_bands_keeps_their_light_and_splines_meet_them(lines: FarmLines):
-    """The bands taken come out as they went in; ends are among them."""
-    fewer = some_bands(lines, 30)
-    assert fewer.bands[[0, -1]].tolist() == [0, 269]
-    np.testing.assert_array_equal(fewer.scene.electrons, lines.scene.electrons[:, fewer.bands])
-    np.testing.assert_allclose(fewer.spline[:, fewer.bands], np.eye(30), atol=1e-6)
 
 
 def test_rays_come_to_the_boxes_as_they_get_more(lines: FarmLines, monkeypatch):

@@ -46,15 +46,11 @@ def _lines(scene: RasterScene) -> np.ndarray[Any, Any]:
 
 
 def test_two_days_of_a_field_are_one_land() -> None:
-    """Tracks and ditches lie where they lay; what grows between them has changed."""
+    """Tracks and ditches lie where they lay; what grows has changed; day and hour stand in the key."""
     june, april = (open_scene(_settings(seed=5, day=day))[0] for day in (172, 100))
     there, then = _lines(june), _lines(april)
     assert np.count_nonzero(there & then) > 0.8 * np.count_nonzero(there | then) > 1000
     assert np.mean(june.labels != april.labels) > 0.1
-
-
-def test_day_and_hour_stand_in_the_key() -> None:
-    """Whose scene is kept is told by them."""
     given: list[dict[str, int]] = [{}, {"day": 173}, {"hour": 9}, {"day": 172, "hour": 11}]
     assert len({open_scene(_settings(**moment))[0].key for moment in given}) == 3
     key = open_scene(_settings(day=173))[0].key
@@ -76,15 +72,11 @@ def test_days_that_are_none_are_refused(table: dict[str, Any], words: str) -> No
         parse_settings(table)
 
 
-def test_a_file_that_names_the_removed_farm_is_refused(tmp_path: Path) -> None:
-    """The name is no path: it is not looked for beside the file."""
+def test_the_removed_farm_is_no_file(tmp_path: Path) -> None:
+    """A settings file that names it is refused; its runs are told apart by their seeds."""
     (tmp_path / "field.toml").write_text(f'scene = "{REMOVED_LAW}"\n')
     with pytest.raises(SettingsError, match="farm@1 was removed"):
         load_settings(tmp_path / "field.toml")
-
-
-def test_runs_of_the_removed_farm_are_told_apart(tmp_path: Path) -> None:
-    """By their seeds: its name is no scene's file."""
     archive = Archive.open(tmp_path)
     keys = [f"farm@1/seed={seed}/shape=8x8/bands=9" for seed in (0, 1)]
     made = [_publish(archive, key, scene=REMOVED_LAW) for key in keys]
@@ -92,14 +84,10 @@ def test_runs_of_the_removed_farm_are_told_apart(tmp_path: Path) -> None:
         compare(tmp_path, *made)
 
 
-def test_night_is_refused_before_anything_is_drawn() -> None:
-    """The scene says how high the sun has to be."""
+def test_moments_are_told_apart_and_night_is_refused() -> None:
+    """Where light drifts as on another day than plants are of, a note says so; the sun has to be up."""
     with pytest.raises(SceneError, match="sun"):
         open_scene(_settings(day=355, hour=3))
-
-
-def test_two_moments_are_told_apart() -> None:
-    """Where the light drifts as on another day than plants and shadows are of, a note says so."""
     said = {
         text: open_scene(_settings(sky={"started": datetime.fromisoformat(text)}))[1]
         for text in ("2026-06-21T12:20:00+02:00", "2026-08-21T12:20:00+02:00", "2026-06-21T18:00:00+02:00")
@@ -161,7 +149,7 @@ def test_a_farm_is_asked_for_again_by_its_law(tmp_path: Path) -> None:
 
 
 def test_training_days_cover_the_season() -> None:
-    """Each month from April to October has some, at hours with enough sun, and none is one that is judged on."""
+    """Each month from April to October has some, with enough sun, none of them judged on; names are read back."""
     data = farm_data(None, 3, LineCamera())
     learnt = [read_farm_name(name) for name in data.train]
     judged = [read_farm_name(name) for name in (*data.validation, *farm_test_data(4, LineCamera()).train)]
@@ -173,10 +161,6 @@ def test_training_days_cover_the_season() -> None:
     assert len(seeds) == len(learnt) + len(judged)
     assert min(seeds) >= 100_000  # far above those a user tries
     assert data.law == FARM_LAW
-
-
-def test_names_of_farm_scenes_are_read_back() -> None:
-    """Seed, day and hour."""
     assert [read_farm_name(name)[0] for name in farm_looks(7, 2)] == [7, 8]
     assert read_farm_name("100003-day-168-hour-14") == (100_003, 168, 14.0)
 

@@ -2,42 +2,59 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import io
+import zlib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
+import torch
 from rich.console import Console
 
 from flows.cli.main import main
 from flows.settings.load import load_settings
 from flows.survey.run import open_run
 from flows.training import train as flow
-from flows.training.train import TrainRequest, run_train, suggested_patch, train_weights, usual_crop
+from flows.training.data import pack_mask, unpack_mask
+from flows.training.train import TrainRequest, joined_split, run_train, suggested_patch, train_weights, usual_crop
 from models.network.sizes import PRESETS, Preset
+from models.training.start_weights import StartFile
 from models.training.train import TrainingSettings
-from models.weights.files import load_any_weights, load_weights
+from models.weights.files import describe_weights, load_any_weights, load_weights
 from pipeline.errors import SceneError, SettingsError, WeightsError
 from tests.flows.small_fields import write_field
 
 SETTINGS = TrainingSettings(steps=1, batch=1, crop=16)
 
 
-def _folder(root: Path) -> Path:
-    return write_field(root, (16, 16), ("001", "002", "003", "004"))
+TOKENS = {"dim": 16, "layers": 1, "heads": 2, "mlp_ratio": 3}
+FLAGS = ("--steps", 1, "--batch", 1, "--crop", 16, "--patch", 8, "--factor", 2)
 
 
-def _request(tmp_path: Path, **choices: Any) -> TrainRequest:
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four frames of 16 x 16 px with two classes."""
+    return write_field(tmp_path_factory.mktemp("frames") / "field", (16, 16), ("001", "002", "003", "004"))
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    """Where the weights of a test go."""
+    return tmp_path / "w.safetensors"
+
+
+def _request(folder: Path, out: Path, **choices: Any) -> TrainRequest:
     sizes = {"patch": 8, "factor": 2, "width": 4, "settings": SETTINGS, **choices}
-    return TrainRequest(str(_folder(tmp_path / "data")), tmp_path / "w.safetensors", **sizes)
+    return TrainRequest(str(folder), out, **sizes)
 
 
-def test_the_record_tells_what_was_trained_on(tmp_path: Path):
+def test_the_record_tells_what_was_trained_on(folder: Path, out: Path, tmp_path: Path):
     """Scenes kept for validation or held out are not among those that the weights were trained on."""
-    record = train_weights(_request(tmp_path, validation=1, hold_out=("003",)))
+    record = train_weights(_request(folder, out, validation=1, hold_out=("003",)))
     split = record["split"]
     assert len(split["train"]) == 2
     assert len(split["validation"]) == 1
@@ -47,27 +64,43 @@ def test_the_record_tells_what_was_trained_on(tmp_path: Path):
     assert load_weights(tmp_path / "w.safetensors").record["split"] == split
 
 
-@pytest.mark.parametrize("sizes", [{"patch": 24}, {"patch": 8, "factor": 16}, {"factor": 0}])
-def test_sizes_that_do_not_fit_are_refused_before_the_first_look(
-    tmp_path: Path, sizes: dict[str, int], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("choices", "words"),
+    [
+        ({"patch": 24}, "choose another --patch or --factor"),
+        ({"patch": 8, "factor": 16}, "choose another --patch or --factor"),
+        ({"factor": 0}, "choose another --patch or --factor"),
+        ({"preset": "coarser", "factor": 1}, "needs an even factor, got 1; choose another --patch or --factor"),
+        ({"init": True}, r"has --dim 16 --heads 2 .* pass --dim 64 --heads 1 --mlp-ratio 4 \(and"),
+        ({"init": True, "preset": "dense"}, "--init is for the two-scale network, got --preset dense"),
+        ({"init": True, "tokens": {**TOKENS, "dim": 18}}, r"token width 18 .*choose another --dim or --heads"),
+    ],
+)
+def test_networks_that_cannot_be_are_refused_before_the_first_look(
+    folder: Path, out: Path, choices: dict[str, Any], words: str, monkeypatch: pytest.MonkeyPatch
 ):
-    """No scene is looked at for a segmenter that cannot be built."""
-    monkeypatch.setattr(flow, "observe_scene", lambda *args: pytest.fail("a scene was looked at"))
-    with pytest.raises(SettingsError, match="choose another --patch or --factor"):
-        train_weights(_request(tmp_path, **sizes))
+    """No scene is opened for a start of another width, and none is looked at for sizes that do not fit."""
+    begun = {"init": _transformer(out.with_name("vit.pth"))} if "init" in choices else {}
+    opened = "open_training_data" if begun else "observe_scene"
+    monkeypatch.setattr(flow, opened, lambda *given, **named: pytest.fail("a scene was looked at"))
+    with pytest.raises(SettingsError, match=words):
+        train_weights(_begun(folder, out, **{**choices, **begun}))
 
 
-def test_a_folder_to_write_to_must_be_there(tmp_path: Path):
-    """The message says so before any scene is read."""
-    with pytest.raises(SettingsError, match="does not exist; make it first"):
-        train_weights(TrainRequest("farm", tmp_path / "none" / "w.safetensors"))
+def test_positions_and_crops_follow_the_preset(folder: Path, out: Path):
+    """Flags that do not fit are refused; the paper's network reads whole scenes."""
+    with pytest.raises(SettingsError, match="--positions paper is not for --preset coarser"):
+        run_train(_request(folder, out, preset="coarser", positions="paper"), Console(quiet=True))
+    assert usual_crop("farm", "paper") == usual_crop("frames", "paper") == 1024
+    assert [usual_crop("farm", "dense"), usual_crop("frames", "two-scale")] == [256, 384]
 
 
 @pytest.mark.parametrize("ending", ["", ".part", ".checkpoint", ".checkpoint.part"])
-def test_a_folder_in_the_place_of_a_file_is_named(tmp_path: Path, ending: str, capsys: pytest.CaptureFixture[str]):
+def test_a_folder_in_the_place_of_a_file_is_named(
+    out: Path, tmp_path: Path, ending: str, capsys: pytest.CaptureFixture[str]
+):
     """Where weights or the state of the run go: one message before any scene is read, and the exit code of usage."""
-    out = tmp_path / "w.safetensors"
-    (tmp_path / f"w.safetensors{ending}").mkdir()
+    out.with_name(f"{out.name}{ending}").mkdir()
     with pytest.raises(SystemExit) as left:
         main(["train", "nowhere", "-o", str(out)])
     shown = " ".join(capsys.readouterr().err.split())
@@ -76,9 +109,9 @@ def test_a_folder_in_the_place_of_a_file_is_named(tmp_path: Path, ending: str, c
     assert f"w.safetensors{ending} is a folder" in shown
 
 
-def test_scenes_of_other_bands_are_not_mixed(tmp_path: Path):
+def test_scenes_of_other_bands_are_not_mixed(folder: Path, out: Path):
     """One camera's scenes make one set of weights: the scene that differs is named."""
-    request = _request(tmp_path)
+    request = _request(folder, out)
     data = flow.open_training_data(request.dataset, 0, None, request.camera)
     first, second = data.scenes(data.train[:2])
     common = flow._common(request, first)
@@ -106,95 +139,49 @@ ROWS = {
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-def test_every_preset_trains_and_shows_the_rows_it_has(tmp_path: Path, preset: Preset):
+def test_every_preset_trains_and_shows_the_rows_it_has(folder: Path, out: Path, preset: Preset):
     """The file holds the network that was asked for; its figures are those that it can give."""
     shown = io.StringIO()
-    request = _request(tmp_path, validation=1, preset=preset)
-    record = run_train(request, Console(file=shown, width=100))
-    assert load_any_weights(request.out).config.preset == preset
-    figures = record["validation"]
+    figures = run_train(_request(folder, out, validation=1, preset=preset), Console(file=shown, width=100))[
+        "validation"
+    ]
+    assert load_any_weights(out).config.preset == preset
     assert set(figures) - {"scenes", "share_of_seats"} == ROWS[preset]
     for name in ROWS[preset]:
         assert all(0 <= figures[name][figure] <= 1 for figure in ("miou", "miou_of_shown_classes", "overall_accuracy"))
         assert name in shown.getvalue()
 
 
-def test_without_validation_scenes_a_control_is_not_judged(tmp_path: Path):
+def test_without_validation_scenes_a_control_is_not_judged(folder: Path, out: Path):
     """Nothing stands in the record where no scene was kept, and the last line says how to judge the weights."""
     shown = io.StringIO()
-    request = _request(tmp_path, validation=0, preset="dense")
+    request = _request(folder, out, validation=0, preset="dense")
     assert run_train(request, Console(file=shown, width=100))["validation"] is None
-    told = f"spectralzoom evaluate {request.dataset} --weights OTHERS --control {request.out}"
-    assert told in shown.getvalue()
+    assert f"spectralzoom evaluate {folder} --weights OTHERS --control {out}" in shown.getvalue()
 
 
-def test_positions_that_a_preset_cannot_have_are_refused(tmp_path: Path):
-    """The flag is named before any scene is read; so is a factor that a coarser grid cannot be made of."""
-    with pytest.raises(SettingsError, match="--positions paper is not for --preset coarser"):
-        run_train(_request(tmp_path / "a", preset="coarser", positions="paper"), Console(quiet=True))
-    with pytest.raises(SettingsError, match="needs an even factor, got 1; choose another --patch or --factor"):
-        train_weights(_request(tmp_path / "b", preset="coarser", factor=1))
-
-
-def test_the_papers_network_trains_on_whole_scenes():
-    """Its numbers of places depend on the width of what it reads; the others' do not."""
-    assert usual_crop("farm", "paper") == usual_crop("frames", "paper") == 1024
-    assert [usual_crop("farm", "dense"), usual_crop("frames", "two-scale")] == [256, 384]
-
-
-def test_a_survey_with_a_control_is_refused(tmp_path: Path):
+def test_a_survey_with_a_control_is_refused(folder: Path, out: Path):
     """Before the scene is opened: weights of a control make no survey."""
-    request = _request(tmp_path, validation=0, preset="paper")
-    train_weights(request)
-    flags = {"scene": str(tmp_path / "data" / "images" / "001_image.png"), "weights": str(request.out)}
+    train_weights(_request(folder, out, validation=0, preset="paper"))
+    flags = {"scene": str(folder / "images" / "001_image.png"), "weights": str(out), "out": str(out.parent / "a")}
     for planning in (False, True):
         with pytest.raises(WeightsError, match=r"holds the control 'paper'.*a survey needs weights of two scales"):
-            open_run(load_settings(None, {**flags, "out": str(tmp_path / "a")}), planning=planning)
+            open_run(load_settings(None, flags), planning=planning)
 
 
-TOML = """
-labels = "labels/{number}_labels.png"
-[classes]
-left = [0, 0, 0]
-right = [255, 0, 0]
-"""
-SHORT = TrainingSettings(steps=2, batch=1, crop=64, minutes=5)
-
-
-@pytest.fixture
-def halves(tmp_path: Path) -> Path:
-    """Three small frames with labels: bright on the right."""
-    rng = np.random.default_rng(3)
-    (tmp_path / "labels").mkdir()
-    for number in ("001", "002", "003"):
-        image = rng.integers(0, 60, (64, 72, 3)).astype(np.uint8)
-        labels = np.zeros((64, 72, 3), np.uint8)
-        image[:, 40:] += 120
-        labels[:, 40:, 0] = 255
-        Image.fromarray(image).save(tmp_path / f"{number}.png")
-        Image.fromarray(labels).save(tmp_path / "labels" / f"{number}_labels.png")
-    (tmp_path / "scene.toml").write_text(TOML)
-    return tmp_path
-
-
-def _two_steps(dataset: Path | str, out: Path, **more: object) -> TrainRequest:
-    """A training run of two steps."""
-    return TrainRequest(str(dataset), out, patch=8, factor=2, width=8, settings=SHORT, **more)  # type: ignore[arg-type]
-
-
-def test_a_survey_says_that_a_scene_was_trained_on(halves: Path, tmp_path: Path) -> None:
+def test_a_survey_says_that_a_scene_was_trained_on(folder: Path, out: Path) -> None:
     """The accuracy on a training scene comes with a warning, that on a held-out one does not."""
-    out = tmp_path / "w.safetensors"
-    train_weights(_two_steps(halves, out, hold_out=("002",), validation=0))
+    train_weights(_request(folder, out, hold_out=("002",), validation=0))
     notes = {}
     for number in ("001", "002"):
-        flags = {"scene": str(halves / f"{number}.png"), "weights": str(out), "out": str(tmp_path / "a"), "budget": 1}
+        scene = folder / "images" / f"{number}_image.png"
+        flags = {"scene": str(scene), "weights": str(out), "out": str(out.parent / "a"), "budget": 1}
         notes[number] = " ".join(open_run(load_settings(None, flags)).notes)
     assert "trained on this scene" in notes["001"]
     assert "trained on this scene" not in notes["002"]
 
 
-def test_pixels_trained_on_are_not_judged(tmp_path: Path) -> None:
+def test_pixels_trained_on_are_not_judged(out: Path, tmp_path: Path) -> None:
     """With a training mask the survey of the same file counts the other labelled pixels alone."""
     rng = np.random.default_rng(4)
     labels = rng.integers(1, 3, (40, 40)).astype(np.uint8)
@@ -203,8 +190,8 @@ def test_pixels_trained_on_are_not_judged(tmp_path: Path) -> None:
     np.save(tmp_path / "labels.npy", labels)
     np.save(tmp_path / "mask.npy", mask)
     given = {"labels": str(tmp_path / "labels.npy"), "wavelengths": [500, 600, 700, 800]}
-    out = tmp_path / "w.safetensors"
-    train_weights(_two_steps(tmp_path / "cube.npy", out, choices={**given, "train_mask": str(tmp_path / "mask.npy")}))
+    choices = {**given, "train_mask": str(tmp_path / "mask.npy")}
+    train_weights(_request(tmp_path / "cube.npy", out, choices=choices))
     flags = {**given, "scene": str(tmp_path / "cube.npy"), "weights": str(out), "out": str(tmp_path / "a"), "budget": 1}
     run = open_run(load_settings(None, flags))
     assert run.labels is not None
@@ -212,20 +199,91 @@ def test_pixels_trained_on_are_not_judged(tmp_path: Path) -> None:
     assert (run.labels[10:] != 255).all()
 
 
-def test_the_same_seed_gives_the_same_weights(halves: Path, tmp_path: Path) -> None:
+def test_the_same_seed_gives_the_same_weights(folder: Path, out: Path) -> None:
     """Two runs of one command agree to rounding, in another order of sums; another seed gives other weights."""
     found = []
     for name, seed in (("one", 0), ("two", 0), ("other", 1)):
-        out = tmp_path / f"{name}.safetensors"
-        train_weights(replace(_two_steps(halves, out, validation=0), settings=replace(SHORT, seed=seed)))
-        tensors = load_weights(out).segmenter.state_dict().values()
+        path = out.with_name(f"{name}.safetensors")
+        train_weights(_request(folder, path, validation=0, settings=replace(SETTINGS, steps=2, seed=seed)))
+        tensors = load_weights(path).segmenter.state_dict().values()
         found.append(np.concatenate([tensor.numpy().ravel().astype(np.float64) for tensor in tensors]))
     one, two, other = found
     assert np.linalg.norm(one - two) < 1e-3 * np.linalg.norm(one - other)
 
 
-def test_scenes_without_labels_are_refused(tmp_path: Path) -> None:
-    """Training on a picture without labels says what is missing."""
-    Image.fromarray(np.zeros((40, 40, 3), np.uint8)).save(tmp_path / "bare.png")
-    with pytest.raises(SceneError, match="no labels"):
-        train_weights(_two_steps(tmp_path / "bare.png", tmp_path / "w.safetensors"))
+def _begun(folder: Path, out: Path, **choices: Any) -> TrainRequest:
+    """A training with small tokens and nothing kept for validation."""
+    return _request(folder, out, **{"tokens": TOKENS, "validation": 0, **choices})
+
+
+def _transformer(path: Path) -> Path:
+    """A file of one block and a norm, 64 wide: one head."""
+    rng, dim = torch.Generator().manual_seed(0), 64
+    sizes = {"attn.qkv": 3 * dim, "attn.proj": dim, "mlp.fc1": 4 * dim}
+    state = {f"blocks.0.{name}.weight": torch.randn(rows, dim, generator=rng) for name, rows in sizes.items()}
+    state |= {"pos_embed": torch.zeros(1, 5, dim), "norm.weight": torch.ones(dim)}
+    torch.save({"model": state, "license": "Apache-2.0"}, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def earlier(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights trained on three of the frames."""
+    path = tmp_path_factory.mktemp("weights") / "first.safetensors"
+    train_weights(_begun(folder, path, hold_out=("004",)))
+    return path
+
+
+def test_weights_begun_from_others_say_so_and_go_on_from_there(folder: Path, earlier: Path, out: Path):
+    """File, hash and its frames are recorded; a step at a rate of nothing leaves them as they were."""
+    begun = train_weights(_begun(folder, out, hold_out=("001", "002", "003"), init=earlier))["begun_from"]
+    assert (begun["file"], begun["kind"], begun["skipped"]) == ("first.safetensors", "spectralzoom", {})
+    assert begun["sha256"] == hashlib.sha256(earlier.read_bytes()).hexdigest()
+    split = load_weights(out).record["split"]
+    assert list(split["train"]) == ["004", *(f"first.safetensors: {name}" for name in ("001", "002", "003"))]
+    assert {*split["train"].values()} > {*describe_weights(earlier).record["split"]["train"].values()}
+    train_weights(_begun(folder, out, hold_out=("004",), init=earlier, settings=replace(SETTINGS, learning_rate=0.0)))
+    before, after = (load_weights(path).segmenter.state_dict() for path in (earlier, out))
+    assert all(torch.allclose(after[name], value, atol=1e-7) for name, value in before.items())
+
+
+@pytest.mark.parametrize("share", ["whole", "in part"])
+def test_frames_that_the_start_has_seen_validate_nothing(
+    folder: Path, earlier: Path, out: Path, monkeypatch: pytest.MonkeyPatch, share: str
+):
+    """Figures on them would say nothing, a mask or not: validation counts all pixels that are labelled."""
+    split = describe_weights(earlier).record["split"]
+    if share == "in part":
+        masks = {key: pack_mask(np.eye(16, dtype=bool)) for key in split["train"].values()}
+        monkeypatch.setattr(StartFile, "earlier", property(lambda file: {"split": {**split, "pixels": masks}}))
+    with pytest.raises(SettingsError, match="was trained on the scene 001, which is kept for validation"):
+        train_weights(_begun(folder, out, validation=1, init=earlier))
+
+
+def test_the_command_prints_what_became_of_a_transformer(command_line: Any, folder: Path, out: Path):
+    """Matched, resized and skipped with the reason, and the licence; a width that is another is a matter of usage."""
+    words = ("train", folder, "-o", out, "--validation", 0, "--init", _transformer(out.with_name("vit.pth")), *FLAGS)
+    refused = command_line(*words)
+    assert (refused.code, "pass --dim 64 --heads 1 --mlp-ratio 4" in refused.errors[0]) == (2, True)
+    done = command_line(*words, "--dim", 64, "--heads", 1, "--mlp-ratio", 4, "--layers", 1)
+    said = " ".join(done.err.split())
+    assert done.code == 0
+    assert "begun from vit.pth (vision transformer): 4 tensors matched, 0 resized, 1 skipped" in said
+    assert "skipped pos_embed: positions on a grid of its own" in said
+    assert "its licence: Apache-2.0" in said
+    assert load_weights(out).config.dim == 64
+
+
+def test_masks_of_what_was_seen_add_up(earlier: Path, monkeypatch: pytest.MonkeyPatch):
+    """Pixels seen by either are seen; a scene that one of both saw whole has no mask any more."""
+    one, other = np.zeros((4, 4), bool), np.zeros((4, 4), bool)
+    one[0], other[:, 0] = True, True
+    start = StartFile(earlier)
+    before = {"train": {"a": "A", "b": "B"}, "pixels": {"A": pack_mask(one), "B": pack_mask(one)}}
+    monkeypatch.setattr(StartFile, "earlier", property(lambda file: {"split": before}))
+    own = {"train": {"a": "A", "b": "B", "c": "C"}, "pixels": {"A": pack_mask(other), "C": pack_mask(other)}}
+    joined = joined_split(own, start)
+    assert (unpack_mask(joined["pixels"]["A"], (4, 4)) == one | other).all()
+    assert set(joined["pixels"]) == {"A", "C"}
+    assert joined["train"] == own["train"]
+    assert zlib.decompress(base64.b64decode(joined["pixels"]["C"])) == np.packbits(other).tobytes()

@@ -1,23 +1,29 @@
-"""Runs of two rounds of detail, which earlier versions made: they stay readable, and are not asked for again."""
+"""Archives of strangers and of earlier versions: verbs stay inside, read what they can, and refuse the rest."""
 
 from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from flows.cli.main import main
+from flows.publish import survey_command
 from flows.publish.run_folder import Published
+from flows.survey.prefect_engine import EngineUnavailable
 from flows.survey.stage import versions
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
+from storage.archive.manifests import _seal, _text
 from storage.archive.records import read_run
+from storage.archive.staging import file_hash
 from tests.conftest import Survey
 from tests.flows.conftest import CommandLine
-from tests.storage.small_archive import flip
+from tests.storage.archive.test_no_files import CASES, Case
+from tests.storage.small_archive import Small, flip, small_survey
 
 
 def _stored_as(archive: Archive, like: StageRef, params: dict[str, Any], inputs: Sequence[str]) -> StageRef:
@@ -92,22 +98,22 @@ def archive(before: Path, tmp_path: Path) -> Path:
         (["explain", "latest"], "it had two rounds of detail, which are no more"),
         (["compare", "previous", "latest"], "rounds"),
         (["gc", "--keep-days", "0"], "0 things went"),
+        (["report", "--out", "OUT/history.html"], ""),
+        (["export", "latest", "--out", "OUT/layers"], ""),
     ],
     ids=lambda given: given[0] if isinstance(given, list) else "",
 )
-def test_such_a_run_is_shown(words: list[str], told: str, archive: Path, command_line: CommandLine) -> None:
-    """Its stages have names that there are no longer, and settings that nobody can ask for."""
-    ended = command_line(words[0], archive, *words[1:])
+def test_such_a_run_is_shown(
+    words: list[str], told: str, archive: Path, tmp_path: Path, command_line: CommandLine
+) -> None:
+    """Its stages have names that there are no longer, and settings that nobody can ask for; files for others too."""
+    ended = command_line(words[0], archive, *(word.replace("OUT", str(tmp_path)) for word in words[1:]))
     assert ended.code == 0
+    if words[0] in ("report", "export"):
+        assert [
+            path for path in tmp_path.rglob("*") if path.suffix in (".html", ".tif") and archive not in path.parents
+        ]
     assert told in ended.out
-
-
-def test_its_history_and_its_layers_are_written(archive: Path, tmp_path: Path, command_line: CommandLine) -> None:
-    """On the field's page, and as files for others."""
-    assert command_line("report", archive, "--out", tmp_path / "history.html").code == 0
-    assert (tmp_path / "history.html").stat().st_size > 0
-    assert command_line("export", archive, "latest", "--out", tmp_path / "layers").code == 0
-    assert list((tmp_path / "layers").rglob("*.tif"))
 
 
 @pytest.mark.parametrize("words", [["reprocess"], ["evaluate", "latest", "--controls"]], ids=lambda words: words[0])
@@ -143,3 +149,106 @@ def test_one_round_is_no_setting_that_differs(survey_png: Survey, tmp_path: Path
         draft.write_file("receipt.json", json.dumps({**published.receipt, "settings": {**settings, "rounds": 1}}))
         draft.publish(survey="scene", settings={**settings, "rounds": 1})
     assert read_run(archive.runs()[-1], {}).settings == read_run(published.folder, {}).settings
+
+
+SECRET = b"not of this archive"
+LEADS = ("../../../secret", "../secret", "/etc/passwd", "stages/../../secret", "./secret", "secret\0", "..", "")
+
+
+def rewrite(folder: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Change a manifest, and seal it again as whoever made it could."""
+    path = folder / "manifest.json"
+    content = json.loads(path.read_text())
+    content.pop("seal")
+    change(content)
+    path.write_text(_text(content | {"seal": _seal(content)}))
+
+
+def list_file(small: Small, lead: str) -> None:
+    """A store lists a file that is no file of its own."""
+    rewrite(small.mosaic.path, lambda facts: facts["files"].update({lead: {"sha256": "0" * 64, "size": len(SECRET)}}))
+
+
+def rest_on(small: Small, lead: str) -> None:
+    """A store was made of something elsewhere."""
+    rewrite(small.mosaic.path, lambda facts: facts.update(inputs=[lead, f"capture/{lead}"]))
+
+
+def call_itself(small: Small, lead: str) -> None:
+    """A store says that it is another stage's, elsewhere."""
+    rewrite(small.mosaic.path, lambda facts: facts.update(stage=lead, key=lead))
+
+
+def name_products(small: Small, lead: str) -> None:
+    """A run's products, stages and what it rests on lie elsewhere."""
+    receipt = json.loads((small.run / "receipt.json").read_text())
+    receipt["products"] = {"class_map": lead, "mosaic": f"stages/rectify/{lead}"}
+    receipt["stages"] = [{"name": lead, "key": lead, "state": "ran", "manifest_sha256": "0" * 64}]
+    text = json.dumps(receipt).encode()
+    (small.run / "receipt.json").write_bytes(text)
+    entry = {"sha256": file_hash(small.run / "receipt.json"), "size": len(text)}
+    rewrite(
+        small.run,
+        lambda facts: facts.update(files={"receipt.json": entry}, rests_on={lead: "0" * 64, f"runs/{lead}": "0" * 64}),
+    )
+
+
+@pytest.mark.parametrize("lead", LEADS)
+@pytest.mark.parametrize("change", [list_file, rest_on, call_itself, name_products])
+def test_no_verb_leaves_the_archive(
+    tmp_path: Path,
+    change: Callable[[Small, str], None],
+    lead: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each verb ends with an answer or one message; what lies beside the archive stays, and none of it is shown."""
+
+    def no_server(*given: object) -> None:  # else each repair waits for one
+        raise EngineUnavailable("none here")
+
+    monkeypatch.setattr(survey_command, "survey_with_prefect", no_server)
+    root = tmp_path / "archive"
+    change(small_survey(Archive.open(root), simulated=False), lead)
+    secrets = [tmp_path / "secret", root / "secret", root / "stages" / "secret"]
+    for path in secrets:
+        path.write_bytes(SECRET)
+    for verb in (
+        ["ls"],
+        ["explain", "class_map"],
+        ["explain", "rectify"],
+        ["verify"],
+        ["export"],
+        ["gc", "--keep-days", "0", "--raw-too"],
+        ["verify", "--repair"],
+    ):
+        with pytest.raises(SystemExit) as ended:
+            main([verb[0], str(root), *verb[1:]])
+        assert ended.value.code in (0, 1, 2, 3), verb
+        shown = capsys.readouterr()
+        assert "defect" not in shown.err + shown.out, (verb, shown.err)
+        assert SECRET.decode() not in shown.err + shown.out
+        assert secrets[0].read_bytes() == SECRET, verb
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["archive", "secret"]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_no_verb_waits_or_follows(case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Pipes and links where files and folders should be: each verb ends, verify with 1, and no defect is met."""
+    root, out = tmp_path / "archive", str(tmp_path / "out")
+    uri = case(small_survey(Archive.open(root)))
+    for verb, *more in (
+        ("ls",),
+        ("explain", "class_map"),
+        ("report", "--out", f"{out}.html"),
+        ("export", "--out", out),
+        ("gc", "--dry-run"),
+        ("verify",),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            main([verb, str(root), *more])
+        shown = capsys.readouterr()
+        assert ended.value.code in (0, 1, 2, 3), (verb, shown.err)
+        assert "defect" not in shown.err + shown.out, (verb, shown.err)
+    assert ended.value.code == 1
+    assert uri in shown.out
