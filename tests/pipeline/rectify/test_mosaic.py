@@ -79,16 +79,6 @@ def test_a_band_without_a_value_is_the_other_sweeps() -> None:
     assert coverage.tolist() == [2]
 
 
-@given(st.integers(0, 10_000), st.integers(1, 19))
-@settings(max_examples=20, deadline=None)
-def test_points_do_not_see_each_other(seed: int, cut: int) -> None:
-    """Blending some of the points gives what blending all of them gives there, bit by bit."""
-    parts = [part(seed), part(seed + 1)]
-    whole = mosaic(parts)[0]
-    some = mosaic([MosaicPart(one.values[:cut], one.weight[:cut], one.edge_px[:cut]) for one in parts])[0]
-    np.testing.assert_array_equal(some, whole[:cut])
-
-
 def test_a_point_alone_is_summed_as_among_others() -> None:
     """One point of one band in many sweeps, some without a value, is mixed in the order in which many points are."""
     rng = np.random.default_rng(5)

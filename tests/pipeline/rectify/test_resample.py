@@ -87,37 +87,6 @@ def test_catmull_rom_keeps_parabolas() -> None:
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_dead_element_spoils_only_its_band(kernel: Kernel) -> None:
-    """With one NaN element out, the other bands and the points that do not touch it stay as they were, bit by bit."""
-    values = np.random.default_rng(9).random((12, 12, 4), np.float32)
-    at = np.random.default_rng(10).uniform(1, 10, (500, 2))
-    whole, share = resample(values, np.ones((12, 12), bool), at, kernel)
-    valid = np.ones((12, 12, 4), bool)
-    values[5, 6, 2], valid[5, 6, 2] = np.nan, False
-    out, share_of_any = resample(values, valid, at, kernel)
-    changed = out != whole
-    np.testing.assert_array_equal(np.flatnonzero(changed.any(axis=0)), [2])
-    assert (np.abs(at[changed.any(axis=1)] - (5, 6)) < 2).all()
-    assert 0 < np.isnan(out).sum() < changed.sum() or kernel == "nearest"
-    np.testing.assert_array_equal(share_of_any, share)
-
-
-def test_mask_by_element_may_be_one_by_sample() -> None:
-    """A mask by element that says the same of all bands gives the same bits as the mask by sample."""
-    rng = np.random.default_rng(12)
-    values, valid = rng.random((20, 20, 3), np.float32), rng.random((20, 20)) > 0.2
-    values[~valid] = np.nan
-    at = rng.uniform(-1, 20, (500, 2))
-    for kernel in KERNELS:
-        for one, other in zip(
-            resample(values, valid, at, kernel),
-            resample(values, np.repeat(valid[..., None], 3, axis=2), at, kernel),
-            strict=True,
-        ):
-            np.testing.assert_array_equal(one, other)
-
-
-@pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("bands", [1, 3, 300])
 def test_result_does_not_depend_on_the_blocks(kernel: Kernel, bands: int) -> None:
     """All points at once, each alone and in any order give the same bits: whole windows, borders and masks alike."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,7 @@ from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
 from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.optics.rays import exact_views, middle_normal
-from pipeline.simulator.optics.tap_sums import SCALE_STEP, TapTable, blurred_weight, box_weight
+from pipeline.simulator.optics.tap_sums import TapTable, blurred_weight, box_weight
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Optics, Rig
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
@@ -92,27 +92,6 @@ def test_closed_form_is_what_thousands_of_rays_give(
     assert error(sweep, line, variant, BLURS) < blurred
 
 
-def test_rays_converge_to_the_closed_form() -> None:
-    """Twice as many rays along either axis leave a third of the difference, or less."""
-    scene, sweep = grain(), replace(CORNER, strip_px=200.0)
-    block = SweepBlock(RIG, sweep, range(1900, 1901), scene.wavelength_nm, scene.shape, samples=range(300, 340))
-    moved = Moved.to(block, scene)
-    light = expected_light(scene, block, {moved: "only", ROTATION: "rays", SLIT: "9x3"})
-    errors = [np.abs(fine_light(scene, block, moved, {}, per_px=many) - light).max() for many in (8, 16, 32)]
-    assert errors[1] < errors[0] / 3
-    assert errors[2] < errors[1] / 3
-
-
-def test_flat_scene_stays_flat() -> None:
-    """Weights sum to 1 at any place, turn and band."""
-    nm = np.linspace(400, 1000, 3)
-    scene = image_scene(np.full((120, 160, 3), 0.7), CAMERA, nm)
-    block = SweepBlock(RIG, CORNER, range(4), scene.wavelength_nm, scene.shape)
-    for variant in ("off", *SLIT.variants):
-        light = expected_light(scene, block, {ROTATION: "rays", SLIT: variant, **BLURS})
-        np.testing.assert_allclose(light, np.broadcast_to(0.7 * scene.electrons, light.shape), rtol=3e-6)
-
-
 @pytest.mark.parametrize("variant", ["off", "3x1"])
 def test_keystone_needs_no_slit(variant: str) -> None:
     """Every band is seen from its own place, through the slit and without it."""
@@ -177,18 +156,6 @@ def test_table_is_the_kernel_at_any_place_and_scale(width: float, blur: float, s
     wanted = np.stack([np.interp(apart, distance, kernel, 0.0, 0.0) for kernel in kernels], axis=1)
     np.testing.assert_allclose(weight.sum(axis=0), 1, atol=1e-6)
     np.testing.assert_allclose(weight, wanted, atol=2e-3)
-
-
-def test_scale_in_the_middle_of_two_is_off_by_little() -> None:
-    """Half a step of scale changes no weight by more than a thousandth, exact scales change none."""
-    table = TapTable.of(2.7, np.array([0.1]), 1, (1.0, 1.03), 0.0)
-    off = np.zeros((1, 1, 1), np.float32)
-    for number, most in ((3.0, 2e-5), (3.5, 1e-3)):
-        scale = np.array([table.least_scale + number * SCALE_STEP])
-        weight = table.read(off, table.scale_rows(scale[None]))[:, 0, 0, 0]
-        distance, kernel = blurred_weight(2.7 * scale[0], np.array([0.1 * scale[0] ** 2]))
-        wanted = np.interp(table.left - np.arange(table.taps), distance, kernel[0])
-        assert np.abs(weight - wanted).max() < most
 
 
 Places = tuple[np.ndarray, np.ndarray]
