@@ -20,8 +20,7 @@ from pipeline.rectify.placed import place
 from pipeline.rectify.region import mosaic_rows, read_seats, seat_pixels
 from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.image_scene import raster_from_values
-from pipeline.simulator.scenes.scene import RasterScene
+from pipeline.simulator.scenes.scene import RasterScene, raster_from_values
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 
 

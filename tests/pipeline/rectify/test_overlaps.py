@@ -22,8 +22,7 @@ from pipeline.rectify.registration.seams import Registration, place_images, regi
 from pipeline.simulator.effects.pointing import PointingErrors
 from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.image_scene import raster_from_values
-from pipeline.simulator.scenes.scene import SceneLight
+from pipeline.simulator.scenes.scene import SceneLight, raster_from_values
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 
 CAMERA = LineCamera(samples=160)

@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.lazy import Once
-from pipeline.simulator.scenes.image_scene import raster_from_values
-from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster, raster_from_values
 
 
 def made_scene(planes: ArrayLike, electrons: ArrayLike, wavelength_nm: ArrayLike, **more: Any) -> RasterScene:
