@@ -39,7 +39,7 @@ from pipeline.simulator.optics.kernel_fit import Moments, fold
 from pipeline.simulator.optics.rays import RayViews, exact_views, middle_normal, straight_views
 from pipeline.simulator.optics.scene_light import Looker
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, Scene
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 
 Floats = NDArray[np.float64]
 Light = NDArray[np.float32]
@@ -77,7 +77,7 @@ class Choice:
         return ((effect, variant) for effect, variant in self.effects if hasattr(effect, action))
 
 
-def expected_light(scene: Scene, block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> Light:
+def expected_light(scene: RasterScene, block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> Light:
     """Give the electrons that the samples of some lines gather on average, before the readout.
 
     ``chosen``: The effects that are on, in the order of the chain, each with its variant; none is a camera of rays that

@@ -26,7 +26,7 @@ from pipeline.simulator.effects.sensor import PRNU, STRIPING
 from pipeline.simulator.effects.spectrometer import RESPONSE, SMILE
 from pipeline.simulator.render import Choice, dark_frame, expected_light, read_out
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, Scene
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from pipeline.source import AT_REST, Line, References
 
 Raw = NDArray[np.uint16]
@@ -45,7 +45,7 @@ class SimulatedSource:
     With ``pointing`` the mirror looks beside the planned positions and still reports those.
     """
 
-    scene: Scene
+    scene: RasterScene
     rig: Rig
     seed: int = 0
     chosen: Mapping[Any, str] | Choice = USUAL
@@ -173,7 +173,7 @@ def sweep_starts(
 
 
 def sweep_block(
-    scene: Scene,
+    scene: RasterScene,
     rig: Rig,
     sweep: Sweep,
     lines: range,
@@ -193,7 +193,7 @@ def sweep_block(
 
 
 def render_lines(
-    scene: Scene,
+    scene: RasterScene,
     rig: Rig,
     chosen: Mapping[Any, str] | Choice,
     sweep: Sweep,
@@ -236,7 +236,7 @@ def check_binning(sweep: Sweep, camera: LineCamera) -> None:
         )
 
 
-def take_references(scene: Scene, rig: Rig, choice: Choice, sweep: Sweep) -> References:
+def take_references(scene: RasterScene, rig: Rig, choice: Choice, sweep: Sweep) -> References:
     """Give mean dark and white frames (sample, band) with the sweep's binning, free of noise. [DN]
 
     The white frame is scaled from a shorter exposure, so that it does not saturate; it is taken with the mirror at

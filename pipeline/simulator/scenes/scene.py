@@ -9,7 +9,6 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from threading import Lock
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +18,10 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.lazy import Once
 from pipeline.readings import MOST_VALUE, find_beyond
-from pipeline.rectify.resample import gather
 
 Drawn = tuple[NDArray[np.float32], NDArray[np.uint8] | None]
 _BINOMIAL = (np.array([1, 8, 28, 56, 70, 56, 28, 8, 1]) / 256).astype(np.float32)
-DEFAULT_EXPOSURE_MS = 100.0  # the exposure at which Scene.electrons is stated
+DEFAULT_EXPOSURE_MS = 100.0  # the exposure at which a scene's electrons are stated
 WELL_SHARE = 0.6  # of the full well, filled by the bright end of a scene without a radiance law
 BRIGHT_PERCENTILE = 99.9
 LEAST_BRIGHT = 1e-30  # electrons per unit of less would end the range of float32
@@ -93,45 +91,6 @@ class SceneLight:
     panel_electrons: NDArray[np.float32]
 
 
-class Scene(Protocol):
-    """A field of light. Light is linear in the components: electrons = components @ ``electrons``."""
-
-    @property
-    def name(self) -> str:
-        """What the receipt calls it."""
-
-    @property
-    def key(self) -> str:
-        """Identity of the content: equal keys give equal light."""
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(y, x) size [px]."""
-
-    @property
-    def wavelength_nm(self) -> NDArray[np.float64]:
-        """(band,) centre wavelengths [nm]."""
-
-    @property
-    def fwhm_nm(self) -> NDArray[np.float64] | None:
-        """(band,) widths [nm], None where not known."""
-
-    @property
-    def electrons(self) -> NDArray[np.float32]:
-        """(component, band) electrons at the default exposure per unit of component; (band,) means a diagonal."""
-
-    @property
-    def panel(self) -> NDArray[np.float32]:
-        """(band,) scene value of the white panel."""
-
-    @property
-    def panel_electrons(self) -> NDArray[np.float32]:
-        """(band,) electrons that the white panel gives at the default exposure."""
-
-    def sample(self, y: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Give the components at points, (n,) rows and columns [px] -> (n, component) float32."""
-
-
 @dataclass(frozen=True)
 class RasterScene:
     """A scene of pixels; between their centres light is linear, and outside the edge pixel is repeated.
@@ -143,6 +102,8 @@ class RasterScene:
     ``planes`` is (y, x, component) float32 and ``electrons`` (component, band), or (band,) where each band has its own
     plane. Labels are (y, x) uint8 with 255 for unlabelled. ``filled_px`` counts pixels that came without a value in a
     band; ``missing`` (y, x) are those without one in most bands, of which nothing is known (None: no such pixel).
+    ``panel`` is the scene value of the white panel, ``wavelength_nm`` and ``fwhm_nm`` are centres and widths of the
+    bands, all (band,); widths are None where not known. Equal keys give equal light.
     Planes, labels and electrons may be made when they are first asked for; all else is known at once.
     """
 
@@ -180,14 +141,17 @@ class RasterScene:
 
     @property
     def shape(self) -> tuple[int, int]:
+        """(y, x) size [px]."""
         return self.raster.shape[:2]
 
     @property
     def electrons(self) -> NDArray[np.float32]:
+        """(component, band) electrons at the default exposure per unit of component; (band,) means a diagonal."""
         return self._checked_light().electrons
 
     @property
     def panel_electrons(self) -> NDArray[np.float32]:
+        """(band,) electrons that the white panel gives at the default exposure."""
         return self._checked_light().panel_electrons
 
     @property
@@ -204,9 +168,6 @@ class RasterScene:
     def labels(self) -> NDArray[np.uint8] | None:
         """(y, x) classes, 255 for unlabelled; None without any."""
         return self.raster.drawn()[1] if self.labelled else None
-
-    def sample(self, y: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float32]:
-        return gather(self.planes, y, x, "bilinear")
 
     def spectra(self) -> NDArray[np.float32]:
         """Scene value per unit of component, shaped as ``electrons``."""

@@ -24,6 +24,7 @@ from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import SceneLight, raster_from_values
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
+from tests.pipeline.simulator.small_scenes import seen_at
 
 CAMERA = LineCamera(samples=160)
 GRID = SceneGrid(260, 300, 16, 4)
@@ -119,7 +120,7 @@ def test_broad_image_is_the_mean_of_the_bands():
     broad = BroadSweep.read(holed, CAMERA, bands=3)  # type: ignore[arg-type]
     along, scan = sweep_to_scene(sweep, CAMERA)
     y, x = scan + (source.field_shape[0] - 1) / 2, along + (source.field_shape[1] - 1) / 2
-    truth = source.scene.sample(y.ravel(), x.ravel()).mean(axis=1).reshape(along.shape)
+    truth = seen_at(source.scene, y, x).mean(axis=-1)
     assert np.isnan(broad.image[7]).all()
     np.testing.assert_allclose(broad.image[kept], truth[kept], atol=2e-3)
     believed = np.arange(sweep.lines) != 9

@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 
 from pipeline.errors import ShapeError
 from pipeline.rectify.kernels import Kernel, kernel_taps
-from pipeline.rectify.resample import BLOCK_PX, gather, merge_lines, resample
+from pipeline.rectify.resample import BLOCK_PX, merge_lines, resample
 
 KERNELS: tuple[Kernel, ...] = ("catmull-rom", "bilinear", "nearest")
 
@@ -142,17 +142,7 @@ def test_shapes_that_do_not_fit_are_named() -> None:
     with pytest.raises(ShapeError, match="flatten the grid"):
         resample(values, np.ones((4, 4), bool), np.zeros((2, 2, 2)))
     with pytest.raises(ValueError, match="'cubic'"):
-        gather(values, np.zeros(1), np.zeros(1), "cubic")  # type: ignore[arg-type]
-
-
-def test_scene_edges_are_repeated() -> None:
-    """Far outside a scene the edge pixel is seen; inside, gather and resample agree."""
-    planes = np.random.default_rng(7).random((5, 6, 2), np.float32)
-    far = gather(planes, np.array([-50.0, 80.0]), np.array([2.0, 99.0]))
-    np.testing.assert_array_equal(far, planes[[0, 4], [2, 5]])
-    at = np.random.default_rng(8).uniform(1, 3, (20, 2))
-    inside, _ = resample(planes, np.ones((5, 6), bool), at)
-    np.testing.assert_allclose(gather(planes, at[:, 0], at[:, 1]), inside, rtol=1e-5)
+        resample(values, np.ones((4, 4), bool), np.zeros((1, 2)), "cubic")  # type: ignore[arg-type]
 
 
 def test_dwell_is_the_mean_of_its_valid_lines() -> None:

@@ -19,7 +19,7 @@ from pipeline.simulator.render import Choice, expected_light
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Rig, Sky
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import render_lines, sweep_block
-from tests.pipeline.simulator.small_scenes import image_scene, made_scene
+from tests.pipeline.simulator.small_scenes import image_scene, made_scene, seen_at
 
 CAMERA = LineCamera()
 OPTICS = effects_on("rotation", "slit", "smear")
@@ -91,7 +91,7 @@ def test_rays_are_those_of_the_mirror() -> None:
     ray = np.stack([0 * slope, slope, 1 + 0 * slope], axis=-1)
     normal = position_to_normal(line_positions(sweep, CAMERA)[7])
     x, y = direction_to_scene(reflect(ray, normal)).T / CAMERA.ifov_rad
-    expected = scene.sample(y + 99.5, x + 349.5)[:, 0] * scene.electrons[0]
+    expected = seen_at(scene, y + 99.5, x + 349.5)[:, 0] * scene.electrons[0]
     np.testing.assert_allclose(line, expected, rtol=1e-4)
 
 

@@ -22,7 +22,7 @@ from pipeline.simulator.optics.tap_sums import TapTable, blurred_weight, box_wei
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Optics, Rig
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
-from tests.pipeline.simulator.small_scenes import image_scene
+from tests.pipeline.simulator.small_scenes import image_scene, seen_at
 
 CAMERA = LineCamera()
 RIG = Rig(camera=CAMERA, optics=Optics(keystone_px=0.3))
@@ -180,7 +180,7 @@ def fine_light(
             beside = moved.displaced(block, along, scan, "only")
             along, scan = along + beside[0] + (size[0] - 1) / 2, scan + beside[1] + (size[1] - 1) / 2
             y, x = (along, scan) if block.sweep.along == "y" else (scan, along)
-            seen = scene.sample(y.ravel(), x.ravel()).reshape(len(block.lines), *slopes.shape, bands)
+            seen = seen_at(scene, y, x).reshape(len(block.lines), *slopes.shape, bands)
             which = slice(None) if not blurs else slice(band, band + 1)
             found[..., which] += one * np.einsum("lsrb,r->lsb", seen[..., which], weights)
     return found * scene.electrons * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
