@@ -173,14 +173,6 @@ def test_spectra_are_reflectances_and_tell_stages_apart() -> None:
 SHAPE = (161, 161)
 
 
-@given(st.integers(60, 300), st.floats(0, 3.5))
-def test_mornings_mirror_afternoons(day: int, hours: float) -> None:
-    """As long before noon as after it the sun is as high, and as far to the east as to the west."""
-    before, after = sun_over_farm(day, 12 - hours), sun_over_farm(day, 12 + hours)
-    assert before.elevation_deg == pytest.approx(after.elevation_deg)
-    assert before.azimuth_deg == pytest.approx(360 - after.azimuth_deg)
-
-
 def test_the_sun_agrees_with_the_surveys() -> None:
     """Place by the survey's algorithm for the same true solar time differs by less than 0.7 degrees."""
     from pvlib.spa import solar_position
