@@ -46,7 +46,7 @@ class FarmLines:
     @property
     def values(self) -> float:
         """Px times bands."""
-        sizes = (len(block.lines) * len(block.columns) * len(block.wavelength_nm) for block in self.blocks)
+        sizes = (len(block.lines) * block.rig.camera.samples * len(block.wavelength_nm) for block in self.blocks)
         return float(sum(sizes))
 
     @property

@@ -40,7 +40,7 @@ class Counted:
     @property
     def draws(self) -> int:
         """Of each level."""
-        return len(self.block.lines) * len(self.block.columns)
+        return len(self.block.lines) * self.block.rig.camera.samples
 
     def counts(self, raw: Raw) -> Floats:
         """How often each number came, (level, DN)."""

@@ -173,23 +173,11 @@ def sweep_starts(
 
 
 def sweep_block(
-    scene: RasterScene,
-    rig: Rig,
-    sweep: Sweep,
-    lines: range,
-    *,
-    seed: int = 0,
-    started_s: float = 0.0,
-    samples: range | None = None,
+    scene: RasterScene, rig: Rig, sweep: Sweep, lines: range, *, seed: int = 0, started_s: float = 0.0
 ) -> SweepBlock:
-    """Give some lines of a sweep over a scene, as effects ask about them.
-
-    ``samples`` are the camera's, before binning; ``started_s`` is when the sweep starts, after the survey did.
-    """
+    """Give some lines of a sweep, which starts ``started_s`` after the survey did, as effects ask about them."""
     white = scene.panel_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
-    return SweepBlock(
-        rig, sweep, lines, scene.wavelength_nm, scene.shape, seed, samples, started_s, scene.fwhm_nm, white
-    )
+    return SweepBlock(rig, sweep, lines, scene.wavelength_nm, scene.shape, seed, started_s, scene.fwhm_nm, white)
 
 
 def render_lines(
@@ -201,24 +189,18 @@ def render_lines(
     *,
     seed: int = 0,
     started_s: float = 0.0,
-    samples: range | None = None,
 ) -> Raw:
     """Give the raw numbers of some lines, (line, sample, band) uint16, binned [DN]. Pure: threads may share arguments.
 
-    Neither the other lines and samples asked for nor the order of calls changes a number. ``samples``: neighbouring
-    ones of the binned line; None is all. Raises ShapeError: sums of ``sweep.binning`` samples at full scale do not fit
-    uint16, or the line has no such samples; PoseError: a position of the sweep is out of the mirror's reach.
+    Neither the other lines asked for nor the order of calls changes a number. Raises ShapeError: sums of
+    ``sweep.binning`` samples at full scale do not fit uint16. PoseError: a position is out of the mirror's reach.
     """
     check_binning(sweep, rig.camera)
-    choice, count = Choice.of(chosen), rig.camera.samples // sweep.binning
-    taken = range(count) if samples is None else samples
-    if taken.step != 1 or not 0 <= taken.start < taken.stop <= count:
-        raise ShapeError(f"sweep {sweep.name} has samples 0 to {count - 1} a line; expected some in a row, got {taken}")
-    of_camera = None if samples is None else range(taken.start * sweep.binning, taken.stop * sweep.binning)
-    raw = np.empty((len(lines), len(taken), len(scene.wavelength_nm)), np.uint16)
+    choice = Choice.of(chosen)
+    raw = np.empty((len(lines), rig.camera.samples // sweep.binning, len(scene.wavelength_nm)), np.uint16)
     for first in range(0, len(lines), BLOCK_LINES):
         some = slice(first, first + BLOCK_LINES)
-        block = sweep_block(scene, rig, sweep, lines[some], seed=seed, started_s=started_s, samples=of_camera)
+        block = sweep_block(scene, rig, sweep, lines[some], seed=seed, started_s=started_s)
         light = expected_light(scene, block, choice)
         raw[some] = bin_samples(read_out(light, block, choice), sweep.binning)
     return raw
@@ -246,7 +228,7 @@ def take_references(scene: RasterScene, rig: Rig, choice: Choice, sweep: Sweep) 
     block = sweep_block(scene, rig, AT_REST, range(1))
     dark = dark_frame(block, choice)
     assert block.white_e is not None
-    light = np.repeat(block.white_e.astype(np.float32)[None, None], len(block.columns), axis=1)
+    light = np.repeat(block.white_e.astype(np.float32)[None, None], block.rig.camera.samples, axis=1)
     for effect, variant in choice.effects:
         if effect.name not in SEEN:
             continue

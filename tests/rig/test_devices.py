@@ -195,3 +195,11 @@ def test_settings_that_mean_nothing_are_refused(name: str, value: Any):
     """A number that nothing can mean (a deadline in ms) names the setting and the range, a choice those there are."""
     with pytest.raises(SettingsError, match=f"mirror.{name} must be (a number from .* to|one of) .*, got '?{value}"):
         MirrorSettings(**{name: value})
+
+
+def test_defaults_are_assumed_and_say_so():
+    """Nothing was confirmed on hardware."""
+    settings = MirrorSettings()
+    assert settings.provenance == "assumed"
+    assert (settings.vector_pairs, settings.ends, settings.strict_crc) == (1500, "exclusive", False)
+    assert settings.patience.deadline_s == settings.deadline_s
