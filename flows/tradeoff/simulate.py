@@ -49,7 +49,7 @@ class FarmLines:
 
     @property
     def values(self) -> float:
-        sizes = (len(block.lines) * len(block.columns) * len(block.wavelength_nm) for block in self.blocks)
+        sizes = (len(block.lines) * block.rig.camera.samples * len(block.wavelength_nm) for block in self.blocks)
         return float(sum(sizes))
 
     @property
@@ -251,7 +251,7 @@ class Counted:
     @property
     def draws(self) -> int:
         """Of each level."""
-        return len(self.block.lines) * len(self.block.columns)
+        return len(self.block.lines) * self.block.rig.camera.samples
 
     def counts(self, raw: Raw) -> Floats:
         """How often each number came, (level, DN)."""

@@ -15,8 +15,7 @@ from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, FARM_NAMES, farm_scene, refuse_removed
-from pipeline.simulator.scenes.image_scene import raster_from_values
-from pipeline.simulator.scenes.scene import RasterScene
+from pipeline.simulator.scenes.scene import RasterScene, raster_from_values
 from storage.readers.datasets import DataSet, load_data_set
 from storage.readers.scene_files import SceneFile
 

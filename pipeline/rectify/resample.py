@@ -1,4 +1,4 @@
-"""Resampling at scattered points: a sweep's lines with masks, as rows of one table, and images without masks."""
+"""Resampling at scattered points: a sweep's lines with masks, as rows of one table."""
 
 from __future__ import annotations
 
@@ -218,29 +218,6 @@ def _lies_on(placed: Windows, shape: tuple[int, int], corners: NDArray[np.bool_]
         line, sample = np.where(inside, placed.corner, 0).astype(np.intp)
         inside &= corners[line, sample]
     return inside
-
-
-def gather(
-    planes: NDArray[np.float32], y: NDArray[np.float64], x: NDArray[np.float64], kernel: Kernel = "catmull-rom"
-) -> NDArray[np.float32]:
-    """Interpolate an image (row, column, component), float32 without NaN, at scattered rows and columns (n,).
-
-    Integers are pixel centres; outside, the edge pixel is repeated. (n, component) float32: a point's result does not
-    depend on the other points of the call.
-    """
-    rows, columns, components = planes.shape
-    table = tensor_rows(np.ascontiguousarray(planes, np.float32).reshape(rows * columns, components))
-    out = np.empty((len(y), components), np.float32)
-    for block in _blocks(len(out)):
-        placed = windows(np.stack([y[block], x[block]], axis=1), kernel)
-        edge = np.flatnonzero(~placed.inside((rows, columns)))
-        row, column = placed.chosen(edge).taps_by_axis()
-        placed.corner[:, edge] = 0
-        index = placed.flat_index((rows, columns))
-        clipped = outer_index(row.clip(0, rows - 1), column.clip(0, columns - 1), columns)
-        index[torch.from_numpy(edge)] = torch.from_numpy(clipped).to(index.dtype)
-        weighted_rows(table, index, placed.joint_weight(), out[block])
-    return out
 
 
 def resample(

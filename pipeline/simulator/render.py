@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -39,7 +40,7 @@ from pipeline.simulator.optics.kernel_fit import Moments, fold
 from pipeline.simulator.optics.rays import RayViews, exact_views, middle_normal, straight_views
 from pipeline.simulator.optics.scene_light import Looker
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, Scene
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 
 Floats = NDArray[np.float64]
 Light = NDArray[np.float32]
@@ -77,25 +78,23 @@ class Choice:
         return ((effect, variant) for effect, variant in self.effects if hasattr(effect, action))
 
 
-def expected_light(scene: Scene, block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> Light:
+def expected_light(scene: RasterScene, block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> Light:
     """Give the electrons that the samples of some lines gather on average, before the readout.
 
     ``chosen``: The effects that are on, in the order of the chain, each with its variant; none is a camera of rays that
     stands still and whose lines lie straight.
-    Returns (line, sample, band) float32, the block's samples. [e-]
+    Returns (line, sample, band) float32. [e-]
     Raises PoseError: a position, with what aims add, is out of the mirror's reach. SettingsError: an effect has no such
     variant.
     """
     choice = Choice.of(chosen)
-    if block.samples is not None and any(getattr(effect, "whole_line", False) for effect, _ in choice.effects):
-        return expected_light(scene, replace(block, samples=None), choice)[:, block.columns]
     steps = [views.flat() for views in _views(block, choice, scene.shape)]
     exposures = block.rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS
     moments, names = tuple(choice.doing("moments")), tuple(map(choice.variant, ("slit", "smear", "rotation")))
     light = _looker(block.rig, block.sweep, block.wavelength_nm.tobytes(), moments, names).look(
         scene, steps, along_y=block.sweep.along == "y", exposures=exposures
     )
-    light = light.reshape(len(block.lines), len(block.columns), light.shape[1])
+    light = light.reshape(len(block.lines), -1, light.shape[1])
     pending: Light | None = None
     for effect, variant in choice.effects:
         if hasattr(effect, "gain"):
@@ -171,10 +170,10 @@ def read_out(light: Light, block: SweepBlock, chosen: Mapping[Any, str] | Choice
     The converter always rounds (half to even) and never gives less than 0 or more than its full scale.
 
     ``light``: (line, sample, band) of the block; negative values count as 0. [e-]
-    Returns (line, sample, band) uint16, all samples of the block before binning.
+    Returns (line, sample, band) uint16, before binning.
     Raises SceneError: a number is not finite; names the first. ShapeError: the light is not the block's.
     """
-    expected_shape = (len(block.lines), len(block.columns), len(block.wavelength_nm))
+    expected_shape = (len(block.lines), block.rig.camera.samples, len(block.wavelength_nm))
     if light.shape != expected_shape:
         raise ShapeError(f"expected light of {expected_shape} (line, sample, band), got {light.shape}")
     readout = Readout(block, Choice.of(chosen))
@@ -187,7 +186,7 @@ def read_out(light: Light, block: SweepBlock, chosen: Mapping[Any, str] | Choice
 def dark_frame(block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> Light:
     """Give what the chosen readout shows without light, on average, (sample, band) float32, before rounding. [DN]"""
     readout, camera = Readout(block, Choice.of(chosen)), block.rig.camera
-    dark = np.zeros((len(block.columns), len(block.wavelength_nm)), np.float32)
+    dark = np.zeros((camera.samples, len(block.wavelength_nm)), np.float32)
     dark += readout.added
     dark /= np.float32(camera.electrons_per_dn)
     dark += np.float32(camera.dark_dn)
@@ -210,7 +209,7 @@ class Readout:
         if not np.isfinite(expected.max(initial=0.0)):
             sample, band = np.argwhere(~np.isfinite(expected))[0]
             raise SceneError(
-                f"sweep {self.block.sweep.name}: line {number}, sample {self.block.columns[sample]}, band {band}"
+                f"sweep {self.block.sweep.name}: line {number}, sample {sample}, band {band}"
                 f" expects {expected[sample, band]} electrons; give a scene and a rig of finite numbers"
             )
         shot = self._variant(SHOT.name)
@@ -248,14 +247,14 @@ class Readout:
         same = np.float32(dark_electrons(self.block.rig) if dark else 0.0)
         if self._variant(DEFECTS.name) == OFF or not self.block.rig.detector.hot_share:
             return same
-        return hot_electrons(self.block.rig, len(self.block.wavelength_nm))[self.block.columns] + same
+        return hot_electrons(self.block.rig, len(self.block.wavelength_nm)) + same
 
     @cached_property
     def dead(self) -> NDArray[np.bool_] | None:
         """Elements without response, (sample, band); None where there are none."""
         if self._variant(DEFECTS.name) == OFF or not self.block.rig.detector.dead_share:
             return None
-        return dead_elements(self.block.rig, len(self.block.wavelength_nm))[self.block.columns]
+        return dead_elements(self.block.rig, len(self.block.wavelength_nm))
 
     @cached_property
     def read_noise_e(self) -> float:
@@ -277,11 +276,9 @@ class Readout:
         return electrons
 
     def _deviates(self, stream: str, number: int) -> Light:
-        """Standard normal deviates of one line, drawn for the whole camera, (sample, band) of the block."""
-        block, bands = self.block, len(self.block.wavelength_nm)
-        samples = block.rig.camera.samples
-        drawn = normal_deviates(block.stream(stream, number), samples * bands).reshape(samples, bands)
-        return drawn if block.samples is None else drawn[block.columns]
+        """Standard normal deviates of one line, (sample, band)."""
+        size = self.block.rig.camera.samples, len(self.block.wavelength_nm)
+        return normal_deviates(self.block.stream(stream, number), math.prod(size)).reshape(size)
 
     def _variant(self, name: str) -> str:
         ideal = self.block.rig.detector.noiseless and name in (SHOT.name, READ_NOISE.name)

@@ -26,7 +26,7 @@ from pipeline.simulator.effects.sensor import PRNU, STRIPING
 from pipeline.simulator.effects.spectrometer import RESPONSE, SMILE
 from pipeline.simulator.render import Choice, dark_frame, expected_light, read_out
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, Scene
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from pipeline.source import AT_REST, Line, References
 
 Raw = NDArray[np.uint16]
@@ -45,7 +45,7 @@ class SimulatedSource:
     With ``pointing`` the mirror looks beside the planned positions and still reports those.
     """
 
-    scene: Scene
+    scene: RasterScene
     rig: Rig
     seed: int = 0
     chosen: Mapping[Any, str] | Choice = USUAL
@@ -173,27 +173,15 @@ def sweep_starts(
 
 
 def sweep_block(
-    scene: Scene,
-    rig: Rig,
-    sweep: Sweep,
-    lines: range,
-    *,
-    seed: int = 0,
-    started_s: float = 0.0,
-    samples: range | None = None,
+    scene: RasterScene, rig: Rig, sweep: Sweep, lines: range, *, seed: int = 0, started_s: float = 0.0
 ) -> SweepBlock:
-    """Give some lines of a sweep over a scene, as effects ask about them.
-
-    ``samples`` are the camera's, before binning; ``started_s`` is when the sweep starts, after the survey did.
-    """
+    """Give some lines of a sweep, which starts ``started_s`` after the survey did, as effects ask about them."""
     white = scene.panel_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
-    return SweepBlock(
-        rig, sweep, lines, scene.wavelength_nm, scene.shape, seed, samples, started_s, scene.fwhm_nm, white
-    )
+    return SweepBlock(rig, sweep, lines, scene.wavelength_nm, scene.shape, seed, started_s, scene.fwhm_nm, white)
 
 
 def render_lines(
-    scene: Scene,
+    scene: RasterScene,
     rig: Rig,
     chosen: Mapping[Any, str] | Choice,
     sweep: Sweep,
@@ -201,24 +189,18 @@ def render_lines(
     *,
     seed: int = 0,
     started_s: float = 0.0,
-    samples: range | None = None,
 ) -> Raw:
     """Give the raw numbers of some lines, (line, sample, band) uint16, binned [DN]. Pure: threads may share arguments.
 
-    Neither the other lines and samples asked for nor the order of calls changes a number. ``samples``: neighbouring
-    ones of the binned line; None is all. Raises ShapeError: sums of ``sweep.binning`` samples at full scale do not fit
-    uint16, or the line has no such samples; PoseError: a position of the sweep is out of the mirror's reach.
+    Neither the other lines asked for nor the order of calls changes a number. Raises ShapeError: sums of
+    ``sweep.binning`` samples at full scale do not fit uint16. PoseError: a position is out of the mirror's reach.
     """
     check_binning(sweep, rig.camera)
-    choice, count = Choice.of(chosen), rig.camera.samples // sweep.binning
-    taken = range(count) if samples is None else samples
-    if taken.step != 1 or not 0 <= taken.start < taken.stop <= count:
-        raise ShapeError(f"sweep {sweep.name} has samples 0 to {count - 1} a line; expected some in a row, got {taken}")
-    of_camera = None if samples is None else range(taken.start * sweep.binning, taken.stop * sweep.binning)
-    raw = np.empty((len(lines), len(taken), len(scene.wavelength_nm)), np.uint16)
+    choice = Choice.of(chosen)
+    raw = np.empty((len(lines), rig.camera.samples // sweep.binning, len(scene.wavelength_nm)), np.uint16)
     for first in range(0, len(lines), BLOCK_LINES):
         some = slice(first, first + BLOCK_LINES)
-        block = sweep_block(scene, rig, sweep, lines[some], seed=seed, started_s=started_s, samples=of_camera)
+        block = sweep_block(scene, rig, sweep, lines[some], seed=seed, started_s=started_s)
         light = expected_light(scene, block, choice)
         raw[some] = bin_samples(read_out(light, block, choice), sweep.binning)
     return raw
@@ -236,7 +218,7 @@ def check_binning(sweep: Sweep, camera: LineCamera) -> None:
         )
 
 
-def take_references(scene: Scene, rig: Rig, choice: Choice, sweep: Sweep) -> References:
+def take_references(scene: RasterScene, rig: Rig, choice: Choice, sweep: Sweep) -> References:
     """Give mean dark and white frames (sample, band) with the sweep's binning, free of noise. [DN]
 
     The white frame is scaled from a shorter exposure, so that it does not saturate; it is taken with the mirror at
@@ -246,7 +228,7 @@ def take_references(scene: Scene, rig: Rig, choice: Choice, sweep: Sweep) -> Ref
     block = sweep_block(scene, rig, AT_REST, range(1))
     dark = dark_frame(block, choice)
     assert block.white_e is not None
-    light = np.repeat(block.white_e.astype(np.float32)[None, None], len(block.columns), axis=1)
+    light = np.repeat(block.white_e.astype(np.float32)[None, None], block.rig.camera.samples, axis=1)
     for effect, variant in choice.effects:
         if effect.name not in SEEN:
             continue

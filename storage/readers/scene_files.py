@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from pipeline.readings import MOST_STEPS, MOST_VALUE, beyond_range, find_beyond
-from pipeline.simulator.scenes.image_scene import BRIGHT_PERCENTILE
+from pipeline.simulator.scenes.scene import BRIGHT_PERCENTILE
 from storage.archive.staging import file_hash
 from storage.readers.cube_sources import BLOCK_LINES, Raster, machine_bytes, scene_lines
 from storage.readers.labels import Labels, find_layout, load_labels

@@ -32,8 +32,7 @@ from pipeline.rectify.resample import resample
 from pipeline.simulator.effects.pointing import ACCURACY_PX, REPEATABILITY_PX, PointingErrors
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
-from pipeline.simulator.scenes.image_scene import raster_from_values
-from pipeline.simulator.scenes.scene import to_bands
+from pipeline.simulator.scenes.scene import raster_from_values, to_bands
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import References
 

@@ -21,8 +21,7 @@ from pipeline.simulator.effects.probe import Unit, noise_electrons, stored_mean,
 from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Detector, Rig
-from pipeline.simulator.scenes.image_scene import raster_from_values
-from pipeline.simulator.scenes.scene import RasterScene
+from pipeline.simulator.scenes.scene import RasterScene, raster_from_values
 from pipeline.simulator.selection.choice import TOTAL, decide
 from pipeline.simulator.selection.survey_probe import probe_survey
 from pipeline.simulator.selection.verification import candidate_blocks, verify, worst_blocks

@@ -26,7 +26,7 @@ from pipeline.rig.emulator.mirror_device import Fault
 from pipeline.rig.mirror.mirror_controller import MirrorController
 from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.scenes.scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Line
 

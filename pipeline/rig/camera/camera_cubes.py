@@ -57,7 +57,6 @@ class CubeLines:
     """Lines of one file. ``lost`` are those that its header promises and it does not hold whole."""
 
     values: NDArray[np.uint16]  # (line, sample, band), a view of the bytes
-    header: CubeHeader
     lost: int
 
 
@@ -105,7 +104,7 @@ def cube_lines(header: CubeHeader, data: bytes) -> CubeLines:
     held = min(max(len(data) - header.offset, 0) // header.line_bytes, header.lines)
     shape = (held, header.bands, header.samples)
     values = np.ndarray(shape, header.dtype, data, header.offset if held else 0).transpose(0, 2, 1)
-    return CubeLines(values, header, header.lines - held)
+    return CubeLines(values, header.lines - held)
 
 
 def read_capture(names: Iterable[str], read: Read) -> CapturedLines:

@@ -61,8 +61,22 @@ class CaptureUnknown(StateUnknown):
     """A capture was sent and not acknowledged; what was found on asking stands in the message."""
 
 
-class HeadwallControl:
-    """Commands to the camera.
+@dataclass(frozen=True)
+class FrameClaim:
+    """What a capture was asked for: frames, in all its cubes, of so many numbers of 16 bits."""
+
+    frames: int
+    samples: int
+    bands: int
+
+    @property
+    def frame_bytes(self) -> int:
+        """Bytes of a frame."""
+        return 2 * self.samples * self.bands
+
+
+class HeadwallCamera:
+    """A line camera for surveys: its commands and its files. Nothing is connected before the first command.
 
     After a reply that was late or damaged the connection is given up and made anew, so that what comes late is never
     taken for the next command's reply. ``connect`` makes a connection. Commands raise DeviceRefused, DeadlinePassed or
@@ -72,11 +86,13 @@ class HeadwallControl:
     def __init__(
         self,
         connect: Callable[[], Transport],
+        server: FileServer,
         *,
         clock: Clock = SYSTEM_CLOCK,
         patience: ControlPatience | None = None,
         limits: CameraLimits | None = None,
     ) -> None:
+        self.server = server
         self.patience = ControlPatience() if patience is None else patience
         self.limits = CameraLimits() if limits is None else limits
         self.clock = clock
@@ -85,6 +101,15 @@ class HeadwallControl:
         self._line: Transport | None = None
         self._reader = ReplyReader()
         self._lock = threading.RLock()
+
+    @classmethod
+    def at(cls, address: CameraAddress, server: FileServer, *, clock: Clock = SYSTEM_CLOCK, **given: Any) -> Self:
+        """A camera on the network."""
+
+        def connect() -> SocketTransport:
+            return SocketTransport(address.host, address.port, clock, connect_s=address.connect_s)
+
+        return cls(connect, server, clock=clock, **given)
 
     def configure(self, exposure_ms: float, frame_period_ms: float) -> None:
         """Set exposure and frame period. [ms]
@@ -144,6 +169,26 @@ class HeadwallControl:
         if not folder:
             raise SettingsError("expected a folder of the camera to list, such as /captured, got an empty name")
         return self._ask("listFiles", folder, as_listing)
+
+    def fetch(
+        self, folder: str, kept: Kept, progress: Progress | None = None, *, claim: FrameClaim | None = None
+    ) -> CapturedLines:
+        """Get a finished capture's files, small ones first, and give its lines; a later call continues.
+
+        RigError where the capture still runs, its files do not belong together, or are larger than ``claim`` lets them
+        be; DeviceRefused, DeadlinePassed, DeviceGone.
+        """
+        files = self._finished(folder, claim)
+        files.sort(key=lambda file: (bool(_RAW.fullmatch(file.base)), file.name))
+        fetch_files(self.server, files, kept, progress, clock=self.clock)
+        return read_capture([file.name for file in files], _reader(kept))
+
+    def references(self, folder: str, kept: Kept, *, claim: FrameClaim | None = None) -> dict[str, MeanFrame]:
+        """Mean frames of the reference cubes in a capture's folder, by ``dark`` and ``white``; empty without any."""
+        files = [file for file in self._finished(folder, claim) if file.base.lower().startswith(("dark", "white"))]
+        fetch_files(self.server, files, kept, clock=self.clock)
+        cubes = read_references([file.name for file in files], _reader(kept))
+        return {kind: mean_frame(cube.values) for kind, cube in cubes.items()}
 
     def close(self) -> None:
         """Say exit and hang up. A capture goes on; nothing is raised."""
@@ -272,69 +317,6 @@ class HeadwallControl:
             "Look at the camera, stop what runs there, then run again, which connects anew"
         )
 
-
-def _told(came: bytes) -> str:
-    return f"{len(came)} bytes came: {came[:80]!r}" if came else "nothing came"
-
-
-@dataclass(frozen=True)
-class FrameClaim:
-    """What a capture was asked for: frames, in all its cubes, of so many numbers of 16 bits."""
-
-    frames: int
-    samples: int
-    bands: int
-
-    @property
-    def frame_bytes(self) -> int:
-        """Bytes of a frame."""
-        return 2 * self.samples * self.bands
-
-
-class HeadwallCamera(HeadwallControl):
-    """A line camera for surveys: its commands and its files. Nothing is connected before the first command."""
-
-    def __init__(
-        self,
-        connect: Callable[[], Transport],
-        server: FileServer,
-        *,
-        clock: Clock = SYSTEM_CLOCK,
-        patience: ControlPatience | None = None,
-        limits: CameraLimits | None = None,
-    ) -> None:
-        super().__init__(connect, clock=clock, patience=patience, limits=limits)
-        self.server = server
-
-    @classmethod
-    def at(cls, address: CameraAddress, server: FileServer, *, clock: Clock = SYSTEM_CLOCK, **given: Any) -> Self:
-        """A camera on the network."""
-
-        def connect() -> SocketTransport:
-            return SocketTransport(address.host, address.port, clock, connect_s=address.connect_s)
-
-        return cls(connect, server, clock=clock, **given)
-
-    def fetch(
-        self, folder: str, kept: Kept, progress: Progress | None = None, *, claim: FrameClaim | None = None
-    ) -> CapturedLines:
-        """Get a finished capture's files, small ones first, and give its lines; a later call continues.
-
-        RigError where the capture still runs, its files do not belong together, or are larger than ``claim`` lets them
-        be; DeviceRefused, DeadlinePassed, DeviceGone.
-        """
-        files = self._finished(folder, claim)
-        files.sort(key=lambda file: (bool(_RAW.fullmatch(file.base)), file.name))
-        fetch_files(self.server, files, kept, progress, clock=self.clock)
-        return read_capture([file.name for file in files], _reader(kept))
-
-    def references(self, folder: str, kept: Kept, *, claim: FrameClaim | None = None) -> dict[str, MeanFrame]:
-        """Mean frames of the reference cubes in a capture's folder, by ``dark`` and ``white``; empty without any."""
-        files = [file for file in self._finished(folder, claim) if file.base.lower().startswith(("dark", "white"))]
-        fetch_files(self.server, files, kept, clock=self.clock)
-        cubes = read_references([file.name for file in files], _reader(kept))
-        return {kind: mean_frame(cube.values) for kind, cube in cubes.items()}
-
     def _finished(self, folder: str, claim: FrameClaim | None) -> list[RemoteFile]:
         """Files of a folder, as two listings in a row have them: one that lost an entry on its way looks whole."""
         if self.is_capturing():
@@ -346,6 +328,10 @@ class HeadwallCamera(HeadwallControl):
                 files = [file for file in listed if not file.folder]
                 return files if claim is None else bounded(files, claim)
         raise RigError(f"{folder} was listed differently each time; look at the camera's network, then run again")
+
+
+def _told(came: bytes) -> str:
+    return f"{len(came)} bytes came: {came[:80]!r}" if came else "nothing came"
 
 
 def _reader(kept: Kept) -> Read:

@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from pipeline.errors import RigError
+from pipeline.rig.device_settings import FileServer
 from pipeline.rig.devices import Clock, Closing, DeviceGone
 from pipeline.rig.emulator import Chunk
 from pipeline.rig.emulator.camera_device import MOST_LINE, PROMPT, CameraDevice
@@ -121,16 +122,7 @@ class CameraServer(Closing):
     RigError where a port is taken.
     """
 
-    def __init__(
-        self,
-        device: CameraDevice,
-        *,
-        host: str = "127.0.0.1",
-        port: int = 0,
-        file_port: int = 0,
-        user: str = "ftpuser",
-        password: str = "ftpuser",
-    ) -> None:
+    def __init__(self, device: CameraDevice, *, host: str = "127.0.0.1", port: int = 0, file_port: int = 0) -> None:
         self.device = device
         self.host = host
         self._ended = threading.Event()
@@ -142,7 +134,7 @@ class CameraServer(Closing):
                 f"{host}:{port} cannot be listened on ({error}); take another port, or 0 for a free one"
             ) from error
         try:
-            self._files = _file_server(device, (host, file_port), (user, password))
+            self._files = _file_server(device, (host, file_port))
         except BaseException:
             self._listener.close()
             raise
@@ -201,13 +193,13 @@ class CameraServer(Closing):
         self._files.close_all()
 
 
-def _file_server(device: CameraDevice, address: tuple[str, int], user: tuple[str, str]) -> FTPServer:
+def _file_server(device: CameraDevice, address: tuple[str, int]) -> FTPServer:
     chatter = logging.getLogger("pyftpdlib")
     chatter.setLevel(logging.ERROR)
     if not chatter.handlers:
         chatter.addHandler(logging.NullHandler())  # else it turns itself up to everything, on stderr
     authorizer = DummyAuthorizer()
-    authorizer.add_user(*user, homedir=".", perm="elr")
+    authorizer.add_user(FileServer.user, FileServer.password, homedir=".", perm="elr")
     handler = type("CameraFileHandler", (_FileHandler,), {"device": device, "authorizer": authorizer})
     try:
         return FTPServer(address, handler, ioloop=IOLoop())

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from itertools import count
 
 from pipeline.errors import RigError
-from pipeline.rig.devices import Clock, DeadlinePassed, DeviceGone
+from pipeline.rig.devices import Clock, Closing, DeadlinePassed, DeviceGone
 from pipeline.rig.emulator import Chunk
 from pipeline.rig.emulator.mirror_device import MirrorDevice, VanishedError
 from pipeline.rig.transports import BITS_PER_BYTE
@@ -95,7 +95,7 @@ class InProcessTransport:
         return DeviceGone(f"{self.port} went away; look at the cable and the power, then connect again")
 
 
-class EmulatedPort:
+class EmulatedPort(Closing):
     """A pty and the thread that serves it, from :meth:`open` to :meth:`close`; use it as a context.
 
     The device's clock paces the bytes, too. ``baud`` is the speed in both directions; 0 lets bytes through as they
@@ -111,9 +111,6 @@ class EmulatedPort:
     def __enter__(self) -> EmulatedPort:
         self.open()
         return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
 
     def open(self) -> str:
         """Make the pty, serve it, and give the name that users open; RigError where this system has no ptys."""

@@ -28,7 +28,6 @@ from pipeline.rig.mirror.pro_mode import (
     error_words,
     go_simple,
 )
-from pipeline.rig.mirror.registers import Status
 from pipeline.rig.transports import Kind, Receiver, Wire
 
 LOG = logging.getLogger(__name__)
@@ -96,7 +95,7 @@ def check_done(line: bytes, request: str, port: str) -> None:
 def read_text(line: bytes, request: str, port: str) -> str:
     """Read a reply that is text of the device's own, such as its id.
 
-    It and the readers below raise DeviceRefused where the device said no, and RigError where the reply is none.
+    It and the reader below raise DeviceRefused where the device said no, and RigError where the reply is none.
     """
     text = line.decode("ascii", "backslashreplace").strip()
     if not re.fullmatch(r"[ -~]+", text) or "\\x" in text:
@@ -104,14 +103,6 @@ def read_text(line: bytes, request: str, port: str) -> str:
     if text.upper() in (Reply.NO, Reply.ERROR):
         check_done(line, request, port)
     return text
-
-
-def read_status(line: bytes, port: str) -> Status:
-    """Read the 32 status bits, in hexadecimal with or without 0x before them."""
-    text = read_text(line, STATUS, port)
-    if not re.fullmatch(r"(0[xX])?[0-9a-fA-F]{1,8}", text):
-        raise RigError(f"expected up to 8 hexadecimal digits to {STATUS} from {port}, got {text!r}")
-    return Status(int(text, 16))
 
 
 def read_temperature(line: bytes, port: str) -> float:

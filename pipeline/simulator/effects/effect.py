@@ -111,9 +111,9 @@ class LightChange(Effect, Protocol):
 
 @dataclass(frozen=True)
 class SweepBlock:
-    """Lines ``lines`` (numbers within the sweep) and samples ``samples`` (of the camera, before binning).
+    """Lines ``lines`` (numbers within the sweep), with all samples of the camera, before binning.
 
-    A result never depends on which other lines or samples are in the block. ``started_s`` is since the survey's start.
+    A result never depends on which other lines are in the block. ``started_s`` is since the survey's start.
     """
 
     rig: Rig
@@ -122,7 +122,6 @@ class SweepBlock:
     wavelength_nm: Floats  # (band,)
     shape: tuple[int, int]  # of the scene [px]
     seed: int = 0
-    samples: range | None = None  # None is all of the camera
     started_s: float = 0.0
     fwhm_nm: Floats | None = None  # (band,) of the scene's own bands; None where not known
     white_e: Floats | None = None  # (band,) electrons of the white panel in one exposure; None where not known
@@ -133,15 +132,9 @@ class SweepBlock:
         return np.arange(self.lines.start, self.lines.stop, self.lines.step, dtype=np.int64)
 
     @property
-    def columns(self) -> NDArray[np.int64]:
-        """(sample,) of the camera."""
-        taken = range(self.rig.camera.samples) if self.samples is None else self.samples
-        return np.arange(taken.start, taken.stop, taken.step, dtype=np.int64)
-
-    @property
     def slopes(self) -> Floats:
         """(sample,) tangent of each sample's ray along the line."""
-        return self.rig.camera.pixel_slopes()[self.columns]
+        return self.rig.camera.pixel_slopes()
 
     @property
     def time_s(self) -> Floats:

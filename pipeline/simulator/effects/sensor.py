@@ -10,7 +10,6 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import ShapeError
 from pipeline.simulator.effects.effect import Bound, Gain, LightChange, SweepBlock, unit_stream
 from pipeline.simulator.effects.noise import normal_deviates
 from pipeline.simulator.effects.probe import GainRange, Probe
@@ -40,7 +39,7 @@ class Prnu(Gain):
         return _range_of(response_gain(rig, len(probe.wavelength_nm)), probe)
 
     def gain(self, block: SweepBlock, variant: str) -> Light:
-        return response_gain(block.rig, len(block.wavelength_nm))[None, block.columns]
+        return response_gain(block.rig, len(block.wavelength_nm))[None]
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,7 @@ class Striping(Gain):
         return _range_of(stripe_gain(rig), probe)
 
     def gain(self, block: SweepBlock, variant: str) -> Light:
-        return stripe_gain(block.rig)[None, block.columns]
+        return stripe_gain(block.rig)[None]
 
 
 def response_gain(rig: Rig, bands: int) -> Light:
@@ -102,7 +101,6 @@ class StrayLight(LightChange):
 
     name = "stray-light"
     cost_ns = MappingProxyType({HALO: 1.2, EVEN: 0.65})
-    whole_line = True  # light comes from all samples: a line is made whole, then cut
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound it by f (S - mean), were all to fall evenly, and what the halo differs from that."""
@@ -117,15 +115,10 @@ class StrayLight(LightChange):
         return Bound(optics.stray_share * spread + halo, why)
 
     def change(self, light: Light, block: SweepBlock, variant: str) -> Light:
-        """Give the light after scattering; works in place. Raises ShapeError: samples of the line are missing."""
-        optics, samples = block.rig.optics, block.rig.camera.samples
+        """Give the light after scattering; works in place."""
+        optics = block.rig.optics
         if optics.stray_share == 0:
             return light
-        if light.shape[1] != samples:
-            raise ShapeError(
-                f"stray light comes from all {samples} samples of a line, got {light.shape[1]}; "
-                "make whole lines and cut them afterwards, or leave stray-light out"
-            )
         for line in light:  # line by line: rounding, too, does not depend on the block
             even = np.float32(optics.stray_share * line.mean(dtype=np.float64))
             scattered = _scattered(line, optics) if variant == HALO else even

@@ -52,7 +52,6 @@ class Response(LightChange):
 
     name = "response"
     cost_ns = MappingProxyType({EXACT: 2.2})
-    whole_line = True  # a product's rounding depends on how many samples it has: a line is made whole, then cut
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound it by I'' v / 2, or by I' sqrt(v) where that is less; 0 where the scene's bands are as wide.
@@ -185,8 +184,6 @@ class Smile(LightChange):
             return light
         bands = tuple(map(float, block.wavelength_nm))
         first, weights = _tap_weights(bands, float(smile), camera.samples, variant)
-        if block.samples is not None:
-            weights = np.take(weights, block.columns, axis=1)
         out = np.empty_like(light)
         for start in range(0, light.shape[1], SAMPLES_AT_ONCE):
             some = slice(start, start + SAMPLES_AT_ONCE)

@@ -22,7 +22,7 @@ from pipeline.geometry.scan import Sweep, scene_to_sweep
 from pipeline.simulator.optics.kernel_fit import Footprint
 from pipeline.simulator.optics.rays import RayViews, exact_views
 from pipeline.simulator.optics.scene_light import Looker
-from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, Scene, to_bands
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, to_bands
 
 Light = NDArray[np.float32]
 TELLING_BANDS = 4
@@ -60,7 +60,9 @@ class _Optics:
         return total
 
 
-def telling_places(scene: Scene, camera: LineCamera, sweeps: Sequence[Sweep], most: int = 200) -> NDArray[np.float64]:
+def telling_places(
+    scene: RasterScene, camera: LineCamera, sweeps: Sequence[Sweep], most: int = 200
+) -> NDArray[np.float64]:
     """Find the places where light changes most over its noise, and where there is most and least of it.
 
     Only where ``sweeps``, all of one binning, look; at most ``most``, each in a tile of its own for one measure and
@@ -120,20 +122,15 @@ def telling_bands(spectra: Light) -> NDArray[np.intp]:
     return np.unique(chosen)
 
 
-def _strips(scene: Scene, tile: int, halo: int) -> Iterator[tuple[int, Light]]:
-    rows, columns = scene.shape
-    across = np.arange(-halo, columns + halo).clip(0, columns - 1)
+def _strips(scene: RasterScene, tile: int, halo: int) -> Iterator[tuple[int, Light]]:
+    rows = scene.shape[0]
     for first in range(0, rows, tile):
         down = np.arange(first - halo, min(first + tile, rows) + halo).clip(0, rows - 1)
-        if isinstance(scene, RasterScene):
-            inner = scene.planes[down[0] : down[-1] + 1][down - down[0]]
-            yield first, np.pad(inner, ((0, 0), (halo, halo), (0, 0)), mode="edge")
-        else:
-            y, x = (axis.ravel().astype(np.float64) for axis in np.meshgrid(down, across, indexing="ij"))
-            yield first, scene.sample(y, x).reshape(len(down), len(across), -1)
+        inner = scene.planes[down[0] : down[-1] + 1][down - down[0]]
+        yield first, np.pad(inner, ((0, 0), (halo, halo), (0, 0)), mode="edge")
 
 
-def _check_finite(scene: Scene, planes: Light, first: int) -> None:
+def _check_finite(scene: RasterScene, planes: Light, first: int) -> None:
     with np.errstate(invalid="ignore", over="ignore"):  # infinity less infinity: found out below
         if np.isfinite(planes.sum(dtype=np.float64)):
             return
@@ -231,7 +228,7 @@ def joined(parts: list[SampleViews]) -> SampleViews:
 
 
 def light_seen(
-    scene: Scene,
+    scene: RasterScene,
     camera: LineCamera,
     views: SampleViews,
     footprint: Footprint,
@@ -300,7 +297,7 @@ def views_of_lines(sweeps: tuple[Sweep, ...], camera: LineCamera, room: int) -> 
     )
 
 
-def views_of_places(places: Floats, scene: Scene, camera: LineCamera, sweeps: tuple[Sweep, ...]) -> SampleViews:
+def views_of_places(places: Floats, scene: RasterScene, camera: LineCamera, sweeps: tuple[Sweep, ...]) -> SampleViews:
     """Patches around places, each as the finest and the most oblique sweep of each orientation see it.
 
     All sweeps sum as many samples to a number.

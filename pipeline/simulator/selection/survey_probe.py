@@ -19,7 +19,7 @@ from pipeline.simulator.optics.rays import middle_normal
 from pipeline.simulator.optics.tap_sums import LADDER
 from pipeline.simulator.render import views_all_over
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, Scene
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from pipeline.simulator.selection.survey_looks import (
     SampleViews,
     joined,
@@ -47,7 +47,7 @@ _NEAR, _FAR = 0.25, 0.5  # px by which the footprint is shifted
 _PHASES = tuple(((along, scan), (0.0, 0.0)) for along in (0.0, 0.5) for scan in (0.0, 0.5))  # at which boxes differ
 
 
-def probe_survey(scene: Scene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit = "sigma") -> tuple[Probe, ...]:
+def probe_survey(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit = "sigma") -> tuple[Probe, ...]:
     """Probe the scene for sweeps of any binning: one probe for each binning that they have, the smallest first.
 
     Time, lines and the usual light they have in common. Raises SceneError, SettingsError, PoseError as `probe_scene`.
@@ -59,7 +59,7 @@ def probe_survey(scene: Scene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit = "
     return tuple(replace(one, lines=lines, seconds=seconds, usual_e=probes[0].usual_e) for one in probes)
 
 
-def probe_scene(scene: Scene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit = "sigma") -> Probe:
+def probe_scene(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit = "sigma") -> Probe:
     """Look at the scene through the footprint alone where it is steepest, brightest and darkest, and along some lines.
 
     Where to look is found on the scene's own pixels, so that the maxima hold for the whole image. Raises SceneError:
@@ -96,21 +96,22 @@ def _taken(sweeps: Sequence[Sweep]) -> tuple[Sweep, ...]:
     return taken
 
 
-def _slit_errors(scene: Scene, rig: Rig, views: SampleViews, sweeps: tuple[Sweep, ...], unit: Unit) -> dict[str, float]:
+def _slit_errors(
+    scene: RasterScene, rig: Rig, views: SampleViews, sweeps: tuple[Sweep, ...], unit: Unit
+) -> dict[str, float]:
     """Greatest change by every variant of the slit, over the unit: off, or against the finest, beside the rig's blurs.
 
-    Each sweep is seen through the boxes that a variant takes for it. Scenes without pixels know no boxes.
+    Each sweep is seen through the boxes that a variant takes for it.
     """
-    ladder = LADDER if isinstance(scene, RasterScene) else LADDER[-1:]
     views = views.chosen_sums(_roughest(scene, rig, views, unit))
     sweep_of = views.sweep[:: views.binning]
     whole = [views_all_over(rig, sweep, exact=True) for sweep in sweeps]
     errors = dict.fromkeys((*SLIT.variants[1:], OFF), 0.0)
     for moments in _blurs(rig, scene.wavelength_nm, sweeps):
-        boxes = {parts: _footprint(SLIT.variants[0], rig, parts, moments, scene) for parts in ladder}
+        boxes = {parts: _footprint(SLIT.variants[0], rig, parts, moments, scene) for parts in LADDER}
         finest = light_seen(scene, rig.camera, views, boxes[LADDER[-1]], _PHASES)
         scale = unit_at(_stored(finest, views), rig, unit, views.binning)
-        found = {parts: _changes(scene, rig, views, boxes[parts], finest, scale) for parts in ladder[:-1]}
+        found = {parts: _changes(scene, rig, views, boxes[parts], finest, scale) for parts in LADDER[:-1]}
         found[LADDER[-1]] = np.zeros(views.sums)
         for variant in SLIT.variants[1:]:
             taken = [box_parts(variant, rig, one) for one in whole]
@@ -121,7 +122,7 @@ def _slit_errors(scene: Scene, rig: Rig, views: SampleViews, sweeps: tuple[Sweep
     return errors
 
 
-def _roughest(scene: Scene, rig: Rig, views: SampleViews, unit: Unit) -> NDArray[np.intp]:
+def _roughest(scene: RasterScene, rig: Rig, views: SampleViews, unit: Unit) -> NDArray[np.intp]:
     boxes = _footprint(SLIT.variants[0], rig, _CLOSE, None, scene)
     close = light_seen(scene, rig.camera, views, boxes, _PHASES)
     scale, found = unit_at(_stored(close, views), rig, unit, views.binning), []
@@ -136,14 +137,18 @@ def _roughest(scene: Scene, rig: Rig, views: SampleViews, unit: Unit) -> NDArray
     return np.unique(np.concatenate(found))
 
 
-def _changes(scene: Scene, rig: Rig, views: SampleViews, footprint: Footprint, finest: Light, scale: Light) -> Floats:
+def _changes(
+    scene: RasterScene, rig: Rig, views: SampleViews, footprint: Footprint, finest: Light, scale: Light
+) -> Floats:
     """Greatest change of each stored number by another footprint, over the unit, (number,): measured, with its sign."""
     change = light_seen(scene, rig.camera, views, footprint, _PHASES) - finest
     change = np.abs(_stored(np.where(np.abs(change) > _ROUNDING * np.abs(finest), change, np.float32(0)), views))
     return np.asarray((change / scale).max(axis=(0, 2)).astype(np.float64))
 
 
-def _footprint(variant: str, rig: Rig, parts: tuple[int, int], moments: Moments | None, scene: Scene) -> Footprint:
+def _footprint(
+    variant: str, rig: Rig, parts: tuple[int, int], moments: Moments | None, scene: RasterScene
+) -> Footprint:
     blurs = moments or Moments.together([], len(scene.wavelength_nm))
     return fold(box_of(variant, rig), parts, 1, blurs)
 
@@ -173,7 +178,7 @@ def _stored(values: Light, views: SampleViews) -> Light:
     return np.asarray(stored_mean(values, views.binning), np.float32)
 
 
-def _summed_up(scene: Scene, rig: Rig, sweeps: tuple[Sweep, ...], unit: Unit, seen: Light, means: Light) -> Probe:
+def _summed_up(scene: RasterScene, rig: Rig, sweeps: tuple[Sweep, ...], unit: Unit, seen: Light, means: Light) -> Probe:
     """Turn light (shift, view, band) and means of lines (line,) into the probe's maxima."""
     camera, binning, least, most = rig.camera, sweeps[0].binning, seen.min(axis=0), seen.max(axis=0)
     darkest, brightest = stored_mean(least, binning), stored_mean(most, binning)

@@ -184,8 +184,7 @@ def _greatest_change(one: _Rendered, light: Light, bound: float, share: float) -
     worst = np.unravel_index(int(np.argmax(change - rounding)), change.shape)  # the first NaN, if there is one
     line, number, band = worst
     block, summed = one.block, "" if binning == 1 else f" (of {binning} summed)"
-    count = number if binning > 1 else block.columns[number]
-    place = f"sweep {block.sweep.name}, line {block.numbers[line]}, sample {count}{summed}, band {band}"
+    place = f"sweep {block.sweep.name}, line {block.numbers[line]}, sample {number}{summed}, band {band}"
     return _Change(
         float(change.max()), float(change[worst]), float(rounding[worst]), f"{place} of the {one.name} lines"
     )
@@ -224,7 +223,7 @@ def contrast_about(block: SweepBlock, render: Render) -> Floats:
     ends = block.lines.start * sweep.step - REACH_PX, block.lines.stop * sweep.step + REACH_PX
     wide = replace(block, sweep=held, lines=range(max(ends[0], 0), min(ends[1], held.lines)))
     if not wide.lines:
-        return np.zeros((1, len(block.columns), len(block.wavelength_nm)))
+        return np.zeros((1, block.rig.camera.samples, len(block.wavelength_nm)))
     looks = [render(replace(wide, sweep=_beside(held, *way)), MIDDLE_RAYS) for way in _HALVES]
     seen = np.concatenate(looks)
     ends_e = seen.max(axis=0), -seen.min(axis=0)

@@ -22,7 +22,7 @@ from pipeline.geometry.grid import UNLABELLED
 from pipeline.rectify.registration.illumination import LightRatio
 from pipeline.simulator.effects.pointing import CommonOffset, PointingErrors
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.scenes.scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef

@@ -17,7 +17,7 @@ from pipeline.geometry.scan import Sweep
 from pipeline.simulator import render, simulated
 from pipeline.simulator.effects.registry import BY_NAME, effects_on
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.scenes.scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Line
 from storage.arrays.spool import Spool

@@ -40,8 +40,7 @@ from pipeline.rig.mirror.mirror_controller import MirrorController
 from pipeline.rig.mirror.pro_mode import Command
 from pipeline.rig.transports import SerialTransport
 from pipeline.simulator.effects.registry import effects_on
-from pipeline.simulator.scenes.image_scene import raster_from_values
-from pipeline.simulator.scenes.scene import RasterScene
+from pipeline.simulator.scenes.scene import RasterScene, raster_from_values
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import References
 from storage.archive.archive import Archive

@@ -14,8 +14,7 @@ from models.training.examples import CropSampler, Example, Observation, measured
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera, expose, footprint
 from pipeline.geometry.grid import SceneGrid
-from pipeline.simulator.scenes.image_scene import raster_from_values
-from pipeline.simulator.scenes.scene import RasterScene, SceneRaster
+from pipeline.simulator.scenes.scene import RasterScene, SceneRaster, raster_from_values
 
 CAMERA = LineCamera(bits=14)
 NM = np.linspace(450, 950, 6)

@@ -38,14 +38,6 @@ def test_seats_are_numbered_row_by_row():
     assert grid.seat_origin(np.array([0, 5, 15])).tolist() == [[0, 0], [16, 16], [48, 48]]
 
 
-def test_one_pixel_makes_one_seat():
-    """The smallest scene has one valid seat, partly filled, and one coarse pixel."""
-    grid = SceneGrid(1, 1, 8, 4)
-    assert grid.valid_seats().tolist() == [0]
-    assert grid.valid_share()[0, 0] == 1 / 64
-    assert grid.coarse_shape == (1, 1)
-
-
 @pytest.mark.parametrize("field", ["height", "width", "patch", "factor"])
 def test_sizes_below_one_are_refused(field: str):
     """The message names the size and what came."""

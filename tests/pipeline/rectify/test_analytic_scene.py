@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -18,34 +18,31 @@ from pipeline.rectify.mosaic import MosaicPart, edge_distance, mosaic
 from pipeline.rectify.resample import resample
 from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
+from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource
+from tests.pipeline.simulator.small_scenes import made_scene
 
 CAMERA = LineCamera(
     bits=14, electrons_per_dn=1.0
 )  # finer steps than the rig's, so that rounding does not blur the figure
 FULL = 15_000.0
-
-
-def ones(bands: int = 2) -> np.ndarray:
-    """Full scale in every band."""
-    return np.full(bands, FULL, np.float32)
+BESIDE = 24  # px
 
 
 @dataclass(frozen=True)
 class Waves:
-    """Sinusoids around 0.5 in two bands, evaluated at any point: a scene without pixels."""
+    """Sinusoids around 0.5 in two bands, known at any point."""
 
     shape: tuple[int, int]
     frequency: np.ndarray  # (wave, 2) of y and x [1/px]
     phase: np.ndarray
     height: np.ndarray
-    name: str = "waves"
-    key: str = "waves"
-    wavelength_nm: np.ndarray = field(default_factory=lambda: np.array([500.0, 700.0]))
-    fwhm_nm: np.ndarray | None = None
-    electrons: np.ndarray = field(default_factory=ones)
-    panel: np.ndarray = field(default_factory=lambda: np.ones(2, np.float32))
-    panel_electrons: np.ndarray = field(default_factory=ones)
+
+    def pixels(self) -> RasterScene:
+        """The scene that is looked at: wider by what lines see beside the field."""
+        y, x = np.mgrid[-BESIDE : self.shape[0] + BESIDE, -BESIDE : self.shape[1] + BESIDE]
+        values = self.field_of(y.ravel(), x.ravel()).reshape(*y.shape, 2)
+        return made_scene(values, np.full(2, FULL), [500.0, 700.0])
 
     def field_of(self, y: np.ndarray, x: np.ndarray, damping: np.ndarray | float = 1.0) -> np.ndarray:
         """Values (n, 2) at points, each wave damped by a factor; even waves are in band 0, odd ones in band 1."""
@@ -53,16 +50,13 @@ class Waves:
         waves = np.cos(2 * np.pi * turns + self.phase) * (self.height * damping)
         return 0.5 + np.stack([waves[:, ::2].sum(axis=1), waves[:, 1::2].sum(axis=1)], axis=1)
 
-    def sample(self, y: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """Components at points."""
-        return self.field_of(y, x).astype(np.float32)
-
     def damping(self, along: Axis, step: int) -> NDArray[np.float64]:
-        """What the footprint leaves of each wave: slit, pixel, held positions and binned samples, in closed form."""
+        """What pixels, slit, detector, held positions and binned samples leave of each wave, in closed form."""
         scan, line = self.frequency.T if along == "x" else self.frequency.T[::-1]
         held = np.arange(step) - (step - 1) / 2
         smear, binned = (np.cos(2 * np.pi * np.outer(f, held)).mean(axis=1) for f in (scan, line))
         left: NDArray[np.float64] = np.sinc(scan * CAMERA.slit_px) * np.sinc(line) * smear * binned
+        left *= (np.sinc(scan) * np.sinc(line)) ** 2  # light is linear between pixels
         return left
 
 
@@ -97,7 +91,7 @@ def rectified(
 
 def rectified_strip(scene: Waves, strip: float, along: Axis, *, step: int, kernel: Kernel, spoil: bool) -> MosaicPart:
     """One sweep on the grid of the scene: captured, calibrated, looked up, resampled."""
-    source = SimulatedSource(scene, Rig(CAMERA), chosen=effects_on("rotation", "slit", "smear"))
+    source = SimulatedSource(scene.pixels(), Rig(CAMERA), chosen=effects_on("rotation", "slit", "smear"))
     sweep = sweep_over(scene, strip, along, step)
     lines = list(source.lines(sweep))
     raw = np.stack([line.data for line in lines])

@@ -19,7 +19,7 @@ from pipeline.rectify.registration.illumination import LightRatio, light_ratio, 
 from pipeline.rectify.registration.overlaps import Window
 from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.image_scene import raster_from_values
+from pipeline.simulator.scenes.scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 
 WAVELENGTH = np.linspace(400, 1000, 31)

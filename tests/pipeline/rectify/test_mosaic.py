@@ -20,8 +20,7 @@ from pipeline.rectify.placed import place
 from pipeline.rectify.region import mosaic_rows, read_seats, seat_pixels
 from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.image_scene import raster_from_values
-from pipeline.simulator.scenes.scene import RasterScene
+from pipeline.simulator.scenes.scene import RasterScene, raster_from_values
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 
 
@@ -77,16 +76,6 @@ def test_a_band_without_a_value_is_the_other_sweeps() -> None:
     values, coverage = mosaic([MosaicPart(one, full, edge), MosaicPart(other, full, edge)])
     np.testing.assert_array_equal(values[0], [2, 3, np.nan])
     assert coverage.tolist() == [2]
-
-
-@given(st.integers(0, 10_000), st.integers(1, 19))
-@settings(max_examples=20, deadline=None)
-def test_points_do_not_see_each_other(seed: int, cut: int) -> None:
-    """Blending some of the points gives what blending all of them gives there, bit by bit."""
-    parts = [part(seed), part(seed + 1)]
-    whole = mosaic(parts)[0]
-    some = mosaic([MosaicPart(one.values[:cut], one.weight[:cut], one.edge_px[:cut]) for one in parts])[0]
-    np.testing.assert_array_equal(some, whole[:cut])
 
 
 def test_a_point_alone_is_summed_as_among_others() -> None:

@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 
 from pipeline.errors import ShapeError
 from pipeline.rectify.kernels import Kernel, kernel_taps
-from pipeline.rectify.resample import BLOCK_PX, gather, merge_lines, resample
+from pipeline.rectify.resample import BLOCK_PX, merge_lines, resample
 
 KERNELS: tuple[Kernel, ...] = ("catmull-rom", "bilinear", "nearest")
 
@@ -87,37 +87,6 @@ def test_catmull_rom_keeps_parabolas() -> None:
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_dead_element_spoils_only_its_band(kernel: Kernel) -> None:
-    """With one NaN element out, the other bands and the points that do not touch it stay as they were, bit by bit."""
-    values = np.random.default_rng(9).random((12, 12, 4), np.float32)
-    at = np.random.default_rng(10).uniform(1, 10, (500, 2))
-    whole, share = resample(values, np.ones((12, 12), bool), at, kernel)
-    valid = np.ones((12, 12, 4), bool)
-    values[5, 6, 2], valid[5, 6, 2] = np.nan, False
-    out, share_of_any = resample(values, valid, at, kernel)
-    changed = out != whole
-    np.testing.assert_array_equal(np.flatnonzero(changed.any(axis=0)), [2])
-    assert (np.abs(at[changed.any(axis=1)] - (5, 6)) < 2).all()
-    assert 0 < np.isnan(out).sum() < changed.sum() or kernel == "nearest"
-    np.testing.assert_array_equal(share_of_any, share)
-
-
-def test_mask_by_element_may_be_one_by_sample() -> None:
-    """A mask by element that says the same of all bands gives the same bits as the mask by sample."""
-    rng = np.random.default_rng(12)
-    values, valid = rng.random((20, 20, 3), np.float32), rng.random((20, 20)) > 0.2
-    values[~valid] = np.nan
-    at = rng.uniform(-1, 20, (500, 2))
-    for kernel in KERNELS:
-        for one, other in zip(
-            resample(values, valid, at, kernel),
-            resample(values, np.repeat(valid[..., None], 3, axis=2), at, kernel),
-            strict=True,
-        ):
-            np.testing.assert_array_equal(one, other)
-
-
-@pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("bands", [1, 3, 300])
 def test_result_does_not_depend_on_the_blocks(kernel: Kernel, bands: int) -> None:
     """All points at once, each alone and in any order give the same bits: whole windows, borders and masks alike."""
@@ -173,17 +142,7 @@ def test_shapes_that_do_not_fit_are_named() -> None:
     with pytest.raises(ShapeError, match="flatten the grid"):
         resample(values, np.ones((4, 4), bool), np.zeros((2, 2, 2)))
     with pytest.raises(ValueError, match="'cubic'"):
-        gather(values, np.zeros(1), np.zeros(1), "cubic")  # type: ignore[arg-type]
-
-
-def test_scene_edges_are_repeated() -> None:
-    """Far outside a scene the edge pixel is seen; inside, gather and resample agree."""
-    planes = np.random.default_rng(7).random((5, 6, 2), np.float32)
-    far = gather(planes, np.array([-50.0, 80.0]), np.array([2.0, 99.0]))
-    np.testing.assert_array_equal(far, planes[[0, 4], [2, 5]])
-    at = np.random.default_rng(8).uniform(1, 3, (20, 2))
-    inside, _ = resample(planes, np.ones((5, 6), bool), at)
-    np.testing.assert_allclose(gather(planes, at[:, 0], at[:, 1]), inside, rtol=1e-5)
+        resample(values, np.ones((4, 4), bool), np.zeros((1, 2)), "cubic")  # type: ignore[arg-type]
 
 
 def test_dwell_is_the_mean_of_its_valid_lines() -> None:

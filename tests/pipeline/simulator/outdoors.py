@@ -87,7 +87,7 @@ def measured(effect: Any, rig: Rig, variant: str = OFF, **more: Any) -> float:
     block = block_of(rig, range(0, 60, 59), **more)
     worst = 0.0
     for spectrum in materials(rig.camera.exposure_ms):
-        light = np.tile(spectrum, (2, len(block.columns), 1))
+        light = np.tile(spectrum, (2, block.rig.camera.samples, 1))
         missed = result(effect, light, block, variant) - result(effect, light, block, effect.variants[0])
         worst = max(worst, float((np.abs(missed) / _sigma(spectrum)).max()))
     return worst

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.ndimage import map_coordinates
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.lazy import Once
-from pipeline.simulator.scenes.image_scene import raster_from_values
-from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster, raster_from_values
 
 
 def made_scene(planes: ArrayLike, electrons: ArrayLike, wavelength_nm: ArrayLike, **more: Any) -> RasterScene:
@@ -27,3 +27,9 @@ def made_scene(planes: ArrayLike, electrons: ArrayLike, wavelength_nm: ArrayLike
 def image_scene(values: ArrayLike, camera: LineCamera, wavelength_nm: ArrayLike) -> RasterScene:
     """A scene of an image's values (y, x, band)."""
     return raster_from_values(np.asarray(values), camera, name="image", wavelength_nm=np.asarray(wavelength_nm, float))
+
+
+def seen_at(scene: RasterScene, y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Components at points, (..., component): linear between pixels, the edge repeated outside."""
+    found = [map_coordinates(plane, [y, x], order=1, mode="nearest") for plane in np.moveaxis(scene.planes, -1, 0)]
+    return np.stack(found, axis=-1)

@@ -19,7 +19,7 @@ from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
-from tests.pipeline.simulator.small_scenes import image_scene
+from tests.pipeline.simulator.small_scenes import image_scene, seen_at
 
 CAMERA = LineCamera(samples=96)
 GRID = SceneGrid(240, 300, 16, 4)
@@ -35,7 +35,7 @@ def textured(seed: int = 0) -> RasterScene:
 def coarse_mean(scene: RasterScene, factor: int) -> np.ndarray:
     """What a coarse pass sees: the mean over whole coarse pixels, repeated pixels beyond the border."""
     y, x = np.mgrid[: -(-GRID.height // factor) * factor, : -(-GRID.width // factor) * factor]
-    fine = scene.sample(y.ravel().astype(float), x.ravel().astype(float)).mean(axis=1).reshape(y.shape)
+    fine = seen_at(scene, y, x).mean(axis=-1)
     return np.asarray(fine.reshape(y.shape[0] // factor, factor, -1, factor).mean(axis=(1, 3)))
 
 

@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pipeline.errors import PoseError, ShapeError
+from pipeline.errors import PoseError
 from pipeline.geometry.camera import LineCamera, expose, footprint
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.geometry.scan import Sweep, line_positions
@@ -19,7 +19,7 @@ from pipeline.simulator.render import Choice, expected_light
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Rig, Sky
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import render_lines, sweep_block
-from tests.pipeline.simulator.small_scenes import image_scene, made_scene
+from tests.pipeline.simulator.small_scenes import image_scene, made_scene, seen_at
 
 CAMERA = LineCamera()
 OPTICS = effects_on("rotation", "slit", "smear")
@@ -91,7 +91,7 @@ def test_rays_are_those_of_the_mirror() -> None:
     ray = np.stack([0 * slope, slope, 1 + 0 * slope], axis=-1)
     normal = position_to_normal(line_positions(sweep, CAMERA)[7])
     x, y = direction_to_scene(reflect(ray, normal)).T / CAMERA.ifov_rad
-    expected = scene.sample(y + 99.5, x + 349.5)[:, 0] * scene.electrons[0]
+    expected = seen_at(scene, y + 99.5, x + 349.5)[:, 0] * scene.electrons[0]
     np.testing.assert_allclose(line, expected, rtol=1e-4)
 
 
@@ -166,31 +166,9 @@ def test_lines_are_the_same_in_any_blocks_by_any_threads(kind: str, sweep: Sweep
         assert raw.tobytes() == whole_sweep(kind, sweep)[lines.start : lines.stop].tobytes()
 
 
-@pytest.mark.parametrize("kind", ["mixed", "planes"])
-@pytest.mark.parametrize("sweep", [FINE, COARSE], ids=["fine", "coarse"])
-@pytest.mark.parametrize("stray", [True, False], ids=["whole lines", "windows"])
-def test_some_samples_are_those_of_the_whole_line(kind: str, sweep: Sweep, stray: bool) -> None:
-    """A window of samples holds the same bytes, with and without effects that need all of the line."""
-    chosen = EVERY if stray else effects_on(*(one.name for one in EFFECTS if not hasattr(one, "whole_line")))
-    lines = range(20, 27)
-    whole = render_lines(grainy(kind), LOUD, chosen, sweep, lines, seed=3)
-    count = whole.shape[1]
-    for samples in (range(count), range(5, 6), range(8, 17), range(count - 4, count)):
-        some = render_lines(grainy(kind), LOUD, chosen, sweep, lines, seed=3, samples=samples)
-        np.testing.assert_array_equal(some, whole[:, samples.start : samples.stop])
-
-
 def test_no_lines_give_none() -> None:
     """An empty range of lines has the shape of the camera."""
     assert render_lines(scene_of(np.ones((4, 4, 3))), Rig(), USUAL, SWEEP, range(0)).shape == (0, 640, 3)
-
-
-def test_windows_beside_the_line_are_refused() -> None:
-    """Samples that are not there, or not in a row, are named."""
-    scene = scene_of(np.ones((4, 4, 1)))
-    for samples in (range(600, 641), range(-1, 4), range(0, 10, 2), range(7, 7)):
-        with pytest.raises(ShapeError, match=r"sweep s has samples 0 to 639 a line.*got range"):
-            render_lines(scene, Rig(), USUAL, SWEEP, range(1), samples=samples)
 
 
 def test_lines_beyond_the_mirror_are_refused() -> None:

@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.rig.camera.headwall_camera import HeadwallCamera, HeadwallControl
-from pipeline.rig.device_settings import ControlPatience
+from pipeline.rig.camera.headwall_camera import HeadwallCamera
+from pipeline.rig.device_settings import ControlPatience, FileServer
 from pipeline.rig.devices import ManualClock
 from pipeline.rig.emulator.camera_device import CameraDevice
 from pipeline.rig.emulator.camera_server import InProcessCameraLine
 
 
-def control_of(device: CameraDevice, clock: ManualClock, retries: int = 2) -> HeadwallControl:
+def control_of(device: CameraDevice, clock: ManualClock, retries: int = 2) -> HeadwallCamera:
     """A control client of an emulated camera in this process."""
     line = lambda: InProcessCameraLine(device, clock, "emulated:8100")  # noqa: E731
-    return HeadwallControl(line, clock=clock, patience=ControlPatience(5.0, retries))
+    return HeadwallCamera(line, FileServer(), clock=clock, patience=ControlPatience(5.0, retries))
 
 
 def wait_for(camera: HeadwallCamera, at_most_s: float) -> None:

@@ -7,7 +7,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from pipeline.rig.camera.headwall_camera import CaptureUnknown
 from pipeline.rig.devices import DeviceRefused, ManualClock
 from pipeline.rig.emulator.camera_device import CameraDevice, CameraUnit
 from pipeline.rig.emulator.camera_server import CameraConnection
@@ -120,42 +119,6 @@ def test_what_it_sees_is_asked_once() -> None:
     assert [x for x, _ in seen] == pytest.approx([time / 10 for _, time in seen])
     pulses = np.concatenate([device.exposures(*span) for span in pairwise(np.linspace(0, 2, 38))])
     np.testing.assert_allclose(pulses, 0.01 + np.arange(100)[:, None] * 0.01 + [0, 0.008], atol=1e-12)
-
-
-@pytest.mark.parametrize("seed", range(5))
-@pytest.mark.parametrize(
-    "fault", [CameraFault.SLOW, CameraFault.SPLIT, CameraFault.MERGED, CameraFault.STALE], ids=lambda fault: fault.name
-)
-def test_harmless_faults(fault: CameraFault, seed: int) -> None:
-    """Slow, cut, merged and stale replies change nothing, for a capture neither, and it is sent once."""
-    device = device_with(fault, 10, seed)
-    control = control_of(device, device.clock)  # type: ignore[arg-type]
-    control.configure(5, 6)
-    assert control.capture(50_000).folder == "/captured/000000"
-    assert control.is_capturing()
-    assert control.stop()
-    assert len(device.captures) == 1
-    assert sum(line.startswith("capture(") for line in device.commands) == 1
-
-
-@pytest.mark.parametrize(
-    "fault",
-    [CameraFault.LATE, CameraFault.SILENT, CameraFault.HANGS_UP, CameraFault.NOT_JSON],
-    ids=lambda fault: fault.name,
-)
-def test_lost_replies(fault: CameraFault) -> None:
-    """Reads get over a lost reply; a capture is sent once, found by asking, and told, within its deadlines."""
-    device = device_with(fault, 1)
-    clock = device.clock
-    control = control_of(device, clock)  # type: ignore[arg-type]
-    assert not control.is_capturing()
-    before = clock.now()
-    control._folders = lambda: set() if not device.captures else {"/captured/000000"}  # type: ignore[method-assign]
-    device.faults.left[fault] = 1
-    with pytest.raises(CaptureUnknown, match="asked again it captures, and new are the folders /captured/000000"):
-        control.capture(5000)
-    assert clock.now() - before < 12
-    assert len(device.captures) == 1
 
 
 @pytest.mark.parametrize(("fault", "words"), [(CameraFault.FULL, "disk full"), (CameraFault.BUSY, "busy capturing")])

@@ -9,9 +9,9 @@ import pytest
 
 from pipeline.errors import RigError, SettingsError
 from pipeline.rig.camera import headwall_replies
-from pipeline.rig.camera.headwall_camera import CaptureUnknown, HeadwallControl
+from pipeline.rig.camera.headwall_camera import CaptureUnknown, HeadwallCamera
 from pipeline.rig.camera.headwall_replies import ReplyReader
-from pipeline.rig.device_settings import ControlPatience
+from pipeline.rig.device_settings import ControlPatience, FileServer
 from pipeline.rig.devices import Clock, DeviceGone, DeviceRefused, ManualClock, StateUnknown
 from tests.rig.scripted import Late, Pair, Reply, ScriptedTransport
 
@@ -38,12 +38,12 @@ def refused(command: bytes, why: bytes) -> bytes:
 
 
 @contextmanager
-def talk(*connections: Sequence[Pair], retries: int = 2, hello: bytes = HELLO) -> Iterator[HeadwallControl]:
+def talk(*connections: Sequence[Pair], retries: int = 2, hello: bytes = HELLO) -> Iterator[HeadwallCamera]:
     """A client whose connections follow these scripts, all of which must be used up."""
     clock = ManualClock()
     scripts = [ScriptedTransport(pairs, clock, hello) for pairs in connections]
     waiting = iter(scripts)
-    yield HeadwallControl(lambda: next(waiting), clock=clock, patience=ControlPatience(5.0, retries, 0.5))
+    yield HeadwallCamera(lambda: next(waiting), FileServer(), clock=clock, patience=ControlPatience(5.0, retries, 0.5))
     for script in scripts:
         script.check()
 

@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.errors import RigError
 from pipeline.rig.camera.camera_files import KeptInMemory
-from pipeline.rig.camera.headwall_camera import HeadwallControl
+from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.capture import JOURNAL
 from pipeline.rig.devices import DeviceGone, DeviceRefused, StateUnknown
 from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults, make_fault
@@ -219,7 +219,7 @@ def test_nothing_is_sent_to_a_rig_of_unknown_state():
 def killed_amid(rig: SmallRig, kept: KeptInMemory, patch: pytest.MonkeyPatch | None = None) -> None:
     """Begin to capture the sweep, and die while it is waited for; with ``patch`` before the camera can be stopped."""
     if patch is not None:
-        patch.setattr(HeadwallControl, "stop", lambda _: kill())
+        patch.setattr(HeadwallCamera, "stop", lambda _: kill())
     with pytest.raises(KilledError):
         list(rig.source(kept).saying(lambda words: kill() if words.startswith("capturing") else None).lines(FINE))
 

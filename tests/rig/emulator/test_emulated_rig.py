@@ -18,7 +18,6 @@ from pipeline.rig.capture.capture_paths import REFERENCES, capture_prefix
 from pipeline.rig.device_settings import CameraAddress, FileServer, MirrorSettings
 from pipeline.rig.devices import SYSTEM_CLOCK, Clock, DeviceGone
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock
-from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults
 from pipeline.rig.mirror.mirror_controller import MirrorController, open_mirror
 from pipeline.rig.mirror.registers import Trigger
 from pipeline.rig.transports import SocketTransport
@@ -27,7 +26,6 @@ from pipeline.simulator.simulated import SimulatedSource
 from tests.rig.camera.camera_line import wait_for
 from tests.rig.small_rig import CAMERA, COARSE, FINE, small_source
 
-ODD = Sweep("fine-7", "fine", "x", 10 / 3, -11.1, 23)
 MOST_S = 60.0
 
 
@@ -70,15 +68,6 @@ def connected(source: SimulatedSource | None = None, **rig: Any) -> Iterator[tup
 def planned(sweep: Sweep, lines: range, source: SimulatedSource | None = None) -> np.ndarray[Any, Any]:
     """What the simulated source gives of some lines, not binned."""
     return (small_source() if source is None else source).render(replace(sweep, binning=1), lines)
-
-
-@pytest.mark.parametrize("sweep", [FINE, COARSE, ODD], ids=lambda sweep: str(sweep.name))
-@pytest.mark.parametrize("first", [0, 3])
-def test_planned_sweep_gives_the_lines_of_the_simulated_source(sweep: Sweep, first: int) -> None:
-    """Bit for bit, from whichever line on, by pulses for every held position."""
-    with connected() as (pair, _):
-        folder = pair.play(sweep, first)
-        np.testing.assert_array_equal(pair.lines(folder), planned(sweep, range(first, sweep.lines)))
 
 
 @pytest.mark.parametrize("sweep", [FINE, COARSE], ids=lambda sweep: str(sweep.name))
@@ -160,14 +149,6 @@ def test_frames_that_wait_to_be_looked_at_keep_the_camera_busy() -> None:
         assert [rig.camera.look_on() for _ in range(4)] == [True, True, True, False]
         assert not pair.camera.is_capturing()
         assert len(pair.lines(folder)) == 20
-
-
-def test_cube_that_is_cut_off_lacks_lines() -> None:
-    """A fault of the camera strikes what it sees of the scene, too."""
-    with connected(camera_faults=CameraFaults({CameraFault.CUT_CUBE: 1})) as (pair, _):
-        found = pair.camera.fetch(pair.play(FINE), KeptInMemory())
-    assert found.valid.tolist() == [True] * (FINE.lines - 2) + [False] * 2
-    np.testing.assert_array_equal(found.values[:-2], planned(FINE, range(FINE.lines - 2)))
 
 
 def test_clock_of_the_source_says_when_a_sweep_began() -> None:

@@ -7,7 +7,7 @@ import pytest
 from pipeline.errors import SettingsError
 from pipeline.rig.devices import ManualClock
 from pipeline.rig.emulator.fault_names import KINDS, CameraFault, fault_table, make_fault, read_fault, read_faults
-from pipeline.rig.emulator.mirror_device import Chance, Fault, MirrorDevice, Mode, VanishedError
+from pipeline.rig.emulator.mirror_device import MirrorDevice, Mode, VanishedError
 from pipeline.rig.emulator.mirror_faults import LATE_S, SLOW_S, TICK_S
 from pipeline.rig.mirror.pro_mode import ErrorCode, Frame, ask_status, encode, float_cell, get_value, refuse, set_vector
 from pipeline.rig.mirror.registers import VECTOR_MEMORY, Status, X
@@ -82,13 +82,6 @@ def test_a_fault_that_does_not_exist_is_refused_with_those_that_do() -> None:
         read_fault("echo:x")
     with pytest.raises(SettingsError, match="opportunity 0 or later"):
         make_fault("echo", at=-1)
-
-
-def test_a_fault_that_never_strikes_changes_nothing() -> None:
-    """The base of all faults leaves a controller alone."""
-    device = MirrorDevice(ManualClock(), [Fault(Chance.drawn("none", 0, 1))])
-    assert answer(device, b"START\r\nSTATUS\r\n") == b"OK\r\n00000000\r\n"
-    assert device.opened() == []
 
 
 def test_one_bit_to_the_controller_is_turned() -> None:

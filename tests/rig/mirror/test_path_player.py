@@ -11,8 +11,8 @@ from pipeline.errors import PoseError, RigError, SettingsError, ShapeError
 from pipeline.rig.device_settings import Patience, ReadBack
 from pipeline.rig.devices import DeadlinePassed, ManualClock
 from pipeline.rig.mirror.mirror_requests import ProLink
-from pipeline.rig.mirror.path_player import check_play, frames_to_check, hold_values, run_values, upload, wire_positions
-from pipeline.rig.mirror.pro_mode import Command, Frame, FrameReader, encode, read_vector, set_values
+from pipeline.rig.mirror.path_player import check_play, frames_to_check, upload, wire_positions
+from pipeline.rig.mirror.pro_mode import Command, Frame, FrameReader, encode, read_vector
 from pipeline.rig.transports import BITS_PER_BYTE, Wire
 
 
@@ -143,13 +143,6 @@ def test_a_sample_finds_the_ends_of_both_channels(cell: int):
         upload(link(Memory(wrong=(cell,))), path(100), "sampled")
 
 
-def test_without_reading_back_nothing_is_found():
-    """The choice is a choice: nothing is asked."""
-    memory = Memory(wrong=(5,))
-    upload(link(memory), path(100), "none")
-    assert {frame.command for frame in memory.frames} == {Command.SET_VECTOR}
-
-
 @given(st.integers(1, 400))
 def test_samples_are_few_and_within(frames: int):
     """First and last frame are always read, and not many more than a tenth."""
@@ -180,12 +173,6 @@ def test_an_upload_takes_the_wire_time(read_back: ReadBack, share: float):
     wire_s = memory.passed * BITS_PER_BYTE / BAUD
     assert wire_s == pytest.approx(plain_s * (1 + share), rel=0.02)
     assert memory.clock.now() == pytest.approx(wire_s)
-
-
-def test_motions_fit_one_frame():
-    """Both channels begin in one frame, which the device carries out as one."""
-    assert len(set_values(hold_values(1.0, -1.0)).payload) == 50
-    assert len(set_values(run_values()).payload) == 38
 
 
 @pytest.mark.parametrize("play", [(0, 1, 1e-3, 1), (0, 1500, 1e4, -1), (1499, 1500, 10, 2**31 - 1)])

@@ -19,20 +19,13 @@ from pipeline.simulator.optics.rays import pupil_contrast
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Optics, Rig
 from pipeline.simulator.scenes.scene import RasterScene
-from tests.pipeline.simulator.fine_image import BOX, IMAGES, SCAN, change, convolved, disc, gaussian, probe_of, shifted
+from tests.pipeline.simulator.fine_image import IMAGES, change, disc, gaussian, probe_of, shifted
 from tests.pipeline.simulator.small_scenes import made_scene
 
 
 def rig_of(sigma_px: float) -> Rig:
     """A rig whose lens blurs by so much."""
     return Rig(optics=Optics(aberration_px=sigma_px))
-
-
-def test_moments():
-    """The square of the sd in all bands and both directions, no shift."""
-    moments = ABERRATION.moments(rig_of(0.3), np.array([400.0, 900.0]), "gaussian")
-    assert moments.variance == pytest.approx(np.full((2, 2), 0.09))
-    assert not moments.shift.any()
 
 
 @pytest.mark.parametrize("name", IMAGES)
@@ -81,14 +74,6 @@ def test_in_focus_or_without_distance(distance: float | None, focus: float):
     assert DEFOCUS.bound(probe_of(IMAGES["edges"]()), rig).value == 0
 
 
-def test_far_away_is_in_focus():
-    """1/d goes to 0 without a jump."""
-    sizes = [defocus_px(rig_at(d), d)[1] for d in (1e3, 1e6, 1e12, 1e300, math.inf)]
-    assert sizes[0] == pytest.approx(0.1, abs=0.001)
-    assert sizes == sorted(sizes, reverse=True)
-    assert sizes[-1] == 0
-
-
 @pytest.mark.parametrize("name", IMAGES)
 @pytest.mark.parametrize("distance", [60.0, 150.0])
 def test_bound_holds_for_disc_and_fold(name: str, distance: float):
@@ -130,13 +115,6 @@ def test_beyond_the_spectrograph_the_shift_stays():
     assert keystone_shift(keystone_rig_of(0.4), np.array([300.0, 2500.0])) == pytest.approx([-0.2, 0.2])
 
 
-def test_moments_shift_along_the_line_only():
-    """No shift along the scan and no blur."""
-    moments = KEYSTONE.moments(keystone_rig_of(0.4), KEYSTONE_NM, "linear")
-    assert moments.shift == pytest.approx(np.array([[-0.2, 0, 0.2], [0, 0, 0]]))
-    assert not moments.variance.any()
-
-
 @pytest.mark.parametrize("name", IMAGES)
 @pytest.mark.parametrize("keystone", [0.15, 1.0, 4.0])
 def test_keystone_bound_holds(name: str, keystone: float):
@@ -164,43 +142,20 @@ def waves(period: float) -> RasterScene:
     return scene_of(np.repeat(wave[:, None, None], 60, axis=1).astype(np.float32))
 
 
-def light_of(scene: RasterScene, lines: range, chosen: dict[Any, str], samples: range | None = None) -> NDArray[Any]:
+def light_of(scene: RasterScene, lines: range, chosen: dict[Any, str]) -> NDArray[Any]:
     """Electrons of some lines through the footprint and what is chosen."""
-    block = SweepBlock(RIG, WAVES_SWEEP, lines, RENDERED_BLURS_NM, scene.shape, samples=samples)
+    block = SweepBlock(RIG, WAVES_SWEEP, lines, RENDERED_BLURS_NM, scene.shape)
     return expected_light(scene, block, {SLIT: "3x1", **chosen})
 
 
 @pytest.mark.parametrize("blur", [DIFFRACTION, DEFOCUS, ABERRATION], ids=lambda blur: blur.name)
 def test_contrast_is_that_of_the_variance(blur: Any):
     """A wave of 16 px along the scan keeps exp(-2 pi^2 s^2 / 16^2) of what the footprint left of it, or the pupil's."""
-    scene, samples = waves(16.0), range(310, 330)
-    before, after = (light_of(scene, range(40), chosen, samples) for chosen in ({}, {blur: blur.variants[0]}))
+    scene = waves(16.0)
+    before, after = (light_of(scene, range(40), chosen)[:, 310:330] for chosen in ({}, {blur: blur.variants[0]}))
     moments = blur.moments(RIG, RENDERED_BLURS_NM, blur.variants[0])
     passed = np.exp(-2 * np.pi**2 * moments.variance[1] / 16**2)
     if moments.waves is not None:
         passed = passed * pupil_contrast(moments.waves[1] / 16)
     left = np.ptp(after, axis=(0, 1)) / np.ptp(before, axis=(0, 1))
     assert left == pytest.approx(passed, abs=1.5e-3)
-
-
-@pytest.mark.parametrize(
-    ("transfer", "bounded", "error", "bound"),
-    [
-        (np.sinc(0.375 * SCAN), ("blur", 0, 0.375**2 / 12), 0.013, 0.0135),
-        (np.sinc(1.125 * SCAN), ("blur", 0, 1.125**2 / 12), 0.046, 0.121),
-        (gaussian(0.1, 0.1), ("blur", 0.01, 0.01), 0.0283, 0.0280),
-        (gaussian(0.35, 0.35), ("blur", 0.35**2, 0.35**2), 0.114, 0.34),
-        (shifted(0, 0.1), ("shift", 0.1, 0.1), 0.038, 0.089),
-    ],
-    ids=["smear 0.375", "smear 1.125", "blur 0.1", "blur 0.35", "shift 0.1"],
-)
-def test_pairs_of_the_design(transfer: np.ndarray, bounded: tuple[str, float, float], error: float, bound: float):
-    """Edges of contrast 1 and 0.51 behind the slit: measured errors and bounds near those of the design's own image."""
-    image = IMAGES["edges"]()
-    probe = probe_of(image)
-    kind, along, scan = bounded
-    found = probe.moved(along, scan) if kind == "shift" else probe.blurred(np.array([[along], [scan]]))
-    measured = float(np.abs(convolved(image, BOX * (transfer - 1))).max())
-    assert measured <= found
-    assert found == pytest.approx(bound, rel=0.1)
-    assert measured == pytest.approx(error, rel=0.35)

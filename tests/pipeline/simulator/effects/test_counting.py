@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -15,14 +14,12 @@ from scipy import stats
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.effects.counting import (
-    BOLTZMANN_EV_PER_K,
     DARK_CURRENT,
     DEFECTS,
     QUANTISATION,
     READ_NOISE,
     SATURATION,
     SHOT,
-    band_gap_ev,
     dark_electrons,
     dead_elements,
     hot_electrons,
@@ -58,13 +55,6 @@ def test_a_bright_scene_needs_shot_noise_and_no_read_noise() -> None:
     assert bound.value == pytest.approx(0.019, abs=1e-3)
     assert bound.value < TOLERANCE
     assert bound.why == "20 e- beside at least 100 e- of shot noise make 102 e-"
-
-
-def test_one_dark_sample_needs_read_noise() -> None:
-    """Read noise is decided by the darkest, shot noise by the brightest sample."""
-    mixed = probe(100, 10_000)
-    assert READ_NOISE.bound(mixed, RIG).value > TOLERANCE
-    assert SHOT.bound(mixed, RIG).value == SHOT.bound(probe(10_000, 10_000), RIG).value
 
 
 def test_a_dim_scene_at_1_s_needs_dark_current() -> None:
@@ -181,35 +171,12 @@ def test_quantisation_is_half_a_dn() -> None:
 DEGREES = st.floats(-80.0, 49.0)
 
 
-def doubling_deg(temperature_deg_c: float) -> float:
-    """How many degrees about a temperature make twice the dark current."""
-    return 0.2 * math.log(2) / math.log(warmth(temperature_deg_c + 0.1) / warmth(temperature_deg_c - 0.1))
-
-
-@pytest.mark.parametrize(("kelvin", "ev"), [(0.0, 1.1557), (300.0, 1.1108), (193.15, 1.1356)])
-def test_band_gap_by_hand(kelvin: float, ev: float) -> None:
-    """1.1557 - 7.021e-4 T^2 / (1108 + T): 1.11 eV in a warm room."""
-    assert band_gap_ev(kelvin) == pytest.approx(ev, abs=1e-4)
-
-
-def test_absolute_size_by_janesick() -> None:
-    """His 2.5e15 T^1.5 exp(-Eg / 2kT) e-/s from 1 cm^2 of 1 nA/cm^2 at 300 K gives that nA back, 6.24e9 e-/s."""
-    rate = 2.5e15 * 300**1.5 * math.exp(-band_gap_ev(300) / (2 * BOLTZMANN_EV_PER_K * 300))
-    assert rate == pytest.approx(6.24e9, rel=0.03)
-
-
 @pytest.mark.parametrize(
     ("deg_c", "factor"), [(25.0, 1.0), (0.0, 0.1056), (-40.0, 1.12e-3), (-80.0, 1.97e-6), (50.0, 6.80)]
 )
 def test_warmth_by_hand(deg_c: float, factor: float) -> None:
     """Worked with a pocket calculator: at -80 deg C (193.15 / 298.15)^1.5 exp(21.629 - 34.114) = 1.97e-6."""
     assert warmth(deg_c) == pytest.approx(factor, rel=3e-3)
-
-
-@pytest.mark.parametrize(("deg_c", "doubles"), [(25.0, 8.4), (-80.0, 3.6)])
-def test_it_doubles_in_fewer_degrees_in_the_cold(deg_c: float, doubles: float) -> None:
-    """Not every 7 deg C, as a rule of thumb has it: ln 2 over 1.5 / T + (Eg - T Eg') / 2kT^2."""
-    assert doubling_deg(deg_c) == pytest.approx(doubles, abs=0.05)
 
 
 @given(DEGREES, st.floats(0.1, 1.0))

@@ -19,7 +19,7 @@ from pipeline.simulator.optics.kernel_fit import Moments, fold
 from pipeline.simulator.optics.rays import pupil_contrast
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Optics, Rig
-from tests.pipeline.simulator.fine_image import IMAGES, SWEEP, airy, airy_contrast, change, gaussian, probe_of
+from tests.pipeline.simulator.fine_image import IMAGES, SWEEP, airy, change, gaussian, probe_of
 from tests.pipeline.simulator.small_scenes import made_scene
 
 RIG = Rig()
@@ -64,41 +64,12 @@ def test_variance_of_a_cut_off_pattern_is_its_integral(v: float):
     assert airy_variance(v) == pytest.approx(inside / light if v > 1e-3 else v * v / 4, rel=1e-4, abs=1e-12)
 
 
-def test_contrast_of_the_gaussian_in_place_of_the_pattern():
-    """Within 0.08 behind the footprint, 0.065 up to half a period per px; other Gaussians are worse."""
-    u = np.linspace(0, 1, 2001)
-
-    def error(sd: float, most: float = np.inf) -> float:  # over the bands, along line and scan; sd in lambda / D
-        boxes = [(size * r, box) for size in RADIAN_PX for r, box in ((1.0, 1.0), (np.sqrt(2), RIG.camera.slit_px))]
-        wrong = np.abs(airy_contrast(u) - np.exp(-2 * (np.pi * sd * u) ** 2))
-        return max(float((wrong * np.abs(np.sinc(u / size * box)))[u <= most * size].max()) for size, box in boxes)
-
-    sd = np.sqrt(airy_variance(THIRD_RING)) / np.pi
-    taken = error(sd)
-    assert taken < 0.0801
-    assert error(sd, most=0.5) < 0.065
-    assert taken < error(1.029 / 2.3548)
-    assert taken < error(np.sqrt(airy_variance(3.831706)) / np.pi)
-    assert taken < error(np.sqrt(airy_variance(7.015587)) / np.pi)
-
-
 @pytest.mark.parametrize("u", [0.02, 0.1, 0.3, 0.6, 0.95])
 def test_contrast_of_the_pupil_is_the_transform_of_its_pattern(u: float):
     """The closed form is Hankel's transform of the Airy pattern, summed out to 600 rings."""
     v = np.arange(1, 400_000) * 0.005
     pattern = 2 * j1(v) ** 2 / v
     assert pupil_contrast(np.array(u)) == pytest.approx((pattern * j0(2 * u * v)).sum() * 0.005, abs=3e-4)
-
-
-def test_contrast_of_an_elliptic_pupil_is_its_autocorrelation():
-    """A mask of the ellipse that the mirror is at rest, correlated with itself by FFT, along and across."""
-    y, x = np.mgrid[:1024, :1024] - 511.5
-    mask = (np.hypot(y / 200, x / (200 * np.sqrt(0.5))) < 1).astype(np.float64)
-    power = np.abs(np.fft.fft2(mask)) ** 2
-    own = np.fft.ifft2(power).real / mask.sum()
-    shifts = np.arange(0, 420, 20)
-    for axis, width in ((own[:, 0], 400), (own[0], 400 * np.sqrt(0.5))):
-        assert axis[shifts] == pytest.approx(pupil_contrast(shifts / width), abs=2e-3)
 
 
 def test_gaussians_of_the_cheap_variants():
@@ -121,10 +92,10 @@ def test_rendered_waves_are_those_of_the_pupil(axis: int, cycles: float):
     planes = np.ones((900, 900, 1), np.float32) * (wave[:, None, None] if axis == 0 else wave[None, :, None])
     scene = made_scene(planes, np.ones((1, 3)), NM)
     sweep = Sweep("s", "fine", "x", strip_px=0.0, start_px=-20.0, lines=40)
-    block = SweepBlock(RIG, sweep, range(40), NM, scene.shape, samples=range(300, 340))
-    found = expected_light(scene, block, {SLIT: "1x1", DIFFRACTION: "airy"})
+    block = SweepBlock(RIG, sweep, range(40), NM, scene.shape)
+    found = expected_light(scene, block, {SLIT: "1x1", DIFFRACTION: "airy"})[:, 300:340]
     profile = found.mean(axis=1 - axis)
-    place = (np.arange(-20.0, 20.0) if axis == 0 else block.slopes / RIG.camera.ifov_rad)[:, None]
+    place = (np.arange(-20.0, 20.0) if axis == 0 else block.slopes[300:340] / RIG.camera.ifov_rad)[:, None]
     box, width = (RIG.camera.slit_px, np.sqrt(2)) if axis == 0 else (1.0, 1.0)
     wanted = np.ones((40, 3))
     for more in range(-4, 5):

@@ -16,7 +16,6 @@ from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.mirror_path import LAG, STAIRCASE, beside_plan, responses, transient
 from pipeline.simulator.rig_model import MirrorMotion, Rig
-from tests.pipeline.geometry.test_second_order import staircase_jitter
 from tests.pipeline.simulator.made_up_effects import steep_probe
 
 SWEEP = Sweep("strip", "fine", "x", 0.0, -100.0, 200)
@@ -39,22 +38,6 @@ def test_responses_agree_with_fifty_digits(damping: float, time: float):
         truth = float(mpmath.re(pulse)), float(mpmath.re(rise))
     found = [one.item() for one in responses(np.array([time]), damping)]
     assert found == pytest.approx(truth, rel=1e-10, abs=1e-18 if time < 1 else 1e-15)
-
-
-@settings(max_examples=40, deadline=None)
-@given(st.floats(0.01, 10.0), st.floats(0.0, 50.0))
-def test_responses_are_the_matrix_exponential(damping: float, time: float):
-    """[[1 - h, g], [-g, 1 - h - 2 zeta g]] is the exponential of the free system."""
-    g, h = (one.item() for one in responses(np.array([time]), damping))
-    truth = expm(np.array([[0.0, 1.0], [-1.0, -2 * damping]]) * time)
-    np.testing.assert_allclose([[1 - h, g], [-g, 1 - h - 2 * damping * g]], truth, atol=1e-9)
-
-
-@pytest.mark.parametrize(("damping", "overshoot"), [(0.2, 0.5266), (0.7, 0.0460), (1.0, 0.0), (3.0, 0.0)])
-def test_overshoot(damping: float, overshoot: float):
-    """A step is overshot by exp(-pi zeta / sqrt(1 - zeta^2)), not at all from damping 1 on."""
-    rise = responses(np.linspace(0, 60, 60001), damping)[1]
-    assert max(rise.max() - 1, 0) == pytest.approx(overshoot, abs=1e-4)
 
 
 @pytest.mark.parametrize("damping", [0.3, 1.0, 2.5])
@@ -91,12 +74,6 @@ def driven(of_mirror: Rig, sweep: Sweep, run_in: int) -> np.ndarray:
     return np.array(means[run_in:])
 
 
-def test_fast_lines_tend_to_the_steady_lag():
-    """A mirror at rest is ahead of one in steady motion by 2 zeta / (omega t) px, 3.7 px at 3 ms lines of 20 Hz."""
-    of_mirror = rig(3.0, positions_per_line=1000.0, settled_s=50.0)
-    assert transient(of_mirror, SWEEP, np.arange(1))[0, 0] == pytest.approx(2 * 0.7 / (2 * np.pi * 20 * 3e-3), rel=0.3)
-
-
 def test_settling_takes_the_way_back_away():
     """Without time to settle the sweep begins where the mirror comes from; the default leaves nothing of it."""
     slow = rig(100.0, settled_s=0.0)
@@ -121,17 +98,6 @@ def test_any_mirror_is_finite_and_within_its_bound(damping: float, ms: float, hz
         assert np.abs(seen["exact"] - seen[variant]).max() <= bound + 1e-9
 
 
-@pytest.mark.parametrize("variant", ["off", "euler"])
-@pytest.mark.parametrize("exposure_ms", [3.0, 5.0, 20.0, 100.0])
-def test_bound_is_tight(variant: str, exposure_ms: float):
-    """A wave of 6 px period changes by at least a sixth of the bound."""
-    of_mirror, places = rig(exposure_ms), np.linspace(0, 2 * np.pi, 50)[:, None]
-    exact = transient(of_mirror, SWEEP, np.arange(200))[:, 0]
-    other = transient(of_mirror, SWEEP, np.arange(200), "euler")[:, 0] if variant == "euler" else 0 * exact
-    measured = np.abs(np.sin(places + exact) - np.sin(places + other)).max()
-    assert measured <= LAG.bound(steep_probe(sweeps=(SWEEP,), span=2.0), of_mirror, variant).value <= 6 * measured
-
-
 STAIRCASE_SWEEP = Sweep("strip", "fine", "x", 0.0, -20.0, 41)
 
 
@@ -143,14 +109,6 @@ def staircase_rig(positions: float) -> Rig:
 def block(positions: float, sweep: Sweep = STAIRCASE_SWEEP, lines: range = range(41)) -> SweepBlock:
     """Some lines of a sweep."""
     return SweepBlock(staircase_rig(positions), sweep, lines, np.array([500.0]), (64, 64))
-
-
-@pytest.mark.parametrize(("samples", "lines", "px"), [(1450, 640, 0.011), (1500, 600, 0.020), (1500, 1000, 0.056)])
-def test_line_centres_shake_as_in_the_table(samples: int, lines: int, px: float):
-    """Line centres jitter by .011, .020 and .056 px rms, as the whole-number reckoning has it."""
-    centre = beside_plan(samples / lines, 1, np.arange(lines)).mean(axis=1)
-    assert np.std(centre) == pytest.approx(px, abs=5e-4)
-    assert np.std(centre) == pytest.approx(staircase_jitter(samples, lines), rel=1e-6)
 
 
 @settings(max_examples=60, deadline=None)

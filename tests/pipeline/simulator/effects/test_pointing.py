@@ -32,26 +32,16 @@ from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Rig
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
-from tests.pipeline.geometry.test_second_order import pointing_error
 from tests.pipeline.simulator.made_up_effects import steep_probe
 from tests.pipeline.simulator.small_scenes import image_scene, made_scene
 
 SWEEP = Sweep("strip", "fine", "x", 0.0, -500.0, 1001)
 RIG = Rig(mirror=replace(MirrorMotion(), repeatability_urad=40.0))
-REST = np.array([1.0, 0.0, -1.0]) / np.sqrt(2)
 
 
 def shifts(lines: range = range(1001), *, seed: int = 0, rig: Rig = RIG, sweep: Sweep = SWEEP) -> np.ndarray:
     """The shift of some lines."""
     return JITTER.aim(SweepBlock(rig, sweep, lines, np.ones(1), (64, 64), seed), "exact")
-
-
-def test_at_rest_the_view_moves_as_the_pointing_error_says():
-    """40 urad move the view by .76 px in the plane of incidence, along the scan, and by .54 px along the line."""
-    gain = np.abs(tilt_to_scene(REST)) * 40e-6 / RIG.camera.ifov_rad
-    in_plane, across = pointing_error(RIG.camera, 40e-6)
-    np.testing.assert_allclose(gain, [[across, 0], [0, in_plane]], atol=1e-12)
-    assert (in_plane, across) == pytest.approx((0.757, 0.535), abs=1e-3)
 
 
 @pytest.mark.parametrize("position", [(0.0, 0.0), (0.3, 0.4), (-0.7, 0.5), (0.1, -0.9)])
@@ -159,18 +149,6 @@ def test_drift_walks_evenly_in_one_direction():
     assert np.hypot(*late[0]) == pytest.approx(120.0, rel=1e-4)
 
 
-@pytest.mark.parametrize("effect", [HYSTERESIS, THERMAL_DRIFT])
-@pytest.mark.parametrize("reach_px", [10.0, 300.0])
-def test_hysteresis_bound_holds_and_is_tight(effect: object, reach_px: float):
-    """The change of a wave, long or short beside the shift, is below the bound and at least a sixth of it."""
-    shift = effect.aim(block(), "exact")[:, 0]
-    wave = np.array([0.6, 0.8]) / reach_px
-    phase = np.linspace(0, 2 * np.pi, 60)[:, None]
-    measured = np.abs(np.sin(phase + shift @ wave) - np.sin(phase)).max()
-    bound = effect.bound(steep_probe(tuple(wave), (HYSTERESIS_SWEEP,), 2.0, seconds=140.1), HYSTERESIS_RIG).value
-    assert measured <= bound <= 6 * measured
-
-
 CAMERA = LineCamera()
 
 
@@ -243,16 +221,6 @@ def test_mirror_looks_beside_and_reports_the_plan():
         next(source_of(errors).lines(POINTING_ERRORS_SWEEP)).mirror_x
         == line_positions(POINTING_ERRORS_SWEEP, CAMERA)[0, 0]
     )
-
-
-def test_no_errors_change_nothing():
-    """Errors of size 0 give the very lines of a source without any, up to rounding."""
-    plain, aimed = (
-        SimulatedSweep(source_of(pointing), POINTING_ERRORS_SWEEP).read(0, 40)
-        for pointing in (None, PointingErrors(0.0, 0.0))
-    )
-    np.testing.assert_allclose(aimed.astype(int), plain.astype(int), atol=1)
-    assert (aimed == plain).mean() > 0.999
 
 
 def test_jitter_moves_lines_one_by_one():

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.geometry.camera import LineCamera, bin_samples
+from pipeline.geometry.camera import bin_samples
 from pipeline.simulator.effects.blurs import DIFFRACTION, KEYSTONE
 from pipeline.simulator.effects.probe import (
     GainRange,
@@ -190,16 +190,6 @@ def test_noise_of_a_sum_is_that_of_its_samples_together(binning: int, signal: fl
     light = np.full(1, signal, np.float32)
     of_sum = binning * noise_electrons(light, rig, binning)
     np.testing.assert_allclose(of_sum, np.sqrt(binning) * noise_electrons(light, rig), rtol=1e-6)
-
-
-def test_drawn_noise_is_what_a_unit_says() -> None:
-    """Sums of 4 samples of drawn noise, over 4 units of their mean, have a deviation of 1."""
-    rng, light = np.random.default_rng(1), np.full((2000, 40, 1), 900.0, np.float32)
-    camera = LineCamera()
-    drawn = rng.poisson(light) + rng.normal(0, camera.read_noise_e, light.shape)
-    rounded = np.rint(drawn / camera.electrons_per_dn) * camera.electrons_per_dn
-    off = (stored_mean(rounded - light, 4)) / unit_at(stored_mean(light, 4), STORED_LIGHT_RIG, "sigma", 4)
-    assert off.std() == pytest.approx(1, rel=0.01)
 
 
 def test_a_dn_of_a_sum_is_shared_by_its_samples() -> None:

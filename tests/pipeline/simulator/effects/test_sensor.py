@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
-from pipeline.errors import SettingsError, ShapeError
 from pipeline.simulator.effects.sensor import PRNU, STRAY_LIGHT, STRIPING, response_gain, stripe_gain
 from pipeline.simulator.rig_model import Detector, Rig
 from tests.pipeline.simulator.spectral_light import block_of, probe_of, random_light, rig_with, worst
@@ -79,22 +78,6 @@ def test_bound_is_within_6_times_at_the_median(unit):
         bound = STRAY_LIGHT.bound(probe_of(light, wavelength, unit), rig_with(stray_share=share))
         ratios.append(bound.value / worst(made, light, unit))
     assert np.median(ratios) < 6
-
-
-def test_part_of_a_line_is_refused():
-    """Stray light of samples that are missing cannot be known; the words say what to do."""
-    light = random_light(2)[1]
-    block = block_of(rig_with(), np.linspace(400, 1000, 90), samples=range(10))
-    with pytest.raises(ShapeError, match=r"all 64 samples of a line, got 10; make whole lines"):
-        STRAY_LIGHT.change(light[:, :10], block, "halo")
-
-
-@pytest.mark.parametrize("number", ["stray_halo_px", "smile_nm", "fwhm_nm", "stray_even"])
-@pytest.mark.parametrize("value", [np.inf, -1e9, np.nan])
-def test_numbers_without_sense_are_refused(number, value):
-    """Optics that would make NaN of light are refused with their place and range."""
-    with pytest.raises(SettingsError, match=rf"optics.{number} must be a number from "):
-        rig_with(**{number: value})
 
 
 RIG = Rig()

@@ -104,15 +104,6 @@ def test_detectors_do_not_mix():
     np.testing.assert_allclose(made[..., 30:], widen_bands(other, second, np.ones(20), 6.0), rtol=1e-6)
 
 
-def test_factors_of_light_serve_as_well():
-    """Widening (component, band) electrons and mixing them is mixing and widening the light."""
-    wavelength, light = random_light(4)
-    spectra, narrow = light[0, :3], np.full(90, 2.0)
-    share = np.random.default_rng(0).uniform(0, 1, (5, 7, 3)).astype(np.float32)
-    both = widen_bands(share @ spectra, wavelength, narrow, 6.0)
-    np.testing.assert_allclose(share @ widen_bands(spectra, wavelength, narrow, 6.0), both, rtol=1e-5)
-
-
 @given(st.integers(0, 10**6), st.floats(0.5, 7), st.sampled_from(["sigma", "dn"]))
 @settings(max_examples=30, deadline=None)
 def test_bound_holds(seed, fwhm_nm, unit):

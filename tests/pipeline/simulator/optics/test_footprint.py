@@ -76,16 +76,6 @@ def test_every_band_passes_waves_as_its_own_kernel(
     assert np.abs(kernels @ found.mixing - wanted).max() <= 2 * NEGLIGIBLE
 
 
-def test_no_kernel_counts_below_zero() -> None:
-    """The usual blurs of 270 bands, keystone among them: shares are not negative, and few."""
-    nm = np.linspace(0.4, 1.0, 270)
-    variance = np.stack([0.06 + 0.14 * nm**2, 0.06 + 0.28 * nm**2])
-    shift = np.stack([np.linspace(-0.075, 0.075, 270), np.zeros(270)])
-    found = folded(shift, variance)
-    assert 1 < found.kernels <= 8
-    assert found.mixing.min() >= 0
-
-
 def test_no_box_and_no_blur_is_linear() -> None:
     """A zero-width slit without blur is a point between two pixels."""
     found = fold((0.0, 0.0), (1, 1), 1, Moments(np.zeros((2, 5)), np.zeros((2, 5))))

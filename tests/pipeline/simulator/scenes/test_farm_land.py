@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from pipeline.geometry.camera import LineCamera, expose, footprint
-from pipeline.planning.orientation import find_rows
 from pipeline.simulator.scenes.farm.farm_plan import FarmPlan, FieldPlan, Ground, farm_plan
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.farm.fields import row_gaps, row_shadow, rows_of, stripes_of, wheel_marks
@@ -46,13 +45,6 @@ def labels_of(scene: RasterScene) -> NDArray[np.uint8]:
 def class_counts(scene: RasterScene) -> NDArray[np.intp]:
     """Pixels of every class."""
     return np.bincount(labels_of(scene).ravel(), minlength=len(scene.class_names))
-
-
-def test_seeds_differ() -> None:
-    """Another seed is another farm."""
-    first, second = farm_scene(0, (200, 200), bands=2), farm_scene(1, (200, 200), bands=2)
-    assert np.mean(labels_of(first) != labels_of(second)) > 0.3
-    assert first.key != second.key
 
 
 def test_bands_do_not_move_the_farm() -> None:
@@ -223,19 +215,6 @@ def test_period_and_heading_are_in_the_picture(survey: tuple[FarmPlan, NDArray[n
         assert turned_by(heading, field.row_angle_deg) < 1.2
         seen += 1
     assert seen >= 6
-
-
-def test_rows_are_found_by_their_gradients(survey: tuple[FarmPlan, NDArray[np.float32]]) -> None:
-    """Where rows lie four pixels apart and more, ``find_rows`` gives their heading within five degrees."""
-    plan, picture = survey
-    for field in plan.fields:
-        window = middle(field, picture)
-        if field.use not in ("maize", "sugar_beet") or window is None:
-            continue
-        found = find_rows(window)
-        assert found.angle_deg is not None
-        assert turned_by(found.angle_deg, field.row_angle_deg) < 5
-        assert found.strength > 0.6
 
 
 def a_field(use: str) -> tuple[FarmPlan, FieldPlan]:

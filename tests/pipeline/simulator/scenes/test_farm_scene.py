@@ -63,14 +63,6 @@ def test_abundances_are_shares(seed: int, height: int, width: int, day: int) -> 
     assert labels_of(scene).max() < len(CLASSES)
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 700), (500, 3), (31, 57)])
-def test_any_size(shape: tuple[int, int]) -> None:
-    """Sizes that divide by nothing work, down to one pixel."""
-    scene = farm_scene(5, shape, bands=2, day=200)
-    assert scene.shape == shape
-    assert np.isfinite(scene.values()).all()
-
-
 def test_values_are_reflectance() -> None:
     """Scene values lie between 0 and 1 in every band; the panel is nearly white."""
     scene = farm_scene(2, (120, 160), bands=31, day=205)

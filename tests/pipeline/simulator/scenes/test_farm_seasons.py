@@ -173,22 +173,6 @@ def test_spectra_are_reflectances_and_tell_stages_apart() -> None:
 SHAPE = (161, 161)
 
 
-def test_the_sun_stands_as_the_declination_says() -> None:
-    """At true noon the sun is in the south, as high as declination and latitude add up to."""
-    for day, declination in ((80, -0.4), (172, 23.45), (266, 0.0), (355, -23.45)):
-        sun = sun_over_farm(day, 12.0)
-        assert sun.azimuth_deg == pytest.approx(180, abs=1e-6)
-        assert sun.elevation_deg == pytest.approx(90 - LATITUDE_DEG + declination, abs=0.5)
-
-
-@given(st.integers(60, 300), st.floats(0, 3.5))
-def test_mornings_mirror_afternoons(day: int, hours: float) -> None:
-    """As long before noon as after it the sun is as high, and as far to the east as to the west."""
-    before, after = sun_over_farm(day, 12 - hours), sun_over_farm(day, 12 + hours)
-    assert before.elevation_deg == pytest.approx(after.elevation_deg)
-    assert before.azimuth_deg == pytest.approx(360 - after.azimuth_deg)
-
-
 def test_the_sun_agrees_with_the_surveys() -> None:
     """Place by the survey's algorithm for the same true solar time differs by less than 0.7 degrees."""
     from pvlib.spa import solar_position

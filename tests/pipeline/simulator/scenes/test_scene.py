@@ -13,8 +13,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.lazy import Once
 from pipeline.simulator.rig_model import Sky
 from pipeline.simulator.scenes.daylight import knots_within, relative_daylight, sun_elevation_deg
-from pipeline.simulator.scenes.image_scene import raster_from_values
-from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster, raster_from_values
 
 BANDS = np.array([400.0, 550.0, 760.0, 1000.0])
 EQUINOX = Sky(started=datetime(2026, 3, 20, 0, 0, tzinfo=UTC), latitude_deg=29.5, longitude_deg=0.0)

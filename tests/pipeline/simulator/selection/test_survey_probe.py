@@ -209,13 +209,6 @@ def test_a_survey_has_a_probe_for_each_binning() -> None:
         probe_scene(scene, RIG, [coarse, SWEEP])
 
 
-def test_unit_of_a_noiseless_rig_is_the_quantisation() -> None:
-    """Without noise one sigma is that of rounding to DN."""
-    noiseless = replace(RIG, detector=Detector(noiseless=True))
-    np.testing.assert_allclose(noise_electrons(np.float32([0.0, 9e3]), noiseless), 5 / np.sqrt(12), rtol=1e-6)
-    np.testing.assert_allclose(noise_electrons(np.float32([-5.0]), RIG), np.sqrt(400 + 25 / 12), rtol=1e-6)
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_number_that_is_not_finite_is_refused_with_its_place(bad: float) -> None:
     """A scene with NaN or infinity is refused, and the message says where."""

@@ -40,7 +40,7 @@ CHIPS = {"steepest": BLOCK, "brightest": replace(BLOCK, lines=range(40, 44))}
 
 def render(block: SweepBlock, chosen: Mapping[Effect, str]) -> Light:
     """Light of 100 e-, brighter from line 40 on, times all gains."""
-    light = np.full((len(block.lines), len(block.columns), 2), 100.0, np.float32)
+    light = np.full((len(block.lines), block.rig.camera.samples, 2), 100.0, np.float32)
     light[block.numbers >= 40] += 20
     for effect, variant in chosen.items():
         if hasattr(effect, "gain"):
@@ -89,9 +89,8 @@ def test_light_that_is_no_number_breaks_every_bound():
     """NaN is not less than a bound."""
 
     def broken(block: SweepBlock, chosen: Mapping[Effect, str]) -> Light:
-        return (
-            render(block, chosen) if chosen else np.full((len(block.lines), len(block.columns), 2), np.nan, np.float32)
-        )
+        shape = len(block.lines), block.rig.camera.samples, 2
+        return render(block, chosen) if chosen else np.full(shape, np.nan, np.float32)
 
     with pytest.raises(BoundError, match="changes light by nan"):
         verify(decided(Brightening("drift", 0.01, share=0.01)), broken, CHIPS, units)
