@@ -44,13 +44,19 @@ def npy_header(shape: tuple[int, ...], kind: str = "<u2") -> bytes:
     return stream.getvalue()
 
 
-@pytest.mark.parametrize("packed", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
-def test_packs_that_claim_too_much(tmp_path: Path, packed: int) -> None:
-    """A shape beyond the member's bytes is refused before it is allocated."""
-    with zipfile.ZipFile(tmp_path / "a.npz", "w", packed) as pack:
-        pack.writestr("cube.npy", npy_header((100_000, 1000, 1000)) + bytes(100))
-    with little_memory(), pytest.raises(SceneError, match="claims 200000000000 bytes of numbers"):
-        load_raster(tmp_path / "a.npz", dims=3)
+@pytest.mark.parametrize("packed", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, None])
+def test_arrays_that_claim_too_much(tmp_path: Path, packed: int | None) -> None:
+    """A shape beyond the file's or the member's bytes is refused before it is allocated."""
+    claim = npy_header((100_000, 1000, 1000)) + bytes(100)
+    path, words = tmp_path / ("a.npy" if packed is None else "a.npz"), "claims 200000000000 bytes of numbers"
+    if packed is None:
+        path.write_bytes(claim)
+        words = "cannot be read as"
+    else:
+        with zipfile.ZipFile(path, "w", packed) as pack:
+            pack.writestr("cube.npy", claim)
+    with little_memory(), pytest.raises(SceneError, match=words):
+        load_raster(path, dims=3)
 
 
 def test_packs_that_would_fill_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -106,8 +112,9 @@ def test_pickles_in_arrays_and_packs(tmp_path: Path) -> None:
         pack.writestr("cube.npy", npy_header((2, 2, 2), "|O") + trap)
         pack.writestr("cube.pkl", trap)
     (tmp_path / "bare.mat").write_bytes(trap)
-    for name in ("bare.npy", "object.npy", "a.npz", "a.npz:cube", "bare.mat"):
-        with pytest.raises(SceneError, match=r"Python objects|cannot be read|has no array"):
+    scipy.io.savemat(tmp_path / "cell.mat", {"cube": np.array([{"a": 1}], object)})  # objects are passed over
+    for name in ("bare.npy", "object.npy", "a.npz", "a.npz:cube", "bare.mat", "cell.mat"):
+        with pytest.raises(SceneError, match=r"Python objects|cannot be read|has no (single )?array"):
             open_cube_source(tmp_path / name)
     assert not (tmp_path / "trapped").exists()
 
