@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from PIL import Image
 
 from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.scan import Sweep
@@ -16,7 +15,6 @@ from pipeline.source import Line, References
 from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
 from storage.arrays.mosaics import MosaicWriter
 from storage.arrays.quicklooks import LineThumbnail, load_quicklook, picture_bands, picture_step, pictures_of, stretched
-from storage.readers.scan_files import open_cube_source
 
 WAVES = np.linspace(400, 900, 12)
 LINES = np.random.default_rng(5).integers(100, 4000, (150, 600, 12), dtype=np.uint16)
@@ -44,17 +42,13 @@ def _stored(path: Path, lost: tuple[int, ...] = (), step: int = 33) -> Path:
         (np.arange(1000.0, 2000.0, 100), (9, 4, 0), "false colour"),
         (np.array([660.0, 800.0]), (1, 0, 0), "false colour"),
         (np.array([800.0]), (0, 0, 0), "grey"),
+        (None, (6, 4, 2), "by number"),
+        (np.array([400, np.nan, 600]), (1, 1, 0), "by number"),
     ],
 )
-def test_bands_are_the_nearest_where_they_are_near(waves: NDArray[np.float64], bands: object, kind: str) -> None:
-    """640, 550 and 460 nm where there is such light, else the ends and the middle of what there is."""
-    assert picture_bands(waves, len(waves)) == (bands, kind)
-
-
-def test_bands_without_wavelengths_are_spread() -> None:
-    """By their number, whether no wavelength is known or one is not a number."""
-    assert picture_bands(None, 9) == ((6, 4, 2), "by number")
-    assert picture_bands(np.array([400, np.nan, 600]), 3) == ((1, 1, 0), "by number")
+def test_bands_are_the_nearest_where_they_are_near(waves: NDArray[np.float64] | None, bands: object, kind: str) -> None:
+    """640, 550 and 460 nm where there is such light, else the ends and the middle of what there is, or by number."""
+    assert picture_bands(waves, 9 if waves is None else len(waves)) == (bands, kind)
 
 
 @pytest.mark.parametrize(
@@ -175,17 +169,6 @@ def test_a_picture_needs_no_more_memory_than_itself() -> None:
     (kept,) = seen._rows
     assert kept.base is None or kept.base.nbytes == kept.nbytes
     assert kept.shape == (16, 150, 3)
-
-
-def test_a_picture_of_an_array_without_references(tmp_path: Path) -> None:
-    """Numbers as they stand, stretched: nothing else is known of a PNG."""
-    Image.fromarray(LINES[:, :, 0].astype(np.uint8)).save(tmp_path / "a.png")
-    source = open_cube_source(str(tmp_path / "a.png"))
-    thumbnail = LineThumbnail(source.shape, source.bands.wavelength_nm)
-    thumbnail.add(0, source.read(0, 150), source.lines.valid)
-    found = thumbnail.finish()
-    wanted = stretched(np.repeat(LINES[::4, ::4, :1].astype(np.uint8), 3, axis=2).astype(np.float32))
-    np.testing.assert_array_equal(found.image, wanted.image)
 
 
 def test_white_as_dark_as_dark_is_missing(tmp_path: Path) -> None:
