@@ -51,14 +51,8 @@ def bounds(geometry: Mapping[str, Any]) -> list[float]:
 def footprint(geobox: GeoBox, seen: Iterable[tuple[int, NDArray[np.bool_]]]) -> dict[str, Any] | None:
     """Convex outline of what a map shows, as a GeoJSON polygon in longitude and latitude, anticlockwise.
 
-    Parameters
-    ----------
-    seen
-        First row and (row, x) whether the map shows anything there, in order.
-
-    Returns
-    -------
-    To within one pixel of the map; None where nothing is seen.
+    ``seen`` is first row and (row, x) whether the map shows anything there, in order. To within one pixel of the map;
+    None where nothing is seen.
     """
     corners = []
     for first, mask in seen:

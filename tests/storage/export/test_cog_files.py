@@ -19,7 +19,7 @@ from pipeline.errors import ArchiveError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.class_maps import ClassNames
 from storage.arrays.layout import AngularGrid
-from storage.export.cog_files import ANGULAR, CogImage, Place, cog_problems, need_rasterio, write_cog
+from storage.export.image_files import ANGULAR, CogImage, Place, cog_problems, need_rasterio, write_cog
 
 rasterio = pytest.importorskip("rasterio", reason="GeoTIFF is written with rasterio, of the extra [geo]")
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
 from pipeline.errors import PoseError, SceneError, ShapeError
-from storage.export.envi_writer import EnviFile, header_text, write_envi
+from storage.export.image_files import EnviFile, header_text, write_envi
 from storage.readers.envi_cubes import DATA_TYPES, INTERLEAVES, EnviCube, open_envi_cube
 from storage.readers.scan_files import open_cube_source
 
