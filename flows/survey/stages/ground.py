@@ -13,8 +13,7 @@ from flows.survey.stage import Product, Wanted, stage
 from pipeline.ground.map_grid import GroundGrid, classes_at, ground_grid, image_at, map_blocks
 from pipeline.ground.view import GroundView
 from storage.archive.keys import StageRef
-from storage.arrays.class_maps import ClassNames, load_class_map
-from storage.arrays.ground_maps import BLOCK, GroundMapWriter
+from storage.arrays.class_maps import BLOCK, ClassNames, GroundMapWriter, load_class_map
 from storage.arrays.layout import SHARD_ROWS, open_group, read_array, read_bands
 from storage.arrays.quicklooks import choose_bands, develop, stretch
 
