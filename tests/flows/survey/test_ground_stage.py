@@ -76,7 +76,7 @@ def stores(tmp_path: Path) -> tuple[StageRef, StageRef]:
     )
     values = np.linspace(0.1, 0.9, rows)[:, None, None] * np.ones((rows, columns, 4))
     values[:5, :5] = np.nan
-    writer.write_rows(0, values, np.ones((rows, columns)))
+    writer.write_tile(0, 0, values, np.ones((rows, columns)))
     return StageRef("segment", "m", tmp_path / "map"), StageRef("rectify", "r", tmp_path / "mosaic")
 
 

@@ -142,7 +142,7 @@ def _mosaic(bands: int, shape: tuple[int, int] = (100, 70)) -> Mosaic:
 def write_mosaic(path: Path, mosaic: Mosaic) -> None:
     """Store a mosaic in one block of rows, with its quicklook."""
     writer = MosaicWriter(path, mosaic.values.shape[:2], mosaic.wavelength_nm, grid=mosaic.grid)
-    writer.write_rows(0, mosaic.values, mosaic.coverage)
+    writer.write_tile(0, 0, mosaic.values, mosaic.coverage)
     assert mosaic.quicklook is not None
     writer.write_quicklook(mosaic.quicklook)
 

@@ -44,7 +44,7 @@ def test_tiles_and_rows_store_the_same(tmp_path: Path) -> None:
     values, coverage = image()
     rows, tiles = writer(tmp_path / "rows.zarr"), writer(tmp_path / "tiles.zarr")
     for first in (0, 64):
-        rows.write_rows(first, values[first : first + 64], coverage[first : first + 64])
+        rows.write_tile(first, 0, values[first : first + 64], coverage[first : first + 64])
     assert tiles.tile_shape == (64, 640)
     assert np.isnan(load_mosaic(tmp_path / "tiles.zarr").values).all()  # shards that never came
     for y, x in [(64, 1280), (64, 640), (64, 0), (0, 1280), (0, 640), (0, 0)]:
@@ -93,7 +93,7 @@ def mosaic(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("mosaic") / "mosaic.zarr"
     values = np.random.default_rng(0).random((150, 90, len(NM)), np.float32)
     values[:20, :30] = np.nan
-    MosaicWriter(path, (150, 90), NM).write_rows(0, values, np.ones((150, 90), np.float32))
+    MosaicWriter(path, (150, 90), NM).write_tile(0, 0, values, np.ones((150, 90), np.float32))
     return path
 
 

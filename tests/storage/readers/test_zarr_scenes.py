@@ -123,7 +123,7 @@ def test_own_mosaic(tmp_path: Path) -> None:
     values = np.random.default_rng(0).random((8, 9, 5)).astype(np.float32).round(2)
     values[2, 3] = np.nan
     writer = MosaicWriter(tmp_path / "mosaic.zarr", (8, 9), NM, fwhm_nm=NM / 100)
-    writer.write_rows(0, values, np.ones((8, 9), np.float32))
+    writer.write_tile(0, 0, values, np.ones((8, 9), np.float32))
     scene = load_scene_file(tmp_path / "mosaic.zarr")
     np.testing.assert_allclose(scene.values, values, rtol=3e-4)
     assert scene.fwhm_nm is not None
