@@ -23,6 +23,7 @@ from storage.archive.archive import Archive
 from storage.arrays.cubes import RawCube, open_raw_cube
 from storage.arrays.quicklooks import load_quicklook
 from storage.arrays.spool import Spool
+from storage.remote.opening import verify_archive
 from tests.conftest import Survey
 from tests.storage.small_archive import flip
 
@@ -144,14 +145,14 @@ def test_lost_lines_are_rendered_again(
     ends = [at for at, byte in enumerate(index.read_bytes()) if byte == ord("\n")]
     for path, at in ((index, 40), (index, ends[3] - 30), (index, ends[9]), (numbers, numbers.stat().st_size // 2)):
         flip(path, at)
-    told = [one for one in Archive.open(tmp_path / "broken").verify_all() if one.problem is not None]
+    told = [one for one in verify_archive(Archive.open(tmp_path / "broken")) if one.problem is not None]
     assert {(one.uri, one.kind) for one in told} == {(f"spool/{index.parent.name}", "growing")}
     survey_png(tmp_path / "broken")
     before, after = (Archive.open(tmp_path / name) for name in ("whole", "broken"))
     assert [ref.uri for ref in after.refs()] == [ref.uri for ref in before.refs()]
     for ref in before.refs("capture"):
         assert after.manifest(after.ref("capture", ref.key))["files"] == before.manifest(ref)["files"]
-    assert {one.kind for one in after.verify_all()} == {"whole"}
+    assert {one.kind for one in verify_archive(after)} == {"whole"}
 
 
 def test_processes_make_the_same_archive(tmp_path: Path, survey_png: Survey, surveyed_png: Survey) -> None:
