@@ -114,6 +114,19 @@ def test_lost_lines_are_put_back(tmp_path: Path, lost: list[int]) -> None:
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
+def test_numbers_are_on_the_disk_before_the_entries_that_vouch_for_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of lines that are put back too: a power cut leaves them lost, and never wrong."""
+    _fill(tmp_path, 6)
+    flip(tmp_path / "lines.bil", 48 * 4 + 5)
+    synced = list[str]()
+    with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
+        monkeypatch.setattr("storage.arrays.spool.sync_path", lambda path: synced.append(path.name))
+        spool.mend([_line(4)])
+    assert synced[:2] == ["lines.bil", "lines.index.part"]
+
+
 def test_lines_are_put_back_in_their_places_alone(tmp_path: Path) -> None:
     """Another line than the one that is lost is refused, and nothing is overwritten with it."""
     _fill(tmp_path, 6)
