@@ -25,23 +25,11 @@ _TANGENT = "tangent of the undeflected direction's plane"
 def path_digest(
     position: NDArray[np.floating], usable: NDArray[np.bool_] | None = None, shift: NDArray[np.floating] | None = None
 ) -> str:
-    """Name a sweep's path by all that its tracks depend on: which lines are usable, where they lie, their corrections.
+    """Name a sweep's path, in 20 hex digits, by all that its tracks depend on: which lines are usable, where they lie.
 
-    What a line that is not usable reports does not count, nor whether a correction is zero or none. Camera, binning,
-    step and grid are the stage's own parameters.
-
-    Parameters
-    ----------
-    position, usable, shift
-        (line, 2), (line,) and (line, 2), as of :func:`pipeline.rectify.tracks.make_tracks`.
-
-    Returns
-    -------
-    20 hex digits.
-
-    Raises
-    ------
-    ShapeError : arrays do not fit the lines.
+    Positions and their corrections ``shift`` are (line, 2), as of :func:`pipeline.rectify.tracks.make_tracks`. What a
+    line that is not usable reports does not count, nor whether a correction is zero or none. Camera, binning, step and
+    grid are the stage's own parameters. Raises ShapeError: arrays do not fit the lines.
     """
     lines = np.asarray(position, np.float64)
     flags = np.ones(len(lines), np.bool_) if usable is None else np.asarray(usable, np.bool_)
@@ -58,15 +46,7 @@ def path_digest(
 
 
 def write_lookup(path: Path, tables: Tables, facts: Mapping[str, Any] | None = None) -> None:
-    """Store the tracks and tie tables of sweeps.
-
-    Parameters
-    ----------
-    tables
-        Of each sweep, by its name, its tracks in order.
-    facts
-        Attributes that say what the tables were made for: geometry of the camera, grid, tolerance.
-    """
+    """Store the tracks and tie tables of sweeps, by name; ``facts`` are attributes: camera, grid, tolerance."""
     root = create_group(path, "lookup", {**(facts or {}), "sweeps": list(tables)})
     for number, (name, tracks) in enumerate(tables.items()):
         sweep = root.create_group(f"sweep_{number}", attributes={"sweep": name, "tracks": len(tracks)})

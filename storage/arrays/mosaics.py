@@ -49,7 +49,7 @@ class Mosaic:
 
 
 class MosaicWriter:
-    """Write a mosaic in rows or tiles of whole shards, so that it never has to be in memory as a whole.
+    """Write a mosaic in tiles of whole shards, so that it never has to be in memory as a whole.
 
     Values are rounded to 11 bits.
     """
@@ -97,12 +97,6 @@ class MosaicWriter:
         """(y, x) of a shard, the least that can be written by itself: 64 rows of at most 640 columns."""
         rows, columns = image_spec(("y", "x"), self._shape[:2], "<f4").shard or self._shape[:2]
         return rows, columns
-
-    def write_rows(self, first: int, values: NDArray[np.floating], coverage: NDArray[np.floating]) -> None:
-        """Store (row, x, band) values and (row, x) coverage from row ``first`` on; raises as `write_tile`."""
-        if values.shape[1:2] != self._shape[1:2]:
-            raise ShapeError(f"rows from {first} have shape {values.shape}; the mosaic is {self._shape}")
-        self.write_tile(first, 0, values, coverage)
 
     def write_tile(
         self, first_row: int, first_column: int, values: NDArray[np.floating], coverage: NDArray[np.generic]

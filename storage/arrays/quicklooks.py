@@ -200,9 +200,3 @@ def quicklook_of(group: zarr.Group) -> Quicklook | None:
     about: dict[str, Any] = dict(group[ARRAY].attrs)
     low, high, bands = (tuple(about.get(name, ())) for name in ("low", "high", "bands"))
     return Quicklook(image, low, high, int(about.get("step", 1)), bands)
-
-
-def pictures_of(store: Path) -> dict[str, NDArray[np.uint8]]:
-    """Pictures (y, x, 3) of a published store by the names of its cubes, in their order; those without are left out."""
-    found = {path.stem: load_quicklook(path) for path in sorted(store.glob("*.zarr"))}
-    return {name: seen.image for name, seen in found.items() if seen is not None}

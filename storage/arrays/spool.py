@@ -37,22 +37,14 @@ _ANEW = os.O_WRONLY | os.O_CREAT | os.O_TRUNC
 
 
 class Spool:
-    """Lines on disk, appended one by one. Use as a context manager, or close it.
-
-    Attributes
-    ----------
-    count
-        Lines that are there or lost; the next one appended has this number.
-    lost
-        Numbers of lines before that which are lost, in order: `mend` them before the lines are read.
-    """
+    """Lines on disk, appended one by one. Use as a context manager, or close it."""
 
     def __init__(self, path: Path, shape: tuple[int, int], header: Mapping[str, Any]) -> None:
         self.path = path  # of the numbers
         self.index_path = path.with_suffix(".index")
         self.samples, self.bands = shape
-        self.count = 0
-        self.lost: list[int] = []
+        self.count = 0  # lines that are there or lost: the number of the next one appended
+        self.lost: list[int] = []  # numbers of those that are lost, in order: `mend` them before the lines are read
         self._head = Head.of(*shape, header)
         self._index_end = 0
         self._line_bytes = shape[0] * shape[1] * 2
@@ -63,20 +55,16 @@ class Spool:
     def open(cls, folder: Path, samples: int, bands: int, *, header: Mapping[str, Any], name: str = "lines") -> Spool:
         """Open the spool in ``folder``, or begin it; lines from an earlier, broken capture are kept and counted.
 
-        Parameters
-        ----------
-        header
-            What the lines belong to (the sweep, the source, the seed): lines of anything else are not continued.
-
-        Raises
-        ------
-        RigError : the spool holds lines of another sweep or of an earlier version, or the disk refuses.
+        ``header`` is what the lines belong to (the sweep, the source, the seed). Raises RigError: the spool holds lines
+        of anything else or of an earlier version, or the disk refuses.
         """
         spool = cls(folder / f"{name}.bil", (samples, bands), header)
         with _refusals(spool.path, 0):
             folder.mkdir(parents=True, exist_ok=True)
-            if not spool._is_there():
-                spool._begin()
+            there = os.path.lexists(spool.index_path) and os.path.lexists(spool.path)
+            if not there or b"\n" not in read_plain(spool.index_path):  # nor is a header that is torn
+                for path, content in ((spool.path, b""), (spool.index_path, spool._head.text)):
+                    _write_anew(path, content)
                 for named in (folder, folder.parent, folder.parent.parent):  # lines need their files' names
                     sync_path(named)
             spool.recover()
@@ -129,7 +117,10 @@ class Spool:
             self._check_line(line, number)
             content = _to_bytes(line.data)
             with _refusals(self.path, number):
-                self._overwrite(number, content)
+                self.close()
+                with os.fdopen(open_plain(self.path, os.O_WRONLY), "wb", buffering=0) as file:
+                    file.seek(number * self._line_bytes)
+                    _write_all(file, content)
                 waiting.append(self._head.entry(line, content))
                 if len(waiting) == SYNC_LINES or number == lost[-1]:
                     self._add_entries(waiting)
@@ -145,18 +136,18 @@ class Spool:
     def recover(self) -> int:
         """Find the good lines and those that are lost, cut off what a crash left torn behind the last good one.
 
-        Returns
-        -------
-        The number of the line to go on with. Every line is read and compared with its CRC.
-
-        Raises
-        ------
-        RigError : the lines are of another sweep or of an earlier version.
+        Gives the number of the line to go on with. Every line is read and compared with its CRC. Raises RigError: the
+        lines are of another sweep or of an earlier version.
         """
         index = read_plain(self.index_path)
         if not self._head.is_head_of(index):
             self._refuse_another(index)
-        good = self._good_entries(index)
+        good: dict[int, SpoolEntry] = {}  # by number, of lines whose numbers are those that were written
+        with plain_reader(self.path) as data:
+            for number, entry in sorted(self._head.entries(index).items()):
+                content = self._read(data, number)
+                if len(content) == self._line_bytes and entry.fits(content):
+                    good[number] = entry
         self.count = max(good, default=-1) + 1
         self.lost = [number for number in range(self.count) if number not in good]
         if self.lost:
@@ -211,16 +202,6 @@ class Spool:
             with os.fdopen(open_plain(path, os.O_WRONLY), "wb") as file:
                 file.truncate(size)
 
-    def _is_there(self) -> bool:
-        """Whether both files are, and of the index at least a line that is not torn."""
-        if not os.path.lexists(self.index_path) or not os.path.lexists(self.path):
-            return False
-        return b"\n" in read_plain(self.index_path)
-
-    def _begin(self) -> None:
-        for path, content in ((self.path, b""), (self.index_path, self._head.text)):
-            _write_anew(path, content)
-
     def _refuse_another(self, index: bytes) -> None:
         """Raise RigError where an index begins with another header; one that is damaged is judged by its entries."""
         found = read_head(index)
@@ -238,16 +219,6 @@ class Spool:
             f"finish that capture, or remove the folder to start anew"
         )
 
-    def _good_entries(self, index: bytes) -> dict[int, SpoolEntry]:
-        """Entries by number, in order, of the lines whose numbers are those that were written."""
-        good: dict[int, SpoolEntry] = {}
-        with plain_reader(self.path) as data:
-            for number, entry in sorted(self._head.entries(index).items()):
-                content = self._read(data, number)
-                if len(content) == self._line_bytes and entry.fits(content):
-                    good[number] = entry
-        return good
-
     def _keep_entries(self, index: bytes, entries: Mapping[int, SpoolEntry]) -> None:
         """Have the index begin with these entries and nothing else, without a write where it does so already."""
         wanted = self._head.text + b"".join(entries[number].text for number in sorted(entries))
@@ -258,12 +229,6 @@ class Spool:
             sync_path(staged)
             staged.replace(self.index_path)
             sync_path(self.index_path.parent)
-
-    def _overwrite(self, number: int, content: bytes) -> None:
-        self.close()
-        with os.fdopen(open_plain(self.path, os.O_WRONLY), "wb", buffering=0) as file:
-            file.seek(number * self._line_bytes)
-            _write_all(file, content)
 
     def _add_entries(self, entries: list[SpoolEntry]) -> None:
         """Enter lines that were put back, once the disk has their numbers."""

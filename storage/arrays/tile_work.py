@@ -182,30 +182,13 @@ def write_mosaic(
     seen: Thumbnail | None = None,
     report: Callable[[float], None] = lambda done: None,
 ) -> TileBudget:
-    """Rectify and blend sweeps into a stored mosaic. Whoever makes the tiles, the same bytes come out.
+    """Rectify and blend sweeps into a stored mosaic, and tell how. Whoever makes the tiles, the same bytes come out.
 
-    Parameters
-    ----------
-    work
-        A recipe, which every crew can follow; opened sweeps for threads alone.
-    memory
-        What this process, with those that it starts, may take, not workers of a scheduler elsewhere. [bytes]
-    crew
-        Who makes tiles, and how many at a time; fewer are made where memory holds fewer.
-    seen
-        Filled with the pixels that it shows.
-    report
-        Called with the share done after each tile, from the calling thread.
-
-    Returns
-    -------
-    How it was done.
-
-    Raises
-    ------
-    SettingsError : not even one tile at a time fits the memory, or the crew cannot work here.
-    WorkerError : processes that made tiles were lost.
-    TypeError : opened sweeps for a crew of processes.
+    Every crew can follow a recipe, threads alone take opened sweeps; fewer tiles are made at a time where ``memory``
+    [bytes] of this process and those that it starts, not of workers elsewhere, holds fewer. ``seen`` is filled with the
+    pixels that it shows, ``report`` called with the share done after each tile, from the calling thread. Raises
+    SettingsError: not even one tile fits the memory, or the crew cannot work here. WorkerError: processes that made
+    tiles were lost. TypeError: opened sweeps for a crew of processes.
     """
     opened = work.open() if isinstance(work, MosaicRecipe) else work
     tiles = plan_tiles(opened.placed, opened.camera, opened.grid, writer.tile_shape)

@@ -22,8 +22,7 @@ from odc.geo.geom import multipoint
 
 from pipeline.errors import ArchiveError
 from storage.archive.whole_files import write_whole
-from storage.arrays.class_maps import ClassNames
-from storage.arrays.ground_maps import map_attributes
+from storage.arrays.class_maps import ClassNames, map_attributes
 
 COG = "image/tiff; application=geotiff; profile=cloud-optimized"
 ZARR = "application/vnd.zarr; version=3"
@@ -51,14 +50,8 @@ def bounds(geometry: Mapping[str, Any]) -> list[float]:
 def footprint(geobox: GeoBox, seen: Iterable[tuple[int, NDArray[np.bool_]]]) -> dict[str, Any] | None:
     """Convex outline of what a map shows, as a GeoJSON polygon in longitude and latitude, anticlockwise.
 
-    Parameters
-    ----------
-    seen
-        First row and (row, x) whether the map shows anything there, in order.
-
-    Returns
-    -------
-    To within one pixel of the map; None where nothing is seen.
+    ``seen`` is first row and (row, x) whether the map shows anything there, in order. To within one pixel of the map;
+    None where nothing is seen.
     """
     corners = []
     for first, mask in seen:

@@ -91,16 +91,9 @@ def plan_clearance(
 ) -> Clearance:
     """Find what can go: stores that no run names, spools of published captures, and what a dead process left.
 
-    Parameters
-    ----------
-    keep_days
-        Stores younger than this stay, and so does what they rest on: a survey may be about to name them.
-    raw_too
-        Also raw lines of a rig (or that were ingested) that no run names; they cannot be had again.
-
-    Raises
-    ------
-    SettingsError : ``keep_days`` is negative or no number.
+    Stores younger than ``keep_days`` stay, and so does what they rest on: a survey may be about to name them.
+    ``raw_too`` also takes raw lines of a rig (or that were ingested) that no run names; they cannot be had again.
+    Raises SettingsError: ``keep_days`` is negative or no number.
     """
     if not (math.isfinite(keep_days) and keep_days >= 0):
         raise SettingsError(f"--keep-days {keep_days}: expected a number of days, 0 or more")

@@ -30,7 +30,7 @@ def growing_problems(root: Path) -> Iterator[tuple[str, str]]:
                 yield f"{SPOOLS}/{folder.name}", problem
     for path in _inside(root / FOLDER):
         if path.name.endswith(SUFFIX):
-            for problem in _told(_ledger_problems, path):
+            for problem in _told(lambda path: _line_problems(path, "", "; the other lines are read"), path):
                 yield f"{FOLDER}/{path.name}", problem
 
 
@@ -44,7 +44,8 @@ def _spool_folder(folder: Path) -> Iterator[str]:
             yield from _told(spool_problems, path)
         for file in _inside(path):
             if file.name == JOURNAL:
-                yield from (f"{path.name}/{one}" for one in _told(_journal_problems, file))
+                found = _told(lambda file: _line_problems(file, f"{file.name}: ", ", and counts for nothing"), file)
+                yield from (f"{path.name}/{one}" for one in found)
             elif file.name.endswith(SUMS) and (at := first_unlike(path / file.name.removesuffix(SUMS))) is not None:
                 name = f"{path.name}/{file.name.removesuffix(SUMS)}"
                 yield f"{name} is not as it was fetched from byte {at} on; it is {_AGAIN}"
@@ -63,18 +64,10 @@ def _told(problems: Callable[[Path], Iterator[str]], path: Path) -> list[str]:
     return found
 
 
-def _changed_lines(path: Path) -> list[int]:
-    return [line.number for line in read_checked(read_plain(path)) if line.state == "changed"]
-
-
-def _ledger_problems(path: Path) -> Iterator[str]:
-    for number in _changed_lines(path):
-        yield f"line {number} has changed since it was written; the other lines are read"
-
-
-def _journal_problems(path: Path) -> Iterator[str]:
-    for number in _changed_lines(path):
-        yield f"{path.name}: line {number} has changed since it was written, and counts for nothing"
+def _line_problems(path: Path, before: str, after: str) -> Iterator[str]:
+    for line in read_checked(read_plain(path)):
+        if line.state == "changed":
+            yield f"{before}line {line.number} has changed since it was written{after}"
 
 
 def spool_problems(path: Path) -> Iterator[str]:

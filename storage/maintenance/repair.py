@@ -76,18 +76,9 @@ def repair(
 ) -> Repaired:
     """Set aside what is broken and all that was made of it, and run the surveys that name any of it again.
 
-    Parameters
-    ----------
-    findings
-        Of `storage.maintenance.verification.verify_everything`.
-    rerun
-        Runs a survey by its settings, as the receipt has them, into this archive. What is whole is found there.
-    versions
-        Of the stages as they are made now: stores of other versions are not made again, and stay.
-
-    Raises
-    ------
-    ArchiveError : somebody else uses the archive, or the disk refuses.
+    ``findings`` are those of `verify_everything`. ``rerun`` runs a survey by its settings, as the receipt has them,
+    into this archive, and finds there what is whole. ``versions`` are the stages' as they are made now: stores of
+    others are not made again, and stay. Raises ArchiveError: somebody else uses the archive, or the disk refuses.
     """
     with archive.in_use(alone=True) as alone, refusals(archive.root, "repair the archive"):
         if not alone:

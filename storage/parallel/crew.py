@@ -129,30 +129,14 @@ def run_blocks(
     They are begun in order, none more than a few before the oldest unfinished one: neighbours share what they read.
     The first error is raised once no block is being made any more: none writes after that.
 
-    Parameters
-    ----------
-    make
-        On threads anything that may be called from several at once. Otherwise it and the items are pickled: they hold
-        absolute paths, never arrays or open files, and writing a block twice must give the same bytes.
-    keep
-        Whether to return the results; False drops each once ``each`` has seen it.
-    report
-        Called with the share done after each block.
-    each
-        Called with an item and its result, one at a time, in the order in which they end.
-    paths
-        Folders that the work reads or writes: workers elsewhere are asked whether they see the same in them. From
-        those in a staged store (``*.part``) goes what a killed worker left of a file that another wrote again.
-
-    Returns
-    -------
-    Results in the order of the items; empty without ``keep``.
-
-    Raises
-    ------
-    SettingsError : no scheduler answers, or its workers see other files or run other versions.
-    WorkerError : workers died, more often than a block is tried again.
-    TypeError : work or items that cannot be sent to another process, or hold arrays.
+    On threads ``make`` is anything that may be called from several at once. Otherwise it and the items are pickled:
+    they hold absolute paths, never arrays or open files, and writing a block twice must give the same bytes.
+    ``each`` is called with an item and its result, one at a time, in the order in which they end, ``report`` with the
+    share done after each. Workers elsewhere are asked whether they see the same in ``paths``, the folders that the work
+    reads or writes; from those in a staged store (``*.part``) goes what a killed worker left of a file that another
+    wrote again. Gives the results in the order of the items; none without ``keep``. Raises SettingsError: no scheduler
+    answers, or its workers see other files or run other versions. WorkerError: workers died, more often than a block is
+    tried again. TypeError: work or items that cannot be sent to another process, or hold arrays.
     """
     results: list[Any] = [None] * len(items) if keep else []
     count = 0

@@ -158,12 +158,10 @@ def check_numbers(kind: np.dtype[Any], where: object) -> None:
 
 
 def scene_lines(source: CubeSource, start: int, stop: int) -> NDArray[Any]:
-    """Lines as a scene shows them: over the white panel where dark and white are known, else as they stand.
+    """Lines as a scene shows them, (line, sample, band): over the white panel where dark and white are known.
 
-    Returns
-    -------
-    (line, sample, band): float32 with NaN where a line is missing, an element bad or the file says no data; the
-    source's own numbers where nothing is missing and there are no references.
+    float32 with NaN where a line is missing, an element bad or the file says no data; the source's own numbers where
+    nothing is missing and there are no references.
     """
     raw = source.read(start, stop)
     valid = source.lines.valid[start:stop]

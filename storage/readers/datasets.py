@@ -81,18 +81,9 @@ def load_data_set(
     A scene is named by the first number in its file's name (``images/059_image.png`` is ``059``), or by the whole name
     where numbers are missing or alike.
 
-    Parameters
-    ----------
-    hold_out
-        Names of scenes to keep from training.
-    train_mask
-        For one scene: where to train. 0 is nowhere; number i is the label file's class ``mask_classes[i - 1]``.
-    mask_classes
-        None takes the mask's numbers as the label file's.
-
-    Raises
-    ------
-    SceneError : there is no scene, a name to hold out does not exist, or a mask is given for several scenes.
+    Those of ``hold_out`` are kept from training. ``train_mask`` says where to train in one scene: 0 is nowhere, number
+    i the label file's class ``mask_classes[i - 1]``, or i where that is None. Raises SceneError: there is no scene, a
+    name to hold out does not exist, or a mask is given for several scenes.
     """
     files = _scene_files(path, train_mask)
     unknown = [name for name in hold_out if name not in files]

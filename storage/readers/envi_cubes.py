@@ -145,20 +145,12 @@ def load_envi_header(path: Path) -> EnviHeader:
 
 
 def parse_envi_header(text: str, where: str = "the header") -> EnviHeader:
-    """Read a header's text.
+    """Read a header's text; messages call it ``where``.
 
     Wavelengths come out in nm. Without a unit they are read as nm or micrometres by their size, and a note says so;
-    wavelengths that do not fit the bands are left out with a note.
-
-    Parameters
-    ----------
-    where
-        What messages call it.
-
-    Raises
-    ------
-    SceneError : it does not begin with ENVI (ArcGIS headers do not), a size, type or interleave is missing or
-        impossible, or it says that its file holds more than plain numbers (compressed, with bytes between frames).
+    wavelengths that do not fit the bands are left out with a note. Raises SceneError: it does not begin with ENVI
+    (ArcGIS headers do not), a size, type or interleave is missing or impossible, or it says that its file holds more
+    than plain numbers (compressed, with bytes between frames).
     """
     notes: list[str] = []
     fields, settings = split_header(text, where, notes)

@@ -51,17 +51,10 @@ def open_cube_source(
 ) -> CubeSource:
     """Open whatever holds a cube; nothing of its numbers is read yet but small images, .mat and .npz, which are whole.
 
-    Parameters
-    ----------
-    address
-        ENVI header or data file, Headwall folder, Zarr store (``STORE:ARRAY``), or a file that
-        :func:`storage.readers.raster_files.load_raster` reads.
-    dark, white
-        ENVI or .npy files of reference frames, averaged over their lines; they win over those in a Headwall folder.
-
-    Raises
-    ------
-    SceneError : there is no such thing, it is damaged, or not of a kind or shape that can be used.
+    That is an ENVI header or data file, a Headwall folder, a Zarr store (``STORE:ARRAY``), or a file that
+    :func:`storage.readers.raster_files.load_raster` reads. ``dark`` and ``white`` are ENVI or .npy files of reference
+    frames, averaged over their lines; they win over those in a Headwall folder. Raises SceneError: there is no such
+    thing, it is damaged, or not of a kind or shape that can be used.
     """
     path, variable = split_variable(address)
     stated, found = [("dark", dark), ("white", white)], list[tuple[str, Path | None]]()
@@ -77,7 +70,9 @@ def open_cube_source(
         source = _raster_source(address)
     for kind, frame in (*found, *stated):
         if frame is not None:
-            source = _with_frame(source, kind, frame)
+            values, more = load_frame(frame)
+            notes = (*source.notes, f"{kind} frame from {Path(frame).name}")
+            source = replace(source, **{kind: values}, files=(*source.files, *more), notes=notes)  # type: ignore[arg-type]
     check_cube_source(source)
     return source
 
@@ -114,15 +109,6 @@ def load_frame(address: str | Path) -> tuple[NDArray[np.float32], tuple[Path, ..
         raise SceneError(f"{path} holds {values.dtype}, expected the real numbers of a reference frame")
     frame = values[None] if values.ndim == 2 else values
     return np.asarray(frame.mean(axis=0, dtype=np.float64), np.float32), files
-
-
-def _with_frame(source: CubeSource, kind: str, address: str | Path) -> CubeSource:
-    """The same cube with its dark or white frame, and a note on where that is from."""
-    frame, more = load_frame(address)
-    files, notes = (*source.files, *more), (*source.notes, f"{kind} frame from {Path(address).name}")
-    if kind == "dark":
-        return replace(source, dark=frame, files=files, notes=notes)
-    return replace(source, white=frame, files=files, notes=notes)
 
 
 def _raster_source(address: str | Path) -> CubeSource:
@@ -196,18 +182,8 @@ def write_ingested_cube(
 ) -> None:
     """Store a cube as ``cube.zarr`` and ``quicklook.png`` in a folder, 64 lines at a time.
 
-    Parameters
-    ----------
-    files
-        What the cube came from, for its attributes.
-    name
-        What the cube is called.
-    report
-        Told how far it is, 0..1.
-
-    Raises
-    ------
-    SceneError : lines cannot be read.
+    Its attributes have its name and the files that it came from; ``report`` is told how far it is, 0..1. Raises
+    SceneError: lines cannot be read.
     """
     kind = stored_dtype(source, lambda done: report(0.3 * done))
     looked_at = source.dtype.kind in "ui" and source.dtype not in (np.uint8, np.uint16)

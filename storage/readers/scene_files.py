@@ -59,24 +59,12 @@ def load_scene_file(
 ) -> SceneFile:
     """Read a scene from an image, .npy, .npz, .mat, ENVI, Zarr or a Headwall folder.
 
-    What is given here wins over the ``scene.toml`` beside the file, and that over what the file says.
-
-    Parameters
-    ----------
-    path
-        File or folder, or ``FILE.mat:VARIABLE``, ``STORE.zarr:ARRAY``. Axes are y, x, band; two axes are one band.
-        What comes in lines with dark and white frames is taken over the white panel.
-    labels
-        File of class numbers or colours on the same pixels. Frames of HyKo2 and RANUS bring their own.
-    bands
-        Bands of the file to use, counted from 0.
-    wavelengths
-        One for each band used, or for each band of the file. [nm]
-
-    Raises
-    ------
-    SceneError : a file is missing, damaged, of a kind or shape that cannot be used, or the labels do not fit.
-    WavelengthError : wavelengths are missing, or their number, unit or range is wrong.
+    ``path`` may be ``FILE.mat:VARIABLE`` or ``STORE.zarr:ARRAY``. Axes are y, x, band; two axes are one band. What
+    comes in lines with dark and white frames is taken over the white panel. What is given here wins over the
+    ``scene.toml`` beside the file, and that over what the file says: a file of class numbers or colours on the same
+    pixels (frames of HyKo2 and RANUS bring their own), bands to use, counted from 0, and wavelengths [nm], one for each
+    band used or for each of the file. Raises SceneError: a file is missing, damaged, of a kind or shape that cannot be
+    used, or the labels do not fit. WavelengthError: wavelengths are missing, or their number, unit or range is wrong.
     """
     file, variable = split_variable(path)
     layout = find_layout(file, variable)

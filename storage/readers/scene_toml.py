@@ -157,20 +157,9 @@ def settle_wavelengths(
 ) -> BandWavelengths:
     """Wavelengths of the chosen bands: the flag first, then ``scene.toml``, then the file, then its colours.
 
-    Parameters
-    ----------
-    bands
-        Chosen bands, counted from 0, of ``file_bands``.
-    stated
-        From the flag: one for each chosen band, or one for each band of the file. [nm]
-    assumed_nm
-        One for each band of the file, or None where nothing can be assumed. [nm]
-    known
-        What the file itself says, of every band.
-
-    Raises
-    ------
-    WavelengthError : nothing says them, or their number, unit or range is wrong.
+    ``bands`` are counted from 0, of ``file_bands``. The flag has one for each of them or for each band of the file;
+    what the file says (``known``), or its colours let assume, is of every band. [nm] Raises WavelengthError: nothing
+    says them, or their number, unit or range is wrong.
     """
     chosen = list(bands)
     if stated is not None:

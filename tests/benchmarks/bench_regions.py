@@ -239,7 +239,7 @@ def _write_sparse(path: Path, grid: SceneGrid) -> NDArray[np.bool_]:
         part = grown[top : top + SHARD_ROWS]
         noise = rng.normal(0, 0.005, (*part.shape, len(nm)))
         values = np.where(part[..., None], maize, soil) + noise
-        writer.write_rows(top, values.astype(np.float32), np.ones(part.shape))
+        writer.write_tile(top, 0, values.astype(np.float32), np.ones(part.shape))
     return grown
 
 
@@ -258,7 +258,7 @@ def _write_field(folder: Path, side: int) -> None:
     grid, rng = SceneGrid(side, side, 16, 4), np.random.default_rng(0)
     nm = np.linspace(420, 980, SYNTHETIC_BANDS)
     writer = MosaicWriter(folder / "mosaic.zarr", grid.coarse_shape, nm)
-    writer.write_rows(0, rng.uniform(0.1, 0.5, (*grid.coarse_shape, len(nm))), np.ones(grid.coarse_shape))
+    writer.write_tile(0, 0, rng.uniform(0.1, 0.5, (*grid.coarse_shape, len(nm))), np.ones(grid.coarse_shape))
     count = int(np.prod(grid.seat_shape))
     seats = np.sort(rng.choice(count, int(SHARE * count), replace=False))
     _write_patches(folder / "patches.zarr", grid, seats, nm)

@@ -18,7 +18,7 @@ from typing import Any
 from storage.archive.archive import Archive
 from storage.archive.staging import MANIFEST_NAME
 from storage.maintenance.garbage import clear_up
-from tests.faults.fault_table import Clock, Row
+from tests.faults.fault_table import Clock, Row, told_wrong
 from tests.faults.nursery import Nursery
 from tests.faults.small_survey import Subject, prepare, problems, words, wrong_after_fault, wrong_after_rerun
 
@@ -149,13 +149,5 @@ def _row(subject: Subject, fault: str, quick: bool) -> Row:
         out = subject.folder / f"{fault.replace(' ', '-').replace(',', '')}-{number}"
         wrong += [f"{name}: {one}" for one in case(subject, out, WRONG[name])]
         shutil.rmtree(out)
-    found = f"{len(wrong)} wrong{': ' + '; '.join(wrong[:3]) if wrong else ''}"
-    return Row(
-        fault,
-        f"the time that the process sees: {', '.join(chosen)}",
-        len(chosen),
-        demanded,
-        found,
-        not wrong,
-        timer.seconds,
-    )
+    injected = f"the time that the process sees: {', '.join(chosen)}"
+    return Row(fault, injected, len(chosen), demanded, told_wrong(wrong), not wrong, timer.seconds)

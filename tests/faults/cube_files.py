@@ -19,7 +19,7 @@ import numpy as np
 from PIL import Image
 
 from pipeline.errors import PipelineError
-from storage.export.envi_writer import EnviFile, write_envi
+from storage.export.image_files import EnviFile, write_envi
 from storage.readers.scan_files import open_cube_source
 
 SHAPE = (20, 12, 5)

@@ -1,8 +1,11 @@
-"""Let the disk run full under a survey: ``python tests/faults/disk_full.py``.
+"""Let the disk run full under a survey, or refuse it calls: ``python tests/faults disk_full refused_writes``.
 
 The archive lies on a small tmpfs. Either it is made so small that the survey does not fit, or it is filled up at a
 chosen place; then it grows, and the same command runs again. Where no tmpfs can be mounted, not even in a namespace of
 its own, the calls are refused from the inside instead, and the table says so.
+
+Rights do not hinder root, so other refusals are of calls, from the inside: whatever changes something in the archive,
+by whichever library, counts as a place. Places are drawn at random over a whole survey, each with a random error.
 """
 
 from __future__ import annotations
@@ -19,40 +22,39 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-
-from tests.faults.fault_table import Clock, Row
-from tests.faults.injection import errors_by_name, label
+from tests.faults.fault_table import Clock, Row, told_wrong
+from tests.faults.injection import ERRORS, label, logged_calls
 from tests.faults.nursery import ROOT, Ended, Nursery
 from tests.faults.small_survey import Subject, prepare, words, wrong_after_fault, wrong_after_rerun
 
-SIZES, EACH = 30, 2
+SIZES, EACH, PLACES = 30, 2, 150
 LARGE = 64 << 20  # bytes: more than a survey takes
 PAGE = 4096
 IN_NAMESPACE = "SPECTRALZOOM_FAULTS_IN_NAMESPACE"
 QUICK = ("spool", "segment manifest", "run")  # kinds for the quick part
 FULL = ("disk is full", "No space left")
 WHERE = {"spool": "spool.", "manifest": "manifests.write_manifest", "run": "run_folder.publish_run"}  # in our functions
+STAGES = ("capture", "locate", "rectify", "attend", "patches", "segment")
+EVERYWHERE = {"spool", "run", "run manifest", *STAGES, *(f"{stage} manifest" for stage in STAGES)}
 
 
 @dataclass
-class Fills:
-    """What came of full disks."""
+class Refusals:
+    """What came of disks that refuse."""
 
-    met_at: Counter[str] = field(default_factory=Counter)  # what was being written
-    told: int = 0
-    fitted: int = 0
+    met_at: Counter[str] = field(default_factory=Counter)  # what was being written, or the call's and the error's name
+    told: int = 0  # one clear message, exit 1
+    done: int = 0  # the survey fitted, or could do without: exit 0
     wrong: list[str] = field(default_factory=list)
 
     def words(self) -> str:
         """The figures."""
         places = ", ".join(f"{name} {count}" for name, count in sorted(self.met_at.items()))
-        return (
-            f"{self.told} failed with one message, {self.fitted} fitted; {len(self.wrong)} wrong"
-            f"{': ' + '; '.join(self.wrong[:3]) if self.wrong else ''} (full at: {places})"
-        )
+        return f"{self.told} failed with one message, {self.done} ended well; {told_wrong(self.wrong)} (at: {places})"
+
+
+# --- full disks -------------------------------------------------------------------------------------------------------
 
 
 def can_mount() -> bool:
@@ -76,42 +78,36 @@ def small_disk(folder: Path, size: int) -> Iterator[Path]:
         folder.rmdir()
 
 
-def grow(folder: Path) -> None:
-    """Give a tmpfs room for everything."""
-    subprocess.run(["mount", "-o", f"remount,size={LARGE}", str(folder)], check=True)
-
-
-def openings_by_label(subject: Subject) -> dict[str, int]:
-    """How many files are opened to be written, by what they belong to."""
-    labels = (label(path) for _, call, path in subject.changing_calls if call == "open")
-    return dict(Counter(name for name in labels if name is not None))
-
-
-def fill_at_places(subject: Subject, each: int, *, mounted: bool, some: tuple[str, ...] = (), seed: int = 0) -> Fills:
+def fill_at_places(
+    subject: Subject, each: int, *, mounted: bool, some: tuple[str, ...] = (), seed: int = 0
+) -> Refusals:
     """Fill the disk ``each`` times while each kind (or some) is written, and run again on a larger one."""
-    found, chance = Fills(), random.Random(seed)
-    for name, count in openings_by_label(subject).items():
+    found, chance = Refusals(), random.Random(seed)
+    labels = (label(path) for _, call, path in subject.changing_calls if call == "open")
+    for name, count in Counter(one for one in labels if one is not None).items():
         if some and name not in some:
             continue
         for at in sorted(chance.sample(range(1, count + 1), min(each, count))):
             disk = subject.folder / f"disk-{name}-{at}".replace(" ", "-")
+            place = {"root": str(disk / "a"), "at": at, "kind": name}
             if mounted:
                 with small_disk(disk, LARGE // 8):
-                    ended = subject.nursery.run(words(disk / "a"), "fill_disk", root=str(disk / "a"), at=at, kind=name)
+                    ended = subject.nursery.run(words(disk / "a"), "fill_disk", **place)
                     _judge(subject, disk / "a", ended, name, found)
             else:
-                number = errors_by_name()["ENOSPC"]
-                ended = subject.nursery.run(
-                    words(disk / "a"), "refuse", root=str(disk / "a"), at=at, number=number, lasting=True, kind=name
-                )
+                full = {"number": ERRORS["ENOSPC"], "lasting": True}
+                ended = subject.nursery.run(words(disk / "a"), "refuse", **place, **full)
                 _judge(subject, disk / "a", ended, name, found)
                 shutil.rmtree(disk)
     return found
 
 
-def try_sizes(subject: Subject, count: int, found: Fills) -> None:
+def try_sizes(subject: Subject, count: int, found: Refusals) -> None:
     """Survey on disks from nearly nothing to what the survey takes, and run again on a larger one."""
-    taken = _taken(subject)
+    with small_disk(subject.folder / "large", LARGE) as disk:
+        assert subject.nursery.run(words(disk / "a")).code == 0
+        state = os.statvfs(disk)
+        taken = (state.f_blocks - state.f_bfree) * state.f_frsize
     for part in range(count):
         pages = max(1, round(taken * (part + 0.5) / count / PAGE))
         with small_disk(subject.folder / f"disk-of-{pages}", pages * PAGE) as disk:
@@ -119,18 +115,11 @@ def try_sizes(subject: Subject, count: int, found: Fills) -> None:
             _judge(subject, disk / "a", ended, None, found)
 
 
-def _taken(subject: Subject) -> int:
-    with small_disk(subject.folder / "large", LARGE) as disk:
-        assert subject.nursery.run(words(disk / "a")).code == 0
-        state = os.statvfs(disk)
-        return (state.f_blocks - state.f_bfree) * state.f_frsize
-
-
-def _judge(subject: Subject, out: Path, ended: Ended, name: str | None, found: Fills) -> None:
+def _judge(subject: Subject, out: Path, ended: Ended, name: str | None, found: Refusals) -> None:
     """Look at the archive after the survey failed, let the disk grow, and look again after the rerun."""
     wrong = wrong_after_fault(subject, out)
     if ended.code == 0 and name is None:
-        found.fitted += 1
+        found.done += 1
     elif not (ended.told and any(word in ended.message for word in FULL)):
         wrong.append(f"exit {ended.code}, {ended.message[-200:]}")
     else:
@@ -140,7 +129,7 @@ def _judge(subject: Subject, out: Path, ended: Ended, name: str | None, found: F
         f"met at {ended.place}" for word, where in WHERE.items() if word in (name or "") and where not in ended.place
     ]
     if os.path.ismount(out.parent):
-        grow(out.parent)
+        subprocess.run(["mount", "-o", f"remount,size={LARGE}", str(out.parent)], check=True)
     wrong += wrong_after_rerun(subject, out, subject.nursery.run(words(out)))
     found.wrong += [f"{name or out.parent.name}: {one}" for one in wrong]
 
@@ -154,62 +143,77 @@ def _met_at(ended: Ended) -> str:
     return f"{failed[0]} {words}" if failed and words != "run" else words if words == "run" else "archive's folder"
 
 
-def rows(quick: bool = False) -> list[Row]:
+def full_rows(quick: bool = False) -> list[Row]:
     if can_mount():
-        return _rows(quick, "a tmpfs")
-    if _can_unshare():
-        command = ["unshare", "-rm", sys.executable, str(Path(__file__)), "--rows", *(["--quick"] if quick else [])]
-        said = subprocess.run(
-            command, cwd=ROOT, env={**os.environ, IN_NAMESPACE: "1"}, capture_output=True, text=True, check=True
-        )
+        return [_full_row(quick, "a tmpfs")]
+    unshare = ["unshare", "-rm"]
+    allowed = IN_NAMESPACE not in os.environ and shutil.which("unshare") is not None
+    if allowed and subprocess.run([*unshare, "true"], capture_output=True, check=False).returncode == 0:
+        command = [*unshare, sys.executable, "-m", "tests.faults.disk_full", *(["--quick"] if quick else [])]
+        environment = {**os.environ, IN_NAMESPACE: "1"}
+        said = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
         return [Row(**row) for row in json.loads(said.stdout)]
-    return _rows(quick, "")
+    return [_full_row(quick, "")]
 
 
-def _can_unshare() -> bool:
-    if IN_NAMESPACE in os.environ or shutil.which("unshare") is None:
-        return False
-    return subprocess.run(["unshare", "-rm", "true"], capture_output=True, check=False).returncode == 0
-
-
-def _rows(quick: bool, kind: str) -> list[Row]:
-    where = f"{kind}{' in a namespace of its own' if IN_NAMESPACE in os.environ else ''}"
+def _full_row(quick: bool, kind: str) -> Row:
     clock = Clock()
     with tempfile.TemporaryDirectory(prefix="full-") as name, Nursery(Path(name)) as nursery:
         subject = prepare(nursery)
         found = fill_at_places(subject, 1 if quick else EACH, mounted=bool(kind), some=QUICK if quick else ())
         if kind:
             try_sizes(subject, 1 if quick else SIZES, found)
+    where = f"{kind}{' in a namespace of its own' if IN_NAMESPACE in os.environ else ''}"
     injected = f"{where} too small, or filled up while each kind of file is written; then it grows"
     if not kind:
         injected = "ENOSPC refused from the inside (no tmpfs can be mounted here), from each kind of file on"
-    row = Row(
-        "disk full",
-        injected,
-        found.told + found.fitted,
-        "one message and exit 1, archive verifies, nothing published is lost, rerun bit-identical",
-        found.words(),
-        not found.wrong and (quick or _everywhere(found)),
-        clock.seconds,
-    )
-    return [row]
+    demanded = "one message and exit 1, archive verifies, nothing published is lost, rerun bit-identical"
+    met = not found.wrong and (quick or set(found.met_at) >= EVERYWHERE)
+    return Row("disk full", injected, found.told + found.done, demanded, found.words(), met, clock.seconds)
 
 
-def _everywhere(found: Fills) -> bool:
-    stages = ("capture", "locate", "rectify", "attend", "patches", "segment")
-    wanted = {"spool", "run", "run manifest", *stages, *(f"{stage} manifest" for stage in stages)}
-    return wanted <= set(found.met_at)
+# --- calls that are refused -------------------------------------------------------------------------------------------
 
 
-def main(arguments: list[str]) -> int:
-    results = rows("--quick" in arguments)
-    if "--rows" in arguments:
-        plain: list[dict[str, Any]] = [asdict(row) for row in results]
-        print(json.dumps(plain))
-    else:
-        print("\n".join(f"{row.injected}: {row.found}" for row in results))
-    return 0 if all(row.met for row in results) else 1
+def refuse_places(subject: Subject, count: int, seed: int = 0) -> Refusals:
+    """Refuse at a random place in each of ``count`` parts of a survey, and run every survey again without."""
+    chance, found = random.Random(seed), Refusals()
+    for part in range(count):
+        at = 1 + int((part + chance.random()) * len(subject.changing_calls) / count)
+        _refuse_one(subject, at, chance.choice(list(ERRORS)), chance.random() < 0.5, found)
+    return found
 
 
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+def _refuse_one(subject: Subject, at: int, name: str, lasting: bool, found: Refusals) -> None:
+    out, log = subject.folder / f"refused-{at}", subject.folder / f"refused-{at}.calls"
+    about = {"root": str(out), "at": at, "number": ERRORS[name], "lasting": lasting, "log": str(log)}
+    ended = subject.nursery.run(words(out), "refuse", **about)
+    hit = logged_calls(log)
+    call, path = hit[0][1:] if hit else ("none", "")
+    found.met_at.update((call, name))
+    found.told += ended.told
+    found.done += ended.code == 0
+    wrong = wrong_after_fault(subject, out)
+    if not hit or not (ended.told or ended.code == 0):
+        wrong.append(f"exit {ended.code}, {ended.message[-300:]}")
+    # One run after the rerun, unless the refusal came when the run was published already.
+    published = ended.code == 0 or not hit or Path(path).name == "runs" or "runs-" in path or "use.lock" in path
+    again = subject.nursery.run(words(out))
+    wrong += wrong_after_rerun(subject, out, again, runs=None if published else 1)
+    found.wrong += [f"{name} at {at} ({call}, {ended.place[-60:]}): {one}" for one in wrong]
+    shutil.rmtree(out, ignore_errors=True)
+    log.unlink(missing_ok=True)
+
+
+def refused_rows(quick: bool = False) -> list[Row]:
+    clock, count = Clock(), 12 if quick else PLACES
+    with tempfile.TemporaryDirectory(prefix="refused-") as name, Nursery(Path(name)) as nursery:
+        found = refuse_places(prepare(nursery), count)
+    injected = f"{', '.join(ERRORS)} at a random call that changes the archive, once or from there on"
+    demanded = "one message and exit 1, archive verifies, rerun bit-identical"
+    met = not found.wrong and found.told > count // 2
+    return [Row("writes refused", injected, count, demanded, found.words(), met, clock.seconds)]
+
+
+if __name__ == "__main__":  # in a namespace of its own
+    print(json.dumps([asdict(row) for row in full_rows("--quick" in sys.argv)]))

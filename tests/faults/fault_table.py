@@ -50,6 +50,11 @@ class Clock:
 Rows = Callable[[bool], Sequence[Row]]  # quick or in full
 
 
+def told_wrong(wrong: Sequence[str]) -> str:
+    """How many demands were not met, and the first three."""
+    return f"{len(wrong)} wrong{': ' + '; '.join(wrong[:3]) if wrong else ''}"
+
+
 def plain_table(rows: Sequence[Row], headings: Sequence[str] = HEADINGS) -> str:
     """Rows in aligned columns, long texts folded inside their own."""
     return aligned([headings, *(row.cells for row in rows)], WIDTHS)
@@ -98,11 +103,12 @@ def run_table(
     return 1 if missed else 0
 
 
-def rows_of(module: str) -> Rows:
-    """The rows that a module gives, which is imported when they are asked for."""
+def rows_of(place: str) -> Rows:
+    """The rows of ``module`` or ``module:function``, which is imported when they are asked for."""
+    module, _, name = place.partition(":")
 
     def rows(quick: bool) -> Sequence[Row]:
-        found: Sequence[Row] = importlib.import_module(module).rows(quick)
+        found: Sequence[Row] = getattr(importlib.import_module(module), name or "rows")(quick)
         return found
 
     return rows

@@ -23,7 +23,7 @@ from pipeline.rig.capture.capture_runner import CaptureJournal
 from storage.archive.ledger import Ledger
 from storage.arrays.spool import Spool
 from storage.maintenance.growing_checks import growing_problems
-from tests.faults.fault_table import Clock, Row
+from tests.faults.fault_table import Clock, Row, told_wrong
 from tests.faults.lost_lines import BANDS, HEADER, SAMPLES, fill, line
 
 LINES = 40
@@ -41,8 +41,7 @@ class Rot:
 
     def words(self) -> str:
         """The figures."""
-        few = f": {'; '.join(self.wrong[:3])}" if self.wrong else ""
-        return f"{self.told} of {self.flips} told; {len(self.wrong)} wrong{few}"
+        return f"{self.told} of {self.flips} told; {told_wrong(self.wrong)}"
 
 
 def flip_spool(name: str, flips: int, folder: Path, seed: int = 0) -> Rot:
@@ -153,26 +152,13 @@ def _guarded(tried: Callable[[], list[str]]) -> list[str]:
         return [f"defect: {error!r}"]
 
 
-def rot_everything(flips: int, folder: Path, seed: int = 0) -> dict[str, Rot]:
-    """So many flips in all, by the kind of file."""
-    share = -(-flips // 5)
-    found = {name: flip_spool(name, share, folder, seed) for name in ("lines.index", "lines.bil", "lines.hdr")}
-    return found | {"ledger": flip_ledger(share, folder / "schedules", seed), "journal": flip_journal(share, seed)}
-
-
 def rows(quick: bool = False) -> Sequence[Row]:
-    clock = Clock()
+    clock, share = Clock(), (200 if quick else FLIPS) // 5
     with tempfile.TemporaryDirectory(prefix="growing-") as name:
-        found = rot_everything(200 if quick else FLIPS, Path(name))
+        found = {kind: flip_spool(kind, share, Path(name)) for kind in ("lines.index", "lines.bil", "lines.hdr")}
+        found |= {"ledger": flip_ledger(share, Path(name, "schedules")), "journal": flip_journal(share)}
+    injected = "one bit of a spool's index, numbers or ENVI header, of a ledger, of a rig's journal"
+    demanded = "no other number, no defect, no other line lost"
+    words = "; ".join(f"{kind}: {one.words()}" for kind, one in found.items())
     met = not any(one.wrong for one in found.values())
-    return [
-        Row(
-            "a bit flips in a file that grows",
-            "one bit of a spool's index, numbers or ENVI header, of a ledger, of a rig's journal",
-            sum(one.flips for one in found.values()),
-            "no other number, no defect, no other line lost",
-            "; ".join(f"{kind}: {one.words()}" for kind, one in found.items()),
-            met,
-            clock.seconds,
-        )
-    ]
+    return [Row("a bit flips in a file that grows", injected, 5 * share, demanded, words, met, clock.seconds)]

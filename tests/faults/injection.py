@@ -22,20 +22,8 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-WATCHED = (
-    "open",
-    "write",
-    "fsync",
-    "fdatasync",
-    "rename",
-    "replace",
-    "link",
-    "mkdir",
-    "unlink",
-    "rmdir",
-    "truncate",
-    "ftruncate",
-)
+_CALLS = "open write fsync fdatasync rename replace link mkdir unlink rmdir truncate ftruncate"
+ERRORS = {name: getattr(errno, name) for name in ("EACCES", "EROFS", "EIO", "ENOSPC", "EDQUOT")}  # that are tried
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 
 
@@ -98,7 +86,7 @@ def label(path: Path) -> str | None:
 
 
 def _install(watch: _Watch) -> None:
-    for name in WATCHED:
+    for name in _CALLS.split():
         setattr(os, name, watch.around(name, getattr(os, name)))
     # The io module calls the system from C, its twin in Python goes through os: so every library's files are seen.
     builtins.open = io.open = _pyio.open
@@ -208,11 +196,6 @@ _DATETIME = datetime.datetime
 
 def _or_now(call: Callable[[float], time.struct_time], now: Callable[[], float]) -> Callable[..., time.struct_time]:
     return lambda seconds=None: call(now() if seconds is None else seconds)
-
-
-def errors_by_name() -> dict[str, int]:
-    """The refusals that are tried."""
-    return {name: getattr(errno, name) for name in ("EACCES", "EROFS", "EIO", "ENOSPC", "EDQUOT")}
 
 
 def logged_calls(log: Path) -> list[tuple[int, str, str]]:

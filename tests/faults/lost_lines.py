@@ -1,7 +1,10 @@
-"""What a capture loses when it dies: ``python tests/faults lost_lines``.
+"""What a capture loses when it dies, or cannot keep up: ``python tests/faults lost_lines spool_rate``.
 
 A killed process loses nothing that it had written: the system has it. When the power fails, a file is what the disk
 was last asked to keep, and of what came after anything: cut off, zeros, other bytes, in one file and not in the other.
+
+At a camera's pace line n is ready n periods after the first; a camera keeps some until they are fetched, and drops
+what is not fetched by then. Half a minute of it lies beside a process that reads the disk and syncs files of its own.
 """
 
 from __future__ import annotations
@@ -15,21 +18,27 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.source import Line
 from storage.arrays.spool import SYNC_LINES, Spool
-from tests.faults.fault_table import Clock, Row
+from tests.faults.fault_table import Clock, Row, told_wrong
+from tests.faults.nursery import ROOT
 
 SAMPLES, BANDS = 20, 7
 LINES = 5 * SYNC_LINES + 13
 KILLS, CUTS = 20, 400
 HEADER = {"sweep": "a"}
 FATES = ("as written", "cut off", "cut short", "zeros", "other bytes", "some pages")
+WIDE, DEEP, RATE_HZ = 640, 270, 100.0  # samples and bands of a camera
+HELD = 64  # lines that a camera or its driver keeps: 22 MB
+MOST_CORE = 0.20
 
 WRITER = """
 import os, sys
@@ -65,7 +74,7 @@ class Losses:
         at = [each[len(each) * share // 100] for share in (50, 90)]
         return (
             f"lines lost: none in {self.lost[0]}, median {at[0]}, 9 of 10 at most {at[1]}, at most {each[-1]};"
-            f" {len(self.wrong)} wrong{': ' + '; '.join(self.wrong[:3]) if self.wrong else ''}"
+            f" {told_wrong(self.wrong)}"
         )
 
 
@@ -171,12 +180,11 @@ def _go_on(place: Path, appended: int, found: Losses) -> Iterator[str]:
 def try_kills(kills: int, folder: Path, seed: int = 0) -> Losses:
     """Kill captures at random moments, and compare what they had appended with what is there."""
     chance, found = random.Random(seed), Losses()
-    root = Path(__file__).resolve().parents[2]
     command = [sys.executable, "-c", WRITER]
-    environment = {**os.environ, "PYTHONPATH": str(root)}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     for number in range(kills):
         place = folder / f"killed-{number}"
-        with subprocess.Popen([*command, str(place)], cwd=root, env=environment, stdout=subprocess.PIPE) as process:
+        with subprocess.Popen([*command, str(place)], cwd=ROOT, env=environment, stdout=subprocess.PIPE) as process:
             assert process.stdout is not None
             told = process.stdout.read(8)  # the first line is there
             time.sleep(chance.uniform(0.0, 0.1))
@@ -205,33 +213,119 @@ def _contents(folder: Path) -> dict[str, bytes]:
 
 
 def rows(quick: bool = False) -> list[Row]:
+    demanded = f"at most {SYNC_LINES} lines lost, the capture goes on to the same bytes"
+    garbled = (
+        "both files as of the last fdatasync, what came later cut off, zeroed, garbled or kept, each in its own way"
+    )
+    cases = (
+        ("capture killed", "SIGKILL of the process that appends lines", "no appended line lost", try_kills, (KILLS, 3)),
+        ("power fails in a capture", garbled, demanded, try_power, (CUTS, 40)),
+    )
     found = []
     with tempfile.TemporaryDirectory(prefix="lost-") as name:
-        clock, kills = Clock(), 3 if quick else KILLS
-        killed = try_kills(kills, Path(name))
-        found.append(
-            Row(
-                "capture killed",
-                "SIGKILL of the process that appends lines",
-                kills,
-                "no appended line lost",
-                killed.words(),
-                not killed.wrong,
-                clock.seconds,
-            )
+        for fault, injected, demanded, tried, counts in cases:
+            clock, count = Clock(), counts[quick]
+            losses = tried(count, Path(name))
+            found.append(Row(fault, injected, count, demanded, losses.words(), not losses.wrong, clock.seconds))
+    return found
+
+
+# --- at a camera's pace -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How a spool kept up."""
+
+    lines: int
+    dropped: int
+    latency_s: NDArray[np.float64]  # from when a line was ready to when the spool had taken it
+    cpu_s: float
+    wall_s: float
+    kept: int  # lines that a reader finds afterwards, as captured
+
+    @property
+    def core(self) -> float:
+        """Share of one core."""
+        return self.cpu_s / self.wall_s
+
+    @property
+    def met(self) -> bool:
+        """No line dropped or changed, and a fifth of a core at most."""
+        return self.dropped == 0 and self.kept == self.lines and self.core <= MOST_CORE
+
+    def words(self) -> str:
+        """The figures."""
+        slowest, late = self.latency_s.max(initial=0.0), np.count_nonzero(self.latency_s > 1 / RATE_HZ)
+        return (
+            f"{self.lines} lines, {self.dropped} dropped, {self.kept} read back as captured; {self.core:.1%} of a core;"
+            f" {late} late, {int(slowest * RATE_HZ)} waiting at most, latency {np.median(self.latency_s) * 1e3:.1f} ms,"
+            f" slowest {slowest * 1e3:.0f} ms"
         )
-        clock, cuts = Clock(), 40 if quick else CUTS
-        cut = try_power(cuts, Path(name))
-        found.append(
-            Row(
-                "power fails in a capture",
-                "both files as of the last fdatasync, what came later cut off, zeroed, "
-                "garbled or kept, each in its own way",
-                cuts,
-                f"at most {SYNC_LINES} lines lost, the capture goes on to the same bytes",
-                cut.words(),
-                not cut.wrong,
-                clock.seconds,
-            )
-        )
+
+
+def keep_pace(folder: Path, seconds: float) -> Pace:
+    """Append lines at ``RATE_HZ`` for some seconds, then read them again."""
+    rng = np.random.default_rng(0)
+    frames = [rng.integers(0, 4096, (WIDE, DEEP), dtype=np.uint16) for _ in range(SYNC_LINES)]
+    count, period = round(seconds * RATE_HZ), 1 / RATE_HZ
+    latency, dropped, number = np.zeros(count), 0, 0
+    with Spool.open(folder, WIDE, DEEP, header={"sweep": "pace"}) as spool:
+        cpu, began = time.process_time(), time.monotonic()
+        for ready in range(count):
+            at = began + ready * period
+            if (wait := at - time.monotonic()) > 0:
+                time.sleep(wait)
+            if time.monotonic() > at + HELD * period:
+                dropped += 1  # the camera has overwritten it
+                continue
+            spool.append(Line(number, frames[number % len(frames)], 0.0, 1e-4 * ready, ready * period, 10.0))
+            latency[number] = time.monotonic() - at
+            number += 1
+        spool.sync()
+        cpu, wall = time.process_time() - cpu, max(time.monotonic() - began, count * period)
+        kept = sum(_as_captured(block, frames) for block in spool.blocks())
+    return Pace(count, dropped, latency[:number], cpu, wall, kept)
+
+
+def _as_captured(block: list[Line], frames: list[NDArray[np.uint16]]) -> int:
+    return sum(np.array_equal(line.data, frames[line.number % len(frames)]) for line in block)
+
+
+@contextmanager
+def loaded_disk(folder: Path) -> Iterator[None]:
+    """Let another process write, sync and read 4 MB at a time in ``folder`` while the block runs."""
+    child = os.fork()
+    if child == 0:
+        _load(folder / "load.bin")
+    try:
+        yield
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+
+
+def _load(path: Path) -> None:
+    block = os.urandom(1 << 22)
+    while True:
+        with path.open("wb") as file:
+            for _ in range(16):
+                file.write(block)
+                file.flush()
+                os.fsync(file.fileno())
+                time.sleep(0.02)
+        path.read_bytes()
+
+
+def pace_rows(quick: bool = False) -> list[Row]:
+    """Five minutes of the paper's line, and half a minute beside a busy disk."""
+    found = []
+    demanded = f"none dropped ({HELD} held by the camera), at most {MOST_CORE:.0%} of a core"
+    for seconds, busy in ((2.0, False),) if quick else ((300.0, False), (30.0, True)):
+        clock = Clock()
+        with tempfile.TemporaryDirectory() as name, loaded_disk(Path(name)) if busy else nullcontext():
+            pace = keep_pace(Path(name) / "spool", seconds)
+        beside = ", another process writing and syncing beside it" if busy else ""
+        injected = f"lines of {WIDE} x {DEEP} at {RATE_HZ:.0f} Hz for {seconds:.0f} s{beside}"
+        found.append(Row("camera's pace", injected, pace.lines, demanded, pace.words(), pace.met, clock.seconds))
     return found

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from storage.archive.archive import Archive
-from tests.faults.fault_table import Clock, Row
+from tests.faults.fault_table import Clock, Row, told_wrong
 from tests.faults.nursery import Ended, Nursery
 from tests.faults.small_survey import Stored, Subject, prepare, problems, stored, words
 
@@ -27,16 +27,12 @@ OTHER = ("--policy", "sobel")  # shares the coarse look, the lookup and the mosa
 class Writings:
     """What came of writing together."""
 
-    archives: int = 0
     waited: int = 0  # processes that were given what another made
     wrong: list[str] = field(default_factory=list)
 
     def words(self, rounds: int) -> str:
         """The figures."""
-        return (
-            f"{rounds} archives, {self.waited} times one was given what another made;"
-            f" {len(self.wrong)} wrong{': ' + '; '.join(self.wrong[:3]) if self.wrong else ''}"
-        )
+        return f"{rounds} archives, {self.waited} times one was given what another made; {told_wrong(self.wrong)}"
 
 
 def write_together(
@@ -118,13 +114,8 @@ def _row(
     for number in range(rounds):
         out = subject.folder / f"{fault.replace(' ', '-')}-{number}"
         write_together(subject, out, commands, truth, found, chance, kill=kill)
-    demanded = "every other one exit 0" if kill else "exit 0 each"
-    return Row(
-        fault,
-        injected,
-        rounds,
-        f"{demanded}, one copy of each store, same bytes, a run listed for each, nothing left",
-        found.words(rounds),
-        not found.wrong,
-        clock.seconds,
+    demanded = (
+        f"{'every other one exit 0' if kill else 'exit 0 each'}, one copy of each store, same bytes, a run listed for "
+        "each, nothing left"
     )
+    return Row(fault, injected, rounds, demanded, found.words(rounds), not found.wrong, clock.seconds)

@@ -1,12 +1,13 @@
 """Mutated files of every kind that is ingested: each gives a cube or one clear error, soon, and in bounded memory.
 
-Bytes are flipped, overwritten, cut, doubled and moved in small files of each format, and the cube is opened and read.
-The full run, in processes of their own so that a crash is seen, with its table:  python tests/faults/mutated_files.py
+``python tests/faults headers files``: values, keys, lines and characters of ENVI headers, real and made; bytes that are
+flipped, overwritten, cut, doubled and moved in small files of each format. The cube is opened and read.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import random
 import resource
 import shutil
@@ -14,37 +15,47 @@ import struct
 import subprocess
 import sys
 import tempfile
-from collections import Counter
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
-
+from pipeline.errors import PipelineError
+from storage.readers.envi_cubes import parse_envi_header
 from tests.faults.cube_files import FORMATS, try_reading
+from tests.faults.fault_table import Clock, Row, told_wrong
+from tests.faults.nursery import ROOT
 
 BATCH = 500  # mutations a process
 RATIO = 1100  # zlib's: files that pack numbers may hold this many times their bytes
 SPARE_BYTES = 24 << 20  # what libraries take when they are first used
+LARGEST_DATA = 200_000  # bytes
+SPARE_OF_HEADERS = 1 << 20  # what Python itself takes, whatever the files hold
+TIMES_HEADER = 80  # a header's text becomes lines, fields, words and numbers
 ODD_NUMBERS = (0, 1, 0x7F, 0x80, 0xFF, 0x7FFF, 0xFFFF, 1 << 20, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFE, 0xFFFFFFFF)
-ODD_WORDS = (
-    b"-1",
-    b"1e9",
-    b"999999999999",
-    b"..",
-    b"../../x",
-    b"null",
-    b"{}",
-    b"[[[[",
-    b"nan",
-    b"\x89HDF",
-    b"PK\x03\x04",
+ODD_BYTES = (b"\x89HDF", b"PK\3\4", b"-1", b"1e9", b"9" * 12, b"..", b"../../x", b"null", b"{}", b"[[[[", b"nan")
+PLAIN_WORDS = (
+    "-1 0 1 2 1000000000000 99999999999999999999999999 1e300 1e400 nan inf -0 0x10 4.5 { } {{ {} \\{ = ; , 1_000 16000 "
+    "bil bsq Micrometers ../../../etc/passwd __import__('os')"
+)
+WORDS = (*PLAIN_WORDS.split(), "", "\0", "\ufeff", "\u0663", "ENVI Spectral Library", "\r\n", "é" * 40, "{" * 500)
+PLAIN_KEYS = "samples lines bands interleave wavelength fwhm description"
+LONG_KEYS = "header offset,data type,byte order,wavelength units,file type,data ignore value,band names"
+KEYS = (*PLAIN_KEYS.split(), *LONG_KEYS.split(","))
+HAND_MADE = (
+    "ENVI\nsamples = 4\nlines = 3\nbands = 2\ndata type = 12\ninterleave = bil\nbyte order = 0\n",
+    "ENVI\nsamples = 5\nbands = 3\ndata type = 4\ninterleave = bsq\nbyte order = 1\nheader offset = 16\n"
+    "wavelength units = um\nwavelength = {0.4,\n 0.5,\n 0.6}\nfwhm = {0.01, 0.01, 0.01}\n",
+    "ENVI\n;Exposure (ms) = 4.5\nsamples = 2\nlines = 100\nbands = 2\ndata type = 2\ninterleave = bip\n"
+    "description = {\n nested {one} two }\ndata ignore value = -9999\nwavelength = {\n400.0\n,500.0\n}\n",
+    "ENVI\nsamples = 1\nlines = 1000000000000\nbands = 1\ndata type = 1\ninterleave = bsq\n",
+    "ENVI\nsamples = 1000000000000\nlines = 3\nbands = 1000000\ndata type = 5\ninterleave = bip\n",
 )
 
 
 @dataclass
 class Tally:
-    """How the readings of one format ended."""
+    """How the readings of one kind of file ended."""
 
     read: int = 0
     refused: int = 0
@@ -60,8 +71,115 @@ class Tally:
         self.most_bytes = max(self.most_bytes, other.most_bytes)
         self.wrong += other.wrong
 
+    def words(self) -> str:
+        """The figures."""
+        return (
+            f"{self.read} read, {self.refused} refused, {told_wrong(self.wrong)}; slowest {self.slowest_s * 1000:.0f} "
+            f"ms, {self.most_bytes / 1e6:.1f} MB at most"
+        )
 
-# --- mutations --------------------------------------------------------------------------------------------------------
+    def try_one(self, address: Path, most_bytes: int, called: str) -> None:
+        """Open one source and read its first and last lines, in so much memory."""
+        found = try_reading(address)
+        wrong = [] if found.wrong is None else [f"{called}: {found.wrong}"]
+        if found.peak_bytes > most_bytes:
+            wrong.append(f"{called}: {found.peak_bytes} bytes of memory, expected {most_bytes} at most")
+        fine = found.refused is None and found.wrong is None
+        self.add(Tally(int(fine), int(found.refused is not None), found.seconds, found.peak_bytes, wrong))
+
+
+# --- headers ----------------------------------------------------------------------------------------------------------
+
+
+def seeds(folder: Path | None) -> list[str]:
+    """Texts to begin from: hand-made headers, and the real ones of a folder."""
+    real = [] if folder is None else sorted(folder.glob("*.hdr"))
+    return [*HAND_MADE, *(path.read_bytes().decode("latin-1") for path in real)]
+
+
+def mutate_header(text: str, rng: random.Random) -> str:
+    """One to four random changes of a header's text: its values, keys, lines, characters."""
+    for _ in range(rng.randint(1, 4)):
+        lines = text.split("\n")
+        at = rng.randrange(len(lines))
+        change = rng.randrange(9)
+        if change == 0 and "=" in lines[at]:
+            lines[at] = f"{lines[at].split('=')[0]}= {rng.choice(WORDS)}"
+        elif change == 1:
+            lines.insert(at, f"{rng.choice(KEYS)} = {rng.choice(WORDS)}")
+        elif change == 2:
+            lines = _set(lines, rng.choice(KEYS), rng.choice(WORDS))
+        elif change == 3:
+            del lines[at]
+        elif change == 4:
+            del lines[at : at + rng.choice((1, 2, 5, len(lines)))]
+        elif change == 5:
+            lines[at] = lines[at] * rng.choice((0, 2, 50))
+        elif change == 6 and lines[at]:
+            place = rng.randrange(len(lines[at]))
+            lines[at] = lines[at][:place] + rng.choice(WORDS) + lines[at][place + 1 :]
+        elif change == 7:
+            rng.shuffle(lines)
+        else:
+            lines = lines[: at + 1] + lines[at:] * rng.randint(1, 3)
+        text = "\n".join(lines)[: 1 << 18]
+    return text
+
+
+def small(text: str, rng: random.Random) -> str:
+    """The same header for a cube of a few lines and samples, so that a small file can hold it."""
+    lines = text.split("\n")
+    for key, most in (("samples", 6), ("lines", 12)):
+        lines = _set(lines, key, str(rng.randint(1, most)))
+    return "\n".join(lines)
+
+
+def data_for(text: str, rng: random.Random) -> bytes:
+    """Bytes that hold what a header promises, some fewer or more of them, or any number where it promises nothing."""
+    try:
+        header = parse_envi_header(text)
+        row = header.samples * header.bands * header.dtype.itemsize
+        size = header.offset + row * (5 if header.lines is None else header.lines)
+    except PipelineError:
+        size = rng.choice((0, 47, 4000))
+    share = rng.choice((1.0, 1.0, 1.0, 0.0, 0.5, 0.99, 1.01))
+    return rng.randbytes(min(int(size * share), LARGEST_DATA))
+
+
+def _set(lines: list[str], key: str, word: str) -> list[str]:
+    return [f"{key} = {word}" if line.split("=")[0].strip() == key else line for line in lines]
+
+
+def try_headers(count: int, folder: Path | None, seed: int = 0) -> Tally:
+    """Mutate ``count`` headers, read each with a data file of a few KB beside it, and say how it went."""
+    rng, texts, tally = random.Random(seed), seeds(folder), Tally()
+    with tempfile.TemporaryDirectory() as name:
+        header = Path(name) / "a.hdr"
+        for number in range(count):
+            whole = rng.choice(texts)
+            text = small(whole, rng) if rng.random() < 0.8 else whole
+            data, made = data_for(text, rng), mutate_header(text, rng).encode("utf-8", "surrogateescape")
+            header.with_suffix(".bin").write_bytes(data)
+            header.write_bytes(made)
+            tally.try_one(header, SPARE_OF_HEADERS + 4 * len(data) + TIMES_HEADER * len(made), f"{number}")
+    return tally
+
+
+def real_headers() -> Path | None:
+    """Folder of headers that instruments wrote, or None."""
+    root = Path(os.environ.get("SPECTRALZOOM_DATA", Path(__file__).parents[3] / "shared" / "data"))
+    return root / "envi_headers" if (root / "envi_headers").is_dir() else None
+
+
+def header_rows(quick: bool = False) -> list[Row]:
+    clock, count = Clock(), 500 if quick else 10_000
+    found = try_headers(count, real_headers())
+    demanded = "a cube or one clear error, soon, in no more memory than the file's size"
+    injected = "random changes in ENVI headers, real and made"
+    return [Row("mutated headers", injected, count, demanded, found.words(), not found.wrong, clock.seconds)]
+
+
+# --- files ------------------------------------------------------------------------------------------------------------
 
 
 def mutate(content: bytes, rng: random.Random) -> bytes:
@@ -75,10 +193,11 @@ def mutate(content: bytes, rng: random.Random) -> bytes:
         elif change == 1:
             content = content[:at] + rng.randbytes(rng.randint(1, 8)) + content[at + rng.randint(0, 8) :]
         elif change in (2, 3):
-            number = struct.pack(rng.choice(("<I", ">I", "<H", ">H")[: 2 if change == 2 else 4]), _odd(rng, change))
+            layout = rng.choice(("<I", ">I", "<H", ">H")[: 2 if change == 2 else 4])
+            number = struct.pack(layout, rng.choice([odd for odd in ODD_NUMBERS if change == 2 or odd < 1 << 16]))
             content = content[:at] + number + content[at + len(number) :]
         elif change == 4:
-            content = content[:at] + rng.choice(ODD_WORDS) + content[at:]
+            content = content[:at] + rng.choice(ODD_BYTES) + content[at:]
         elif change == 5:
             content = content[: rng.randrange(size + 1)]
         elif change == 6:
@@ -90,15 +209,6 @@ def mutate(content: bytes, rng: random.Random) -> bytes:
     return content
 
 
-def _odd(rng: random.Random, change: int) -> int:
-    return (
-        rng.choice(ODD_NUMBERS) if change == 2 else rng.choice([number for number in ODD_NUMBERS if number < 1 << 16])
-    )
-
-
-# --- trying -----------------------------------------------------------------------------------------------------------
-
-
 def try_files(count: int, seed: int = 0) -> dict[str, Tally]:
     """Mutate ``count`` files, each format in turn, read each, and say how it went."""
     tallies = {name: Tally() for name in FORMATS}
@@ -108,71 +218,38 @@ def try_files(count: int, seed: int = 0) -> dict[str, Tally]:
         for name, make in FORMATS.items():
             sources[name].mkdir()
             addresses[name] = make(sources[name])
-        names = list(FORMATS)
         for number in range(count):
-            name = names[number % len(names)]
-            rng = random.Random(f"{seed}/{number}")
-            folder = Path(place, "tried")
+            name = list(FORMATS)[number % len(FORMATS)]
+            rng, folder = random.Random(f"{seed}/{number}"), Path(place, "tried")
             shutil.copytree(sources[name], folder)
             files = sorted(file for file in folder.rglob("*") if file.is_file())
             chosen = rng.choice(files)
             chosen.write_bytes(mutate(chosen.read_bytes(), rng))
-            size = sum(file.stat().st_size for file in files)
-            try_one(folder / addresses[name], size, tallies[name], f"{name}, seed {seed}, number {number}")
+            most = SPARE_BYTES + RATIO * sum(file.stat().st_size for file in files)
+            tallies[name].try_one(folder / addresses[name], most, f"{name}, seed {seed}, number {number}")
             shutil.rmtree(folder)
     return tallies
 
 
-def try_one(address: Path, size: int, tally: Tally, called: str) -> None:
-    """Open one source and read its first and last lines."""
-    found = try_reading(address)
-    tally.read += found.refused is None and found.wrong is None
-    tally.refused += found.refused is not None
-    tally.slowest_s = max(tally.slowest_s, found.seconds)
-    tally.most_bytes = max(tally.most_bytes, found.peak_bytes)
-    if found.wrong is not None:
-        tally.wrong.append(f"{called}: {found.wrong}")
-    if found.peak_bytes > SPARE_BYTES + RATIO * size:
-        tally.wrong.append(f"{called}: {found.peak_bytes} bytes of memory for a file of {size}")
-
-
-# --- the full run -----------------------------------------------------------------------------------------------------
-
-
-def main(count: int = 5000) -> int:
-    """Try ``count`` files in processes of ``BATCH``, print the table; 1 where anything went wrong."""
-    tallies = {name: Tally() for name in FORMATS}
-    grown = 0
+def file_rows(quick: bool = False) -> Sequence[Row]:
+    """One row for all formats; files are tried in processes of ``BATCH``, so that a crash is seen."""
+    clock, count = Clock(), 100 if quick else 5000
+    tally, crashed, grown = Tally(), list[str](), 0
     for seed in range(-(-count // BATCH)):
-        wanted = min(BATCH, count - seed * BATCH)
-        command = [sys.executable, __file__, "--part", str(wanted), str(seed)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=Path(__file__).parents[2])
+        command = [sys.executable, "-m", "tests.faults.mutated_files", str(min(BATCH, count - seed * BATCH)), str(seed)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
         if done.returncode != 0:
-            tallies["ENVI"].wrong.append(
-                f"the process of seed {seed} ended with {done.returncode}: {done.stderr[-400:]}"
-            )
+            crashed.append(f"the process of seed {seed} ended with {done.returncode}: {done.stderr[-400:]}")
             continue
         found = json.loads(done.stdout)
         grown = max(grown, found.pop("grown"))
-        for name, tally in found.items():
-            tallies[name].add(Tally(**tally))
-    print(_table(tallies, count, grown))
-    return int(any(tally.wrong for tally in tallies.values()))
-
-
-def _table(tallies: dict[str, Tally], count: int, grown: int) -> str:
-    lines = [
-        f"{count} mutated files",
-        f"{'format':16} {'read':>6} {'refused':>8} {'wrong':>6} {'slowest':>9} {'memory':>9}",
-    ]
-    for name, tally in tallies.items():
-        lines.append(
-            f"{name:16} {tally.read:6} {tally.refused:8} {len(tally.wrong):6} {tally.slowest_s * 1000:6.0f} ms "
-            f"{tally.most_bytes / 1e6:6.1f} MB"
-        )
-    kinds = Counter(line for tally in tallies.values() for line in tally.wrong[:20])
-    lines.append(f"a process of {BATCH} grew by {grown / 1e6:.0f} MB at most")
-    return "\n".join([*lines, *(f"  {line}" for line in kinds)])
+        for one in found.values():
+            tally.add(Tally(**one))
+    words = [*crashed, tally.words(), f"a process of {BATCH} grew by {grown / 1e6:.0f} MB at most"]
+    met = not crashed and not tally.wrong
+    injected = "random changes in files of every kind that is ingested"
+    demanded = "a cube or one clear error, soon, in bounded memory"
+    return [Row("mutated files", injected, count, demanded, "; ".join(words), met, clock.seconds)]
 
 
 def _part(count: int, seed: int) -> None:
@@ -184,7 +261,4 @@ def _part(count: int, seed: int) -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["--part"]:
-        _part(int(sys.argv[2]), int(sys.argv[3]))
-    else:
-        sys.exit(main(int(sys.argv[1]) if len(sys.argv) > 1 else 5000))
+    _part(int(sys.argv[1]), int(sys.argv[2]))

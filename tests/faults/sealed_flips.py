@@ -1,10 +1,13 @@
-"""One bit flipped in files of weights and in the state of a training run, by the thousand: what is then read of them.
+"""One bit flipped in what is sealed: ``python tests/faults flips sealed_flips``.
 
-A reader may refuse the file, in one message, or give what was written, bit by bit: never other numbers.
+Of an archive each flip must be found by verify, with the store's or run's address. A reader of weights or of the state
+of a training run may refuse the file, in one message, or give what was written, bit by bit: never other numbers.
 """
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,8 +21,11 @@ from models.training.start_weights import StartFile
 from models.weights.files import content_key, load_any_weights, save_weights
 from models.weights.sealed_files import load_checkpoint, save_checkpoint
 from pipeline.errors import WeightsError
+from storage.archive.archive import Archive
 from tests.conftest import RGB_NM, random_weights
-from tests.faults.fault_table import Clock, Row
+from tests.faults.fault_table import Clock, Row, told_wrong
+from tests.faults.nursery import ROOT
+from tests.faults.small_survey import problems
 
 RUN = "the run's identity"
 Content = tuple[Any, Mapping[str, torch.Tensor]]  # everything beside the tensors, and the tensors
@@ -111,19 +117,46 @@ def _written(folder: Path) -> dict[str, Path]:
     return {"weights": weights, "start": weights, "checkpoint": state}
 
 
-def rows(quick: bool) -> Sequence[Row]:
+def weight_rows(quick: bool) -> Sequence[Row]:
     clock, count = Clock(), 60 if quick else 2000
     with tempfile.TemporaryDirectory() as place:
         found = flip_bits(count, Path(place))
-    words = f"{found.refused} refused in one message, {found.same} as written, {len(found.wrong)} otherwise"
-    return [
-        Row(
-            "a bit flips in weights",
-            "one bit of weights or of a training run's state",
-            count,
-            "refused in one message, or the numbers that were written",
-            "; ".join([words, *found.wrong[:3]]),
-            not found.wrong and found.tried == count,
-            clock.seconds,
-        )
-    ]
+    words = f"{found.refused} refused in one message, {found.same} as written, {told_wrong(found.wrong)}"
+    injected = "one bit of weights or of a training run's state"
+    demanded = "refused in one message, or the numbers that were written"
+    met = not found.wrong and found.tried == count
+    return [Row("a bit flips in weights", injected, count, demanded, words, met, clock.seconds)]
+
+
+# --- an archive -------------------------------------------------------------------------------------------------------
+
+
+def flip_archive(root: Path, flips: int, seed: int = 0) -> list[str]:
+    """Flip one bit at random places, one at a time, and put it back; gives those that verify does not name."""
+    archive = Archive.open(root, create=False, write=False)
+    folders = [ref.path for ref in archive.refs()] + archive.runs()
+    files = sorted(path for folder in folders for path in folder.rglob("*") if path.is_file() and path.stat().st_size)
+    rng, wrong = Random(seed), list[str]()
+    for path in rng.choices(files, [path.stat().st_size for path in files], k=flips):
+        whole = path.read_bytes()
+        place, bit = rng.randrange(len(whole)), rng.randrange(8)
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << bit]) + whole[place + 1 :])
+        inside = path.relative_to(root)
+        try:
+            found = problems(root)
+        finally:
+            path.write_bytes(whole)
+        if not any(inside.is_relative_to(problem.split()[0]) for problem in found):
+            wrong.append(f"{inside}, byte {place}, bit {bit}: {found or 'not found'}")
+    return wrong + problems(root)
+
+
+def archive_rows(quick: bool) -> Sequence[Row]:
+    clock, count = Clock(), 20 if quick else 200
+    survey = "survey --scene farm --size 256x256 --no-controls --engine plain --out"
+    with tempfile.TemporaryDirectory(prefix="flips-") as place:
+        command = [sys.executable, "-m", "flows.cli.main", *survey.split(), place]
+        subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
+        wrong = flip_archive(Path(place), count)
+    injected, demanded = "one bit of a random file of an archive", "each found by verify, and named"
+    return [Row("a bit flips", injected, count, demanded, told_wrong(wrong), not wrong, clock.seconds)]

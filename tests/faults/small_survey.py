@@ -16,6 +16,10 @@ from tests.conftest import RGB_NM, patchy_scene, random_weights
 from tests.faults.injection import logged_calls
 from tests.faults.nursery import Ended, Nursery
 
+SURVEY = (
+    "survey --scene scene.png --labels labels.png --weights weights.safetensors --engine plain --no-controls "
+    "--budget 0.8"
+)
 Stored = dict[str, dict[str, str]]  # address of a store -> SHA-256 of each of its files
 
 
@@ -39,23 +43,7 @@ class Subject:
 
 def words(out: Path, *more: str) -> list[str]:
     """The survey's command into an archive; flags given later win."""
-    return [
-        "survey",
-        "--scene",
-        "scene.png",
-        "--labels",
-        "labels.png",
-        "--weights",
-        "weights.safetensors",
-        "--engine",
-        "plain",
-        "--no-controls",
-        "--budget",
-        "0.8",
-        "--out",
-        str(out),
-        *more,
-    ]
+    return [*SURVEY.split(), "--out", str(out), *more]
 
 
 def prepare(nursery: Nursery) -> Subject:

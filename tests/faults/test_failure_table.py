@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from random import Random
 
@@ -15,21 +15,13 @@ from tests.faults import (
     hostile_rig,
     lost_lines,
     many_writers,
-    refused_writes,
+    mutated_files,
     sealed_flips,
     small_survey,
-    spool_rate,
 )
+from tests.faults.cube_files import FORMATS
 from tests.faults.fault_table import Row, markdown_table, plain_table
-from tests.faults.nursery import Nursery
-from tests.faults.small_survey import Subject, prepare, stored, words
-
-
-@pytest.fixture(scope="module")
-def subject(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Subject]:
-    """A small survey to disturb."""
-    with Nursery(tmp_path_factory.mktemp("faults")) as nursery:
-        yield prepare(nursery)
+from tests.faults.small_survey import Subject, stored, words
 
 
 def test_disk_full_under_spool_manifest_and_run(subject: Subject) -> None:
@@ -43,14 +35,11 @@ def test_disk_full_under_spool_manifest_and_run(subject: Subject) -> None:
 
 def test_writes_refused_at_random_calls(subject: Subject) -> None:
     """Wherever in a survey, by whichever library, and whether once or for good."""
-    found = refused_writes.refuse_places(subject, 4, seed=3)
+    found = disk_full.refuse_places(subject, 4, seed=3)
     assert found.wrong == []
     assert found.told >= 3
-    assert found.places > 500
-
-
-def test_refused_writes_are_counted_in_zarr_too(subject: Subject) -> None:
-    """Else nothing would be refused where most is written."""
+    assert len(subject.changing_calls) > 500
+    # Writes of Zarr count too: else nothing would be refused where most is written.
     names = {name for _, name, _ in subject.changing_calls}
     assert {"open", "write", "fsync", "fdatasync", "mkdir", "rename", "replace", "unlink"} <= names
 
@@ -100,7 +89,7 @@ def test_bit_flips_in_a_ledger(tmp_path: Path) -> None:
 
 def test_spool_at_a_cameras_pace(tmp_path: Path) -> None:
     """Two seconds of the paper's line; how fast the machine is has no part in it, only that nothing is lost."""
-    pace = spool_rate.keep_pace(tmp_path, 2.0)
+    pace = lost_lines.keep_pace(tmp_path, 2.0)
     assert pace.lines == 200
     assert pace.kept == pace.lines - pace.dropped
 
@@ -119,6 +108,26 @@ def test_bits_flipped_in_weights_and_checkpoints(tmp_path: Path) -> None:
     assert found.wrong == []
     assert found.tried == found.refused + found.same == 150
     assert found.refused > 100
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_mutated_headers_end_well(seed: int) -> None:
+    """Each header gives a cube or one clear error, soon, in about the memory that the files take."""
+    found = mutated_files.try_headers(300, mutated_files.real_headers(), seed)
+    assert found.wrong == []
+    assert found.read > 20  # else nothing but the first check was tried
+    assert found.refused > 20
+
+
+@pytest.mark.filterwarnings("ignore::Warning")  # decoders may warn of what they then refuse
+def test_mutated_files_end_well() -> None:
+    """Each file gives a cube or one clear error, soon, in memory bounded by its size."""
+    pytest.importorskip("tifffile")
+    found = mutated_files.try_files(18 * len(FORMATS), seed=7).values()
+    assert [line for tally in found for line in tally.wrong] == []
+    assert min(tally.read + tally.refused for tally in found) == 18
+    assert sum(tally.refused for tally in found) > 40
+    assert sum(tally.read for tally in found) > 40
 
 
 def test_a_fault_that_is_not_survived_is_seen(subject: Subject) -> None:

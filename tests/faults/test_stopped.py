@@ -1,25 +1,32 @@
 """Stopped by SIGTERM or SIGKILL: one sentence where it can be said, nothing lost, and the same command goes on.
 
+Killed at random moments, what was published verifies, what was spooled is there, and the rerun goes on.
+
 A run is published once its map is drawn; stopped while the map is judged it is there, and its accuracy is added later.
 """
 
 from __future__ import annotations
 
 import json
+import random
 import shutil
 import signal
-from collections.abc import Iterator
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from flows.publish.receipt import check_receipt, comparable, is_pending
 from flows.terminal.processes import TERMINATED
 from storage.archive.archive import Archive
 from storage.arrays.spool import Spool
-from tests.faults.nursery import Ended, Nursery
-from tests.faults.small_survey import Subject, prepare, problems, words, wrong_after_rerun
+from storage.remote.opening import verify_archive
+from tests.faults.nursery import ROOT, Ended
+from tests.faults.small_survey import Subject, problems, stored, words, wrong_after_fault, wrong_after_rerun
 from tests.flows.small_fields import write_field, write_weights
 
 GOING_ON = "terminated; the same command goes on from here"
@@ -35,13 +42,9 @@ PLACES = {  # function and call before which a survey is stopped that has its ma
     "after the run has changed": ("storage.archive.run_folders:remove_tree", 1, signal.SIGKILL),
 }
 ADDED = "after the run has changed"
-
-
-@pytest.fixture(scope="module")
-def subject(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Subject]:
-    """A small survey, and where to run it."""
-    with Nursery(tmp_path_factory.mktemp("stopped")) as nursery:
-        yield prepare(nursery)
+KILLS = 6
+MOMENTS = [(number + random.Random(number).random()) / KILLS for number in range(KILLS)]  # of the time it takes
+LIVES = (0.5, 0.35, 0.35, 0.35) * 3  # of it too: what was not published begins anew
 
 
 def told(ended: Ended) -> bool:
@@ -86,28 +89,8 @@ def test_a_capture_keeps_every_line(subject: Subject, tmp_path: Path) -> None:
 def test_training_goes_on(subject: Subject, tmp_path: Path) -> None:
     """It is broken off in a step; the same command ends well."""
     field, out = write_field(tmp_path / "field", (16, 16)), tmp_path / "w.safetensors"
-    asked = [
-        "train",
-        str(field),
-        "-o",
-        str(out),
-        "--validation",
-        "0",
-        "--steps",
-        "4",
-        "--crop",
-        "16",
-        "--patch",
-        "8",
-        "--factor",
-        "2",
-        "--dim",
-        "16",
-        "--layers",
-        "1",
-        "--batch",
-        "1",
-    ]
+    sizes = "--validation 0 --steps 4 --crop 16 --patch 8 --factor 2 --dim 16 --layers 1 --batch 1"
+    asked = ["train", str(field), "-o", str(out), *sizes.split()]
     ended = subject.nursery.run(asked, "end_before", place="models.training.train:_step", number=signal.SIGTERM, call=2)
     assert told(ended), ended.text
     assert not out.exists()
@@ -118,24 +101,8 @@ def test_training_goes_on(subject: Subject, tmp_path: Path) -> None:
 def test_an_evaluation_goes_on(subject: Subject, tmp_path: Path) -> None:
     """Frames that were judged are kept, and not judged again."""
     field, file, out = write_field(tmp_path / "field"), tmp_path / "w.safetensors", tmp_path / "out"
-    asked = [
-        "evaluate",
-        str(field),
-        "--weights",
-        str(write_weights(file)),
-        "-o",
-        str(out),
-        "--shares",
-        "0.5",
-        "--policies",
-        "random",
-        "--timed-frames",
-        "0",
-        "--draws",
-        "20",
-        "--no-rig",
-        "--no-pooled",
-    ]
+    how = "--shares 0.5 --policies random --timed-frames 0 --draws 20 --no-rig --no-pooled"
+    asked = ["evaluate", str(field), "--weights", str(write_weights(file)), "-o", str(out), *how.split()]
     place = {"place": "flows.evaluate.work:judge_frame", "number": signal.SIGTERM}
     ended = subject.nursery.run(asked, "end_before", call=3, **place)
     assert told(ended), ended.text
@@ -229,3 +196,106 @@ def test_evaluate_adds_it_as_the_survey_does(subject: Subject, whole: Any, mappe
     again = subject.nursery.run(["evaluate", str(run)])
     assert (again.code, "has its accuracy already" in again.text) == (0, True)
     assert (run / "manifest.json").read_bytes() == manifest
+
+
+# --- killed at random moments -----------------------------------------------------------------------------------------
+
+
+def run_until(subject: Subject, out: Path, delay: float) -> int:
+    """The survey, killed after some seconds; its exit code."""
+    child = subject.nursery.start(words(out))
+    time.sleep(delay)
+    child.kill()
+    return child.wait().code
+
+
+@pytest.mark.parametrize("moment", MOMENTS)
+def test_killed_survey_goes_on(subject: Subject, tmp_path: Path, moment: float) -> None:
+    """Killed at any moment: every store verifies; the same command ends with the bytes of an undisturbed run."""
+    code = run_until(subject, tmp_path, moment * subject.whole_s)
+    assert code in (-signal.SIGKILL, 0)  # a faster run than the first may have ended before
+    before = stored(tmp_path)
+    assert wrong_after_fault(subject, tmp_path) == []
+    assert wrong_after_rerun(subject, tmp_path, subject.nursery.run(words(tmp_path))) == []
+    assert set(before) <= set(stored(tmp_path))
+
+
+def test_killed_again_and_again(subject: Subject, tmp_path: Path) -> None:
+    """Runs that all die early still get somewhere: each goes on from what the one before it had published."""
+    published = [0]
+    for life in LIVES:
+        code = run_until(subject, tmp_path, life * subject.whole_s)
+        assert problems(tmp_path) == []
+        published.append(len(stored(tmp_path)))
+        if code == 0:
+            break
+    assert published == sorted(published)
+    assert published[-1] > 0
+    assert wrong_after_rerun(subject, tmp_path, subject.nursery.run(words(tmp_path))) == []
+
+
+PUBLISH = """
+import sys
+from storage.archive.archive import Archive
+archive = Archive.open(sys.argv[1])
+made = 0
+for number in range(10**6):
+    def build(path):
+        for name in range(4):
+            (path / f"{name}.bin").write_bytes(bytes([number % 251]) * 20_000)
+    made += archive.produce("stage", build, version=1, params={"number": number})[1]
+    if made == 1:
+        print("published one", flush=True)
+"""
+SPOOL = """
+import sys
+from pathlib import Path
+import numpy as np
+from pipeline.source import Line
+from storage.arrays.spool import Spool
+spool = Spool.open(Path(sys.argv[1]), 64, 30, header={"sweep": "a"})
+print(spool.count, flush=True)
+for number in range(spool.count, 10**6):
+    spool.append(Line(number, np.full((64, 30), number % 65536, np.uint16), 0.0, 0.0, 0.1 * number, 100.0))
+"""
+
+
+def run_and_kill(script: str, folder: Path, delay: float) -> str:
+    """Start the script, wait for its first word, kill it ``delay`` s later; gives the word."""
+    command = [sys.executable, "-c", script, str(folder)]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        word = process.stdout.readline().strip()
+        time.sleep(delay)
+        process.send_signal(signal.SIGKILL)
+    return word
+
+
+def test_killed_while_publishing(tmp_path: Path) -> None:
+    """Every store with a final name is whole, what is torn has none, and the next run makes the rest."""
+    delays = random.Random(1)
+    seen = 0
+    for _ in range(KILLS):
+        assert run_and_kill(PUBLISH, tmp_path, delays.uniform(0.005, 0.06)) == "published one"
+        archive = Archive.open(tmp_path, create=False)
+        findings = verify_archive(archive)
+        assert [finding.problem for finding in findings if finding.problem] == []
+        assert len(findings) > seen
+        seen = len(findings)
+    archive.reclaim()
+    assert not list(tmp_path.glob("stages/*/*.part"))
+
+
+def test_killed_while_spooling(tmp_path: Path) -> None:
+    """No line that an earlier run had counted is lost, and every line left is as captured."""
+    delays = random.Random(2)
+    before = 0
+    for _ in range(KILLS):
+        counted = int(run_and_kill(SPOOL, tmp_path, delays.uniform(0.005, 0.06)))
+        assert counted >= before
+        with Spool.open(tmp_path, 64, 30, header={"sweep": "a"}) as spool:
+            before = spool.count
+            for block in spool.blocks():
+                assert all((line.data == line.number % 65536).all() for line in block)
+    assert before > 0
+    assert (tmp_path / "lines.bil").stat().st_size == before * np.dtype("u2").itemsize * 64 * 30

@@ -10,6 +10,7 @@ from typing import Any
 
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
+from storage.remote.opening import verify_archive
 
 DAY_S = 86400
 
@@ -75,3 +76,8 @@ def grow_old(ref: StageRef, days: float) -> None:
     path.write_text(json.dumps(content))
     moment = path.stat().st_mtime - days * DAY_S
     os.utime(path, (moment, moment))
+
+
+def problems(archive: Archive) -> list[str]:
+    """What verify finds."""
+    return [f"{one.uri} {one.problem}" for one in verify_archive(archive) if one.problem is not None]

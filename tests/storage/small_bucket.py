@@ -8,7 +8,6 @@ from pathlib import Path
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.remote.object_archive import ObjectArchive
-from storage.remote.opening import verify_archive
 
 Machine = Callable[..., ObjectArchive]  # of the fixture: opens the archive, by the name of a machine
 FIRST, SECOND = "first", "second"  # two machines, by the folder of their working copies
@@ -35,8 +34,3 @@ def rot(archive: ObjectArchive, name: str, at: int = -1) -> None:
 def object_of(archive: ObjectArchive, ref: StageRef, file: str) -> str:
     """The object that holds a file of a store."""
     return next(name for name in archive.objects.listing(ref.uri) if name.endswith(f"/{file}"))
-
-
-def problems(archive: Archive) -> list[str]:
-    """What verify finds."""
-    return [f"{one.uri} {one.problem}" for one in verify_archive(archive) if one.problem is not None]

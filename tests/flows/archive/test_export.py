@@ -23,7 +23,7 @@ from flows.settings.load import load_settings
 from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from pipeline.ground.view import RigPose
 from storage.archive.archive import Archive
-from storage.export.cog_files import cog_problems
+from storage.export.image_files import cog_problems
 from storage.export.stac_items import stac_problems
 from storage.readers.envi_cubes import open_envi_cube
 from storage.remote.opening import verify_archive

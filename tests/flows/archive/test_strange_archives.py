@@ -22,7 +22,7 @@ from storage.archive.records import read_run
 from storage.archive.staging import file_hash
 from tests.conftest import Survey
 from tests.flows.conftest import CommandLine
-from tests.storage.archive.test_no_files import CASES, Case
+from tests.storage.archive.test_no_files import CASES, Case, put
 from tests.storage.small_archive import Small, flip, small_survey
 
 
@@ -236,7 +236,7 @@ def test_no_verb_leaves_the_archive(
 def test_no_verb_waits_or_follows(case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Pipes and links where files and folders should be: each verb ends, verify with 1, and no defect is met."""
     root, out = tmp_path / "archive", str(tmp_path / "out")
-    uri = case(small_survey(Archive.open(root)))
+    uri = put(small_survey(Archive.open(root)), case)
     for verb, *more in (
         ("ls",),
         ("explain", "class_map"),

@@ -20,8 +20,7 @@ from pipeline.ground.map_grid import GroundGrid
 from pipeline.ground.view import RigPose, pixel_places
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
-from storage.arrays.class_maps import ClassMap, write_class_map
-from storage.arrays.ground_maps import load_ground_map
+from storage.arrays.class_maps import ClassMap, load_ground_map, write_class_map
 from storage.arrays.layout import AngularGrid
 from storage.arrays.mosaics import MosaicWriter
 
@@ -77,7 +76,7 @@ def stores(tmp_path: Path) -> tuple[StageRef, StageRef]:
     )
     values = np.linspace(0.1, 0.9, rows)[:, None, None] * np.ones((rows, columns, 4))
     values[:5, :5] = np.nan
-    writer.write_rows(0, values, np.ones((rows, columns)))
+    writer.write_tile(0, 0, values, np.ones((rows, columns)))
     return StageRef("segment", "m", tmp_path / "map"), StageRef("rectify", "r", tmp_path / "mosaic")
 
 

@@ -108,19 +108,19 @@ def test_missing_short_and_extra_files_are_named(archive: Archive) -> None:
     assert archive.find("mosaic", "abc") is None
 
 
-def test_a_torn_manifest_is_an_incomplete_store(archive: Archive) -> None:
-    """A manifest that is no JSON is said to be invalid."""
-    (_publish(archive) / "manifest.json").write_text('{"files": ')
-    with pytest.raises(IncompleteStoreError, match=r"no valid manifest\.json"):
-        archive.find("mosaic", "abc")
-
-
-@pytest.mark.parametrize("change", [lambda text: text + " ", lambda text: text.replace(": ", ":  ", 1)])
-def test_every_byte_of_a_manifest_counts(archive: Archive, change: Callable[[str], str]) -> None:
-    """Also one that means nothing to JSON."""
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda text: text + " ", "its seal does not fit"),
+        (lambda text: text.replace(": ", ":  ", 1), "its seal does not fit"),
+        (lambda text: text[:40], r"no valid manifest\.json"),
+    ],
+)
+def test_every_byte_of_a_manifest_counts(archive: Archive, change: Callable[[str], str], words: str) -> None:
+    """Also one that means nothing to JSON; of a torn one it is said that it is not valid."""
     path = _publish(archive) / "manifest.json"
     path.write_text(change(path.read_text()))
-    with pytest.raises(IncompleteStoreError, match="its seal does not fit"):
+    with pytest.raises(IncompleteStoreError, match=words):
         archive.find("mosaic", "abc")
 
 
@@ -139,7 +139,7 @@ def test_a_store_is_on_the_disk_before_and_after_it_gets_its_name(
         monkeypatch.setattr(module, "sync_path", lambda path: told.append(path.name))
     _publish(archive)
     assert told[:3] == ["b.bin", "a.txt", "manifest.json"]
-    assert told[3:] == ["inner", "abc.part", "stages", "rename abc.part", "mosaic"]
+    assert told[3:] == ["inner", "abc.part", "stages", "rename abc.part", "mosaic"]  # and so the stage's own name
 
 
 def test_two_same_runs_make_one_store(tmp_path: Path, archive: Archive) -> None:
@@ -286,6 +286,23 @@ def test_a_lock_let_go_twice_leaves_the_next_holder_alone(tmp_path: Path) -> Non
     assert not path.exists()
 
 
+def test_a_lock_file_that_cannot_be_removed_holds_nobody_up(
+    tmp_path: Path, archive: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was made is published, and the same store can be worked on again."""
+
+    def refused(path: Path, missing_ok: bool = False) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(path))
+
+    with monkeypatch.context() as disk:
+        disk.setattr(Path, "unlink", refused)
+        _publish(archive)
+    (ref,) = archive.refs()
+    assert [path.name for path in (tmp_path / ".locks").iterdir()] == [f"mosaic-{ref.key}.lock"]
+    assert archive.discard(ref, wait=False)
+    assert _publish(archive) == ref.path
+
+
 def test_a_run_begins_in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What a killed run of the same second and name left is not published with the next."""
     monkeypatch.setattr(
@@ -334,14 +351,10 @@ def table(tmp_path: Path) -> Path:
     return Archive.open(tmp_path).produce("attend", build, version=1, params={})[0].path / "plan.json"
 
 
-def test_a_table_comes_back(table: Path) -> None:
-    """As it was written."""
-    assert read_table(table) == {"seats": [1, 2], "share": 0.25}
-
-
 @pytest.mark.parametrize("content", ['{"seats": [1, 3], "share": 0.25}', '{"seats": [1, 2], "share": 0.25', ""])
 def test_a_changed_table_is_not_read(table: Path, content: str) -> None:
-    """One other digit is as bad as what is no JSON."""
+    """It comes back as it was written; then one other digit is as bad as what is no JSON."""
+    assert read_table(table) == {"seats": [1, 2], "share": 0.25}
     table.write_text(content)
     with pytest.raises(IncompleteStoreError, match=r"plan\.json has .*verify --repair"):
         read_table(table)

@@ -178,15 +178,6 @@ def test_products_go_by_many_names(tmp_path: Path, archive: Archive) -> None:
         assert found.folder == small.run
 
 
-def test_the_latest_run_goes_by_that_name(tmp_path: Path, archive: Archive) -> None:
-    """As export and compare have it."""
-    small_survey(archive)
-    second = small_survey(archive).run
-    found = find_product(Catalogue.read(tmp_path), "latest")
-    assert isinstance(found, Run)
-    assert found.folder == second
-
-
 def test_without_a_run_stores_are_offered(tmp_path: Path) -> None:
     """An archive of ingested cubes alone has no products, but addresses."""
     with Archive.open(tmp_path).publish("ingest", "abcd1"):
@@ -218,7 +209,10 @@ def test_a_stage_narrows_the_beginning_of_a_key(tmp_path: Path, archive: Archive
 def test_a_products_name_is_of_the_newest_run_that_can_be_read(tmp_path: Path, archive: Archive) -> None:
     """A damaged one after it does not hide it."""
     made = [small_survey(archive, seed=seed) for seed in range(3)]
-    assert find_product(Catalogue.read(tmp_path), "class_map") == made[2].map.uri
+    catalogue = Catalogue.read(tmp_path)
+    assert find_product(catalogue, "class_map") == made[2].map.uri
+    assert isinstance(newest := find_product(catalogue, "latest"), Run)
+    assert newest.folder == made[2].run
     flip(made[2].run / "receipt.json")
     assert find_product(Catalogue.read(tmp_path), "class_map") == made[1].map.uri
 
@@ -262,24 +256,19 @@ def test_what_is_no_product_is_refused(tmp_path: Path, text: str, words: str) ->
         find_product(Catalogue.read(tmp_path), text)
 
 
-def test_a_damaged_receipt_names_what_its_manifest_recorded(tmp_path: Path, archive: Archive) -> None:
-    """The receipt's own words do not count any more."""
+@pytest.mark.parametrize("well", [False, True])
+def test_a_damaged_receipt_names_what_its_manifest_recorded(tmp_path: Path, archive: Archive, well: bool) -> None:
+    """The receipt's own words do not count any more, even where one digit of it is another and it reads well."""
     small = small_survey(archive)
-    flip(small.run / "receipt.json")
-    (run,) = Catalogue.read(tmp_path).runs
-    assert run.receipt == {}
-    assert run.problem is not None
-    assert run.names == {small.raw.uri, small.mosaic.uri, small.map.uri}
-
-
-def test_a_receipt_that_reads_well_but_has_changed_is_not_believed(tmp_path: Path) -> None:
-    """One digit of it is another."""
-    small = small_survey(Archive.open(tmp_path))
     receipt = small.run / "receipt.json"
-    receipt.write_text(receipt.read_text().replace('"seed": 0', '"seed": 7'))
+    if well:
+        receipt.write_text(receipt.read_text().replace('"seed": 0', '"seed": 7'))
+    else:
+        flip(receipt)
     (run,) = Catalogue.read(tmp_path).runs
     assert (run.receipt, run.settings) == ({}, {})
     assert "receipt.json has changed since it was published" in str(run.problem)
+    assert run.names == {small.raw.uri, small.mosaic.uri, small.map.uri}
 
 
 def test_a_run_names_the_stores_of_its_stages(tmp_path: Path, archive: Archive) -> None:

@@ -19,11 +19,11 @@ from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 from storage.archive.manifests import read_manifest, write_manifest
 from storage.archive.records import read_run
-from storage.archive.run_folders import try_exchange
+from storage.archive.run_folders import RunDraft, try_exchange
 from storage.archive.staging import PART_SUFFIX
 from storage.maintenance.garbage import clear_up
-from tests.storage.small_archive import small_survey
-from tests.storage.small_bucket import FIRST, SECOND, Machine, problems
+from tests.storage.small_archive import problems, small_survey
+from tests.storage.small_bucket import FIRST, SECOND, Machine
 
 ROOT = Path(__file__).parents[3]
 KILL_EVERYWHERE = """
@@ -62,6 +62,13 @@ def run_id(archive: Archive) -> str:
     return folder.name
 
 
+def drafted(archive: Archive, name: str) -> RunDraft:
+    """What is added to a run, which nobody else does."""
+    draft = archive.extend_run(name)
+    assert draft is not None
+    return draft
+
+
 def extend(archive: Archive, name: str, figure: float = 0.75) -> Path:
     """Judge the small survey's map, and publish the run again with what came of it."""
 
@@ -70,9 +77,7 @@ def extend(archive: Archive, name: str, figure: float = 0.75) -> Path:
 
     (map_,) = archive.refs("segment")
     ref, _ = archive.produce("evaluate", build, version=1, params={"figure": figure}, inputs=[map_.key])
-    draft = archive.extend_run(name)
-    assert draft is not None
-    with draft:
+    with drafted(archive, name) as draft:
         before = json.loads((draft.published / "receipt.json").read_text())
         products = {**before["products"], "accuracy": f"{ref.uri}/accuracy.json"}
         draft.write_file("receipt.json", json.dumps({**before, "products": products, "accuracy": {"miou": figure}}))
@@ -113,9 +118,7 @@ def test_an_old_run_does_not_become_the_newest(archive: Archive) -> None:
     first = run_id(archive)
     small_survey(archive, seed=1)
     names = [run.folder.name for run in Catalogue.read(archive.root).runs]
-    draft = archive.extend_run(first)
-    assert draft is not None
-    with draft:
+    with drafted(archive, first) as draft:
         draft.write_file("receipt.json", "{}")
         draft.publish()
     assert [run.folder.name for run in Catalogue.read(archive.root).runs] == names
@@ -125,9 +128,7 @@ def test_what_is_not_published_changes_nothing(archive: Archive) -> None:
     """A block that fails, and one that ends without a word, leave the run as it was, and nothing beside it."""
     name, before = run_id(archive), (archive.runs()[0] / "manifest.json").read_bytes()
     for error in (None, KeyboardInterrupt(), ArchiveError("the disk is full")):
-        draft = archive.extend_run(name)
-        assert draft is not None
-        with suppress(KeyboardInterrupt, ArchiveError), draft:
+        with suppress(KeyboardInterrupt, ArchiveError), drafted(archive, name) as draft:
             draft.write_file("receipt.json", "{}")
             if error is not None:
                 raise error
@@ -139,9 +140,7 @@ def test_what_is_not_published_changes_nothing(archive: Archive) -> None:
 def test_one_at_a_time(archive: Archive) -> None:
     """A second process is told that it is being done, and a run that is not there is named."""
     name = run_id(archive)
-    draft = archive.extend_run(name)
-    assert draft is not None
-    with draft:
+    with drafted(archive, name):
         assert archive.extend_run(name, wait=False) is None
         assert archive.reclaim() == []
         assert clear_up(archive, keep_days=0).removals == ()
@@ -344,15 +343,6 @@ def test_a_published_run_holds_nothing(tmp_path: Path) -> None:
     assert list((tmp_path / ".locks").iterdir()) == []
     draft.abandon()
     assert (folder / "receipt.json").read_text() == "{}"
-
-
-def test_a_block_that_fails_publishes_nothing(tmp_path: Path) -> None:
-    """And leaves no folder."""
-    archive = Archive.open(tmp_path)
-    with pytest.raises(TypeError), archive.new_run("farm") as draft:
-        draft.write_file("receipt.json", "{}")["no"]  # type: ignore[index]
-    assert archive.runs() == []
-    assert list((tmp_path / "runs").iterdir()) == []
 
 
 def test_folders_exchange_their_names(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -14,7 +15,7 @@ from storage.archive.whole_files import new_file, remove_leftovers, write_whole,
 
 
 def _files(folder: Path) -> dict[str, str]:
-    return {path.name: path.read_text() for path in folder.iterdir()}
+    return {path.name: path.read_text() for path in folder.iterdir() if path.is_file()}
 
 
 def test_files_appear_together_and_replace_the_old(tmp_path: Path) -> None:
@@ -29,17 +30,20 @@ def test_files_appear_together_and_replace_the_old(tmp_path: Path) -> None:
     assert _files(folder) == {"x": "new", "y": "new", "mine": "mine"}
 
 
-def test_a_block_that_fails_leaves_the_old(tmp_path: Path) -> None:
-    """Whatever it had written."""
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (KeyboardInterrupt(), pytest.raises(KeyboardInterrupt)),
+        (OSError(errno.ENOSPC, "No space left"), pytest.raises(ArchiveError, match="the disk is full")),
+    ],
+)
+def test_a_block_that_fails_leaves_the_old(tmp_path: Path, error: BaseException, told: Any) -> None:
+    """Whatever it had written; a full disk is told, with what to do."""
     write_whole(tmp_path / "x", "old")
-
-    def fail() -> None:
-        with written_aside(tmp_path, ["x"]) as aside:
-            (aside / "x").write_text("half")
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        fail()
+    with told, written_aside(tmp_path, ["x"]) as aside:
+        (aside / "x").write_text("half")
+        raise error
+    assert [path.name for path in tmp_path.iterdir()] == ["x"]
     assert _files(tmp_path) == {"x": "old"}
 
 
@@ -58,7 +62,7 @@ def test_old_and_new_files_are_never_mixed(tmp_path: Path, monkeypatch: pytest.M
     true, seen = Path.replace, []
 
     def watched(self: Path, target: Path) -> Path:
-        seen.append(_files_only(tmp_path))
+        seen.append(_files(tmp_path))
         return true(self, target)
 
     monkeypatch.setattr(Path, "replace", watched)
@@ -67,10 +71,6 @@ def test_old_and_new_files_are_never_mixed(tmp_path: Path, monkeypatch: pytest.M
             (aside / name).write_text("new")
     assert seen == [{"x": "old"}, {"x": "new"}]
     assert _files(tmp_path) == {"x": "new", "y": "new"}
-
-
-def _files_only(folder: Path) -> dict[str, str]:
-    return {path.name: path.read_text() for path in folder.iterdir() if path.is_file()}
 
 
 def test_every_file_is_synced_before_it_has_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -99,13 +99,6 @@ def test_a_file_where_the_folder_should_be_is_refused(tmp_path: Path) -> None:
             with pytest.raises(ArchiveError, match="is or lies below a file, expected a folder; choose another --out"):
                 write()
     assert (tmp_path / "mine").read_text() == "mine"
-
-
-def test_a_full_disk_is_told(tmp_path: Path) -> None:
-    """With what to do, and nothing left."""
-    with pytest.raises(ArchiveError, match="the disk is full"), written_aside(tmp_path, ["x"]) as aside:
-        raise OSError(errno.ENOSPC, "No space left on device", str(aside / "x"))
-    assert _files(tmp_path) == {}
 
 
 def test_names_are_taken_once(tmp_path: Path) -> None:

@@ -15,7 +15,6 @@ from pipeline.geometry.scan import Sweep
 from pipeline.rectify.calibration.calibrate import calibrate
 from pipeline.source import Line, References
 from storage.archive.archive import Archive
-from storage.arrays.class_maps import ClassMap, load_class_map, write_class_map
 from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube, open_reflectance
 from storage.arrays.layout import AngularGrid, round_bits
 from storage.arrays.mosaics import (
@@ -192,7 +191,7 @@ def _mosaic(bands: int, shape: tuple[int, int] = (100, 70)) -> Mosaic:
 def write_mosaic(path: Path, mosaic: Mosaic) -> None:
     """Store a mosaic in one block of rows, with its quicklook."""
     writer = MosaicWriter(path, mosaic.values.shape[:2], mosaic.wavelength_nm, grid=mosaic.grid)
-    writer.write_rows(0, mosaic.values, mosaic.coverage)
+    writer.write_tile(0, 0, mosaic.values, mosaic.coverage)
     assert mosaic.quicklook is not None
     writer.write_quicklook(mosaic.quicklook)
 
@@ -224,19 +223,6 @@ def test_mosaic_says_where_its_pixels_lie(tmp_path: Path) -> None:
     with xr.open_zarr(tmp_path / "m.zarr", consolidated=False) as data:
         assert data.attrs["spatial:dimensions"] == ["y", "x"]
         assert data.attrs["zarr_conventions"][0]["uuid"].startswith("689b58e2")
-
-
-def test_mosaic_in_blocks_is_the_mosaic(tmp_path: Path) -> None:
-    """Blocks of whole shards give the same store; a block that splits one is refused."""
-    mosaic = _mosaic(3)
-    writer = MosaicWriter(tmp_path / "m.zarr", (100, 70), mosaic.wavelength_nm)
-    writer.write_rows(64, mosaic.values[64:], mosaic.coverage[64:])
-    writer.write_rows(0, mosaic.values[:64], mosaic.coverage[:64])
-    np.testing.assert_array_equal(load_mosaic(tmp_path / "m.zarr").values, round_bits(mosaic.values))
-    with pytest.raises(ChunkError, match=r"rows 10:74 split"):
-        writer.write_rows(10, mosaic.values[:64], mosaic.coverage[:64])
-    with pytest.raises(ShapeError, match="the tile at row 64, column 0 has shapes"):
-        writer.write_rows(64, mosaic.values[:64], mosaic.coverage[:64])
 
 
 @pytest.mark.parametrize("count", [0, 1, 5, 70])
@@ -282,25 +268,6 @@ def test_attention_round_trip(tmp_path: Path) -> None:
     assert found.policy == "entropy"
     with xr.open_zarr(tmp_path / "a.zarr", consolidated=False) as data:
         np.testing.assert_array_equal(data["score"].values, score)
-
-
-def test_class_map_round_trip(tmp_path: Path) -> None:
-    """Classes, names and colours come back; xarray reads the CF flags and masks what has no class."""
-    classes = np.random.default_rng(0).integers(0, 3, (50, 70), dtype=np.uint8)
-    classes[0, :9] = 255
-    confidence = np.where(classes == 255, np.nan, 0.75).astype(np.float32)
-    colours = np.array([[0, 0, 0], [0, 255, 0], [255, 0, 0]], np.uint8)
-    write_class_map(tmp_path / "c.zarr", ClassMap(classes, confidence, ("bare soil", "crop", "weed"), colours, GRID))
-    found = load_class_map(tmp_path / "c.zarr")
-    np.testing.assert_array_equal(found.classes, classes)
-    np.testing.assert_array_equal(found.colours, colours)
-    assert found.names == ("bare soil", "crop", "weed")
-    with xr.open_zarr(tmp_path / "c.zarr", consolidated=False) as data:
-        assert data["classes"].attrs["flag_meanings"] == "bare_soil crop weed"
-        assert data["classes"].attrs["flag_values"] == [0, 1, 2]
-        assert int(data["classes"].isnull().sum()) == 9
-    with pytest.raises(ShapeError, match="class 2 is in the map, but only 2 classes"):
-        write_class_map(tmp_path / "d.zarr", ClassMap(classes, confidence, ("a", "b"), colours[:2]))
 
 
 def test_a_flipped_bit_is_an_error_and_is_named(archive: Archive) -> None:

@@ -8,15 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from PIL import Image
 
 from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.scan import Sweep
 from pipeline.source import Line, References
 from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
 from storage.arrays.mosaics import MosaicWriter
-from storage.arrays.quicklooks import LineThumbnail, load_quicklook, picture_bands, picture_step, pictures_of, stretched
-from storage.readers.scan_files import open_cube_source
+from storage.arrays.quicklooks import LineThumbnail, load_quicklook, picture_bands, picture_step, stretched
 
 WAVES = np.linspace(400, 900, 12)
 LINES = np.random.default_rng(5).integers(100, 4000, (150, 600, 12), dtype=np.uint16)
@@ -44,17 +42,13 @@ def _stored(path: Path, lost: tuple[int, ...] = (), step: int = 33) -> Path:
         (np.arange(1000.0, 2000.0, 100), (9, 4, 0), "false colour"),
         (np.array([660.0, 800.0]), (1, 0, 0), "false colour"),
         (np.array([800.0]), (0, 0, 0), "grey"),
+        (None, (6, 4, 2), "by number"),
+        (np.array([400, np.nan, 600]), (1, 1, 0), "by number"),
     ],
 )
-def test_bands_are_the_nearest_where_they_are_near(waves: NDArray[np.float64], bands: object, kind: str) -> None:
-    """640, 550 and 460 nm where there is such light, else the ends and the middle of what there is."""
-    assert picture_bands(waves, len(waves)) == (bands, kind)
-
-
-def test_bands_without_wavelengths_are_spread() -> None:
-    """By their number, whether no wavelength is known or one is not a number."""
-    assert picture_bands(None, 9) == ((6, 4, 2), "by number")
-    assert picture_bands(np.array([400, np.nan, 600]), 3) == ((1, 1, 0), "by number")
+def test_bands_are_the_nearest_where_they_are_near(waves: NDArray[np.float64] | None, bands: object, kind: str) -> None:
+    """640, 550 and 460 nm where there is such light, else the ends and the middle of what there is, or by number."""
+    assert picture_bands(waves, 9 if waves is None else len(waves)) == (bands, kind)
 
 
 @pytest.mark.parametrize(
@@ -135,11 +129,14 @@ def test_a_flat_or_missing_band_is_black() -> None:
 def test_pictures_are_read_without_the_cube(tmp_path: Path) -> None:
     """The cube's chunks may be gone: what shows a picture does not ask for them."""
     path = _stored(tmp_path / "store" / "fine-0.zarr")
-    before = pictures_of(tmp_path / "store")["fine-0"]
+    before = load_quicklook(path)
     for shard in (path / "dn" / "c").rglob("*"):
         if shard.is_file():
             shard.write_bytes(b"not read")
-    np.testing.assert_array_equal(pictures_of(tmp_path / "store")["fine-0"], before)
+    seen = load_quicklook(path)
+    assert before is not None
+    assert seen is not None
+    np.testing.assert_array_equal(seen.image, before.image)
     with pytest.raises(IncompleteStoreError):
         open_raw_cube(path).read(0, 1)
 
@@ -155,7 +152,6 @@ def test_stores_of_before_open_without_a_picture(tmp_path: Path) -> None:
     np.testing.assert_array_equal(cube.read(0, 3), LINES[:3])
     MosaicWriter(tmp_path / "m.zarr", (8, 8), WAVES)
     assert load_quicklook(tmp_path / "m.zarr") is None
-    assert pictures_of(tmp_path) == {}
 
 
 def test_a_mosaic_has_its_picture_as_it_was_given(tmp_path: Path) -> None:
@@ -175,17 +171,6 @@ def test_a_picture_needs_no_more_memory_than_itself() -> None:
     (kept,) = seen._rows
     assert kept.base is None or kept.base.nbytes == kept.nbytes
     assert kept.shape == (16, 150, 3)
-
-
-def test_a_picture_of_an_array_without_references(tmp_path: Path) -> None:
-    """Numbers as they stand, stretched: nothing else is known of a PNG."""
-    Image.fromarray(LINES[:, :, 0].astype(np.uint8)).save(tmp_path / "a.png")
-    source = open_cube_source(str(tmp_path / "a.png"))
-    thumbnail = LineThumbnail(source.shape, source.bands.wavelength_nm)
-    thumbnail.add(0, source.read(0, 150), source.lines.valid)
-    found = thumbnail.finish()
-    wanted = stretched(np.repeat(LINES[::4, ::4, :1].astype(np.uint8), 3, axis=2).astype(np.float32))
-    np.testing.assert_array_equal(found.image, wanted.image)
 
 
 def test_white_as_dark_as_dark_is_missing(tmp_path: Path) -> None:

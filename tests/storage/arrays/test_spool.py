@@ -42,8 +42,10 @@ def _same(found: list[Line], first: int = 0) -> bool:
 
 def test_lines_come_back_in_blocks(tmp_path: Path) -> None:
     """150 lines are blocks of 64, 64 and 22, each line with all its facts."""
-    _fill(tmp_path, 150)
+    for count in (10, 12, 150):  # interrupted, and gone on with
+        _fill(tmp_path, count)
     with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
+        assert spool.count == 150
         blocks = list(spool.blocks())
     assert [len(block) for block in blocks] == [64, 64, 22]
     assert _same([line for block in blocks for line in block])
@@ -58,15 +60,6 @@ def test_every_64th_line_waits_for_the_disk(tmp_path: Path, monkeypatch: pytest.
         for number in range(130):
             spool.append(_line(number))
         assert synced_at == [64, 64, 128, 128]
-
-
-def test_an_interrupted_capture_goes_on(tmp_path: Path) -> None:
-    """A spool opened again has the count of its lines and takes the next."""
-    _fill(tmp_path, 10)
-    _fill(tmp_path, 12)
-    with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
-        assert spool.count == 12
-        assert _same([line for block in spool.blocks(5) for line in block])
 
 
 def test_the_spool_is_an_envi_file(tmp_path: Path) -> None:
@@ -102,19 +95,6 @@ def test_a_torn_tail_is_cut_off(tmp_path: Path, name: str, cut: int) -> None:
         assert spool.count == 8
 
 
-def test_a_changed_line_is_named(tmp_path: Path) -> None:
-    """Reading compares each line's CRC; opening again finds it lost, and the lines after it good."""
-    _fill(tmp_path, 6)
-    with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
-        content = bytearray((tmp_path / "lines.bil").read_bytes())
-        content[48 * 4 + 5] ^= 1
-        (tmp_path / "lines.bil").write_bytes(content)
-        with pytest.raises(RigError, match="line 4 has changed"):
-            list(spool.blocks())
-        assert spool.recover() == 6
-        assert spool.lost == [4]
-
-
 @pytest.mark.parametrize("lost", [[0], [3], [2, 3, 4], list(range(70))])
 def test_lost_lines_are_put_back(tmp_path: Path, lost: list[int]) -> None:
     """The same bytes as had nothing been lost; until then the others are there and these are not given."""
@@ -134,11 +114,27 @@ def test_lost_lines_are_put_back(tmp_path: Path, lost: list[int]) -> None:
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
+def test_numbers_are_on_the_disk_before_the_entries_that_vouch_for_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of lines that are put back too: a power cut leaves them lost, and never wrong."""
+    _fill(tmp_path, 6)
+    flip(tmp_path / "lines.bil", 48 * 4 + 5)
+    synced = list[str]()
+    with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
+        monkeypatch.setattr("storage.arrays.spool.sync_path", lambda path: synced.append(path.name))
+        spool.mend([_line(4)])
+    assert synced[:2] == ["lines.bil", "lines.index.part"]
+
+
 def test_lines_are_put_back_in_their_places_alone(tmp_path: Path) -> None:
     """Another line than the one that is lost is refused, and nothing is overwritten with it."""
     _fill(tmp_path, 6)
-    flip(tmp_path / "lines.bil", 48 * 4 + 5)
     with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
+        flip(tmp_path / "lines.bil", 48 * 4 + 5)
+        with pytest.raises(RigError, match="line 4 has changed"):  # reading compares each line's checksum
+            list(spool.blocks())
+        assert (spool.recover(), spool.lost) == (6, [4])  # and opening again finds it lost, and the one after it good
         with pytest.raises(RigError, match="got line 3"):
             spool.mend([_line(3)])
         assert spool.lost == [4]
@@ -212,7 +208,10 @@ def test_lines_of_another_sweep_are_not_continued(tmp_path: Path) -> None:
 
 
 def test_lines_come_in_order_and_of_one_size(tmp_path: Path) -> None:
-    """A line with another number or shape is refused."""
+    """A line with another number or shape is refused, and so is a file where the folder should be."""
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(RigError, match="cannot write line 0"):
+        Spool.open(tmp_path / "file", 6, 4, header=HEADER)
     with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
         with pytest.raises(RigError, match="got line 1"):
             spool.append(_line(1))
@@ -237,10 +236,3 @@ def test_a_full_disk_keeps_the_lines_before(tmp_path: Path, monkeypatch: pytest.
                 spool.append(_line(5))
         spool.append(_line(5))
         assert _same(next(spool.blocks()))
-
-
-def test_an_unwritable_folder_is_told(tmp_path: Path) -> None:
-    """A file where the folder should be gives one message."""
-    (tmp_path / "file").write_text("x")
-    with pytest.raises(RigError, match="cannot write line 0"):
-        Spool.open(tmp_path / "file", 6, 4, header=HEADER)

@@ -94,6 +94,11 @@ def work_of(cubes: list[RawCube]) -> MosaicWork:
     return MosaicWork([place(cube, CAMERA, grid=GRID) for cube in cubes], CAMERA, GRID)
 
 
+def mosaic_at(path: Path) -> MosaicWriter:
+    """An empty mosaic on the grid."""
+    return MosaicWriter(path, GRID.shape, BANDS)
+
+
 def digest_of(folder: Path) -> str:
     """Hash of all files of a store, names included."""
     files = sorted(path for path in folder.rglob("*") if path.is_file())
@@ -107,12 +112,12 @@ def test_workers_do_not_change_a_byte(tmp_path: Path, cubes: list[RawCube]) -> N
     digests = set()
     for crew in (ONE, THREE):
         path = tmp_path / f"{crew.workers}.zarr"
-        budget = write_mosaic(work_of(cubes), MosaicWriter(path, GRID.shape, BANDS), memory=PLENTY, crew=crew)
+        budget = write_mosaic(work_of(cubes), mosaic_at(path), memory=PLENTY, crew=crew)
         assert budget.workers == crew.workers
         digests.add(digest_of(path))
     assert len(digests) == 1
     plain = MosaicWork([place(Whole(cube), CAMERA, grid=GRID) for cube in cubes], CAMERA, GRID)
-    write_mosaic(plain, MosaicWriter(tmp_path / "whole.zarr", GRID.shape, BANDS), memory=PLENTY, crew=ONE)
+    write_mosaic(plain, mosaic_at(tmp_path / "whole.zarr"), memory=PLENTY, crew=ONE)
     np.testing.assert_array_equal(load_mosaic(tmp_path / "whole.zarr").values, load_mosaic(tmp_path / "1.zarr").values)
 
 
@@ -128,7 +133,7 @@ def test_progress_and_tiles_are_told(tmp_path: Path, cubes: list[RawCube]) -> No
 
     write_mosaic(
         work_of(cubes),
-        MosaicWriter(tmp_path / "m.zarr", GRID.shape, BANDS),
+        mosaic_at(tmp_path / "m.zarr"),
         memory=PLENTY,
         crew=TWO,
         seen=Watched(GRID.shape, [0, 1, 2], 900),
@@ -144,7 +149,7 @@ def test_thumbnail_is_every_nth_pixel(tmp_path: Path, cubes: list[RawCube], most
     """Whatever tiles it is made of, a thumbnail holds the mosaic's own pixels, at most so many a side."""
     thumbnail = Thumbnail(GRID.shape, [2, 0], most_px)
     path = tmp_path / "m.zarr"
-    write_mosaic(work_of(cubes), MosaicWriter(path, GRID.shape, BANDS), memory=PLENTY, crew=ONE, seen=thumbnail)
+    write_mosaic(work_of(cubes), mosaic_at(path), memory=PLENTY, crew=ONE, seen=thumbnail)
     down, across = (-(-size // most_px) for size in GRID.shape)
     whole = load_mosaic(path).values[::down, ::across, ::-2]
     np.testing.assert_allclose(thumbnail.image, whole, rtol=3e-4)
@@ -154,11 +159,11 @@ def test_thumbnail_is_every_nth_pixel(tmp_path: Path, cubes: list[RawCube], most
 def test_memory_says_how_many_tiles_at_a_time(tmp_path: Path, cubes: list[RawCube]) -> None:
     """With memory for one tile only one is made at a time, whatever is allowed; a byte less and none is."""
     work = work_of(cubes)
-    least = write_mosaic(work, MosaicWriter(tmp_path / "a.zarr", GRID.shape, BANDS), memory=PLENTY, crew=ONE).projected
-    tight = write_mosaic(work, MosaicWriter(tmp_path / "b.zarr", GRID.shape, BANDS), memory=least, crew=THREE)
+    least = write_mosaic(work, mosaic_at(tmp_path / "a.zarr"), memory=PLENTY, crew=ONE).projected
+    tight = write_mosaic(work, mosaic_at(tmp_path / "b.zarr"), memory=least, crew=THREE)
     assert tight.workers == 1
     with pytest.raises(SettingsError, match=r"projected memory \d+ MiB exceeds --memory \d+ MiB: one tile of 64 x 640"):
-        write_mosaic(work, MosaicWriter(tmp_path / "c.zarr", GRID.shape, BANDS), memory=least - 1)
+        write_mosaic(work, mosaic_at(tmp_path / "c.zarr"), memory=least - 1)
 
 
 def test_an_error_in_a_tile_ends_the_work(tmp_path: Path, cubes: list[RawCube]) -> None:
@@ -166,13 +171,7 @@ def test_an_error_in_a_tile_ends_the_work(tmp_path: Path, cubes: list[RawCube]) 
 
     thumbnail = Thumbnail(GRID.shape, [3], 100)  # a band too far
     with pytest.raises(IndexError, match="index 3 is out of bounds"):
-        write_mosaic(
-            work_of(cubes),
-            MosaicWriter(tmp_path / "m.zarr", GRID.shape, BANDS),
-            memory=PLENTY,
-            crew=TWO,
-            seen=thumbnail,
-        )
+        write_mosaic(work_of(cubes), mosaic_at(tmp_path / "m.zarr"), memory=PLENTY, crew=TWO, seen=thumbnail)
 
 
 def test_processes_write_the_same_bytes(tmp_path: Path, cubes: list[RawCube], processes: Crew) -> None:
@@ -180,9 +179,7 @@ def test_processes_write_the_same_bytes(tmp_path: Path, cubes: list[RawCube], pr
     made = {}
     for crew in (ONE, TWO, processes):
         path, thumbnail = tmp_path / f"{crew.scheduler}{crew.workers}.part" / "m.zarr", Thumbnail(GRID.shape, [2], 50)
-        budget = write_mosaic(
-            recipe_of(cubes), MosaicWriter(path, GRID.shape, BANDS), memory=PLENTY, crew=crew, seen=thumbnail
-        )
+        budget = write_mosaic(recipe_of(cubes), mosaic_at(path), memory=PLENTY, crew=crew, seen=thumbnail)
         assert (budget.workers, budget.processes) == (crew.workers, crew is processes)
         made[crew] = digest_of(path), thumbnail.image.tobytes()
     assert len({*made.values()}) == 1
@@ -193,10 +190,10 @@ def test_a_worker_killed_between_tiles_changes_nothing(
 ) -> None:
     """kill -9 of a process that makes tiles, with a shard half written: the mosaic is as an undisturbed one."""
     folder = tmp_path / "key.part"
-    write_mosaic(recipe_of(cubes), MosaicWriter(tmp_path / "a.zarr", GRID.shape, BANDS), memory=PLENTY, crew=ONE)
+    write_mosaic(recipe_of(cubes), mosaic_at(tmp_path / "a.zarr"), memory=PLENTY, crew=ONE)
     kill = KillOnce((1, 1), (0,), str(folder))
     monkeypatch.setattr("storage.arrays.tile_work.ThumbnailCut", lambda *about: kill)
-    writer = MosaicWriter(folder / "m.zarr", GRID.shape, BANDS)
+    writer = mosaic_at(folder / "m.zarr")
     write_mosaic(recipe_of(cubes), writer, memory=PLENTY, crew=processes, seen=Thumbnail(GRID.shape, [0], 900))
     assert (folder / "killed").exists()
     assert digest_of(folder / "m.zarr") == digest_of(tmp_path / "a.zarr")
@@ -205,9 +202,7 @@ def test_a_worker_killed_between_tiles_changes_nothing(
 def test_processes_need_a_recipe(tmp_path: Path, cubes: list[RawCube], processes: Crew) -> None:
     """Opened sweeps cannot be sent to other processes."""
     with pytest.raises(TypeError, match="crew 'processes' needs a MosaicRecipe"):
-        write_mosaic(
-            work_of(cubes), MosaicWriter(tmp_path / "m.zarr", GRID.shape, BANDS), memory=PLENTY, crew=processes
-        )
+        write_mosaic(work_of(cubes), mosaic_at(tmp_path / "m.zarr"), memory=PLENTY, crew=processes)
 
 
 def test_each_process_keeps_the_lines_of_one_tile(cubes: list[RawCube]) -> None:
@@ -222,7 +217,7 @@ def test_each_process_keeps_the_lines_of_one_tile(cubes: list[RawCube]) -> None:
 
 def test_a_worker_lets_tiles_go(tmp_path: Path, cubes: list[RawCube]) -> None:
     """Raw lines are kept from tile to tile of a mosaic, and no longer than the process is at tiles."""
-    writer = MosaicWriter(tmp_path / "m.zarr", GRID.shape, BANDS)
+    writer = mosaic_at(tmp_path / "m.zarr")
     maker = TileMaker(recipe_of(cubes), writer.path, 2**24)
     maker((slice(0, 64), slice(0, 640)))
     lines = weakref.ref(tile_work._opened(maker)._cache)
@@ -242,6 +237,6 @@ def test_memory_of_workers_elsewhere_is_not_counted(tmp_path: Path, cubes: list[
 
 def test_every_process_counts_against_the_memory(tmp_path: Path, cubes: list[RawCube]) -> None:
     """Two processes and this one do not fit where one does; the message says what each takes."""
-    writer = MosaicWriter(tmp_path / "m.zarr", GRID.shape, BANDS)
+    writer = mosaic_at(tmp_path / "m.zarr")
     with pytest.raises(SettingsError, match=r"each of two processes 512 MiB; give at least --memory 1\d\d\d MiB"):
         write_mosaic(recipe_of(cubes), writer, memory=2**30, crew=Crew("processes", 2))

@@ -19,7 +19,7 @@ from pipeline.errors import ArchiveError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.class_maps import ClassNames
 from storage.arrays.layout import AngularGrid
-from storage.export.cog_files import ANGULAR, CogImage, Place, cog_problems, need_rasterio, write_cog
+from storage.export.image_files import ANGULAR, CogImage, Place, cog_problems, need_rasterio, write_cog
 
 rasterio = pytest.importorskip("rasterio", reason="GeoTIFF is written with rasterio, of the extra [geo]")
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
@@ -100,21 +100,8 @@ def test_a_large_image_is_cloud_optimised(tmp_path: Path, dtype: str) -> None:
         assert file.block_shapes[0] == (512, 512)
 
 
-def test_overviews_of_classes_hold_classes(tmp_path: Path) -> None:
-    """A coarser level takes the commonest of its four pixels: no class between two others appears."""
-    values = classes_of((1300, 1100))
-    write_cog(tmp_path / "a.tif", class_image(values.shape), rows_of(values))
-    with rasterio.open(tmp_path / "a.tif", overview_level=0) as file:
-        coarse = file.read(1)
-    assert coarse.shape == (650, 550)
-    assert set(np.unique(coarse)) <= {0, 1, 2, UNLABELLED}
-    four = values.reshape(650, 2, 550, 2).swapaxes(1, 2).reshape(650, 550, 4)
-    alike = (four == four[..., :1]).all(axis=-1)
-    np.testing.assert_array_equal(coarse[alike], four[alike][:, 0])
-
-
 def test_overviews_of_classes_are_no_mean_of_colours(tmp_path: Path) -> None:
-    """Three white pixels and a black one are white, though a grey class has a colour nearer to their mean."""
+    """The commonest class: three white pixels and a black one are white, though grey is nearer to their mean."""
     greys = ClassNames(("black", "grey", "white"), np.repeat(np.array([[0], [180], [255]], "u1"), 3, axis=1))
     values = np.tile(np.array([[0, 2], [2, 2]], np.uint8), (300, 280))
     image = replace(class_image(values.shape), legend=greys)
@@ -155,15 +142,6 @@ def test_classes_have_colours_and_names(tmp_path: Path) -> None:
     assert [name.text for name in names] == list(LEGEND.names)
 
 
-def test_an_existing_file_is_replaced_as_a_whole(tmp_path: Path) -> None:
-    """The second file of a name has nothing of the first, and nothing else is left in the folder."""
-    for shape in (FEW, (40, 30)):
-        write_cog(tmp_path / "a.tif", class_image(shape), rows_of(classes_of(shape)))
-    with rasterio.open(tmp_path / "a.tif") as file:
-        assert file.shape == (40, 30)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.tif", "a.tif.aux.xml"]
-
-
 @pytest.mark.parametrize(
     ("rows", "words"),
     [
@@ -175,7 +153,11 @@ def test_an_existing_file_is_replaced_as_a_whole(tmp_path: Path) -> None:
 )
 def test_blocks_that_do_not_fill_the_image_change_nothing(tmp_path: Path, rows: Any, words: str) -> None:
     """Missing, shifted or wider blocks are refused; the file of before stays, byte for byte."""
-    write_cog(tmp_path / "a.tif", class_image(FEW), rows_of(classes_of(FEW)))
+    for size in ((40, 30), FEW):
+        write_cog(tmp_path / "a.tif", class_image(size), rows_of(classes_of(size)))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.tif", "a.tif.aux.xml"]  # nothing of the first
+    with rasterio.open(tmp_path / "a.tif") as file:
+        assert file.shape == FEW
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     with pytest.raises(ShapeError, match=words):
         write_cog(tmp_path / "a.tif", class_image(FEW), iter(rows))

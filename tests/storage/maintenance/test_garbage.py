@@ -9,12 +9,7 @@ import pytest
 from pipeline.errors import SettingsError
 from storage.archive.archive import Archive
 from storage.maintenance.garbage import IN_USE, Removal, clear_up, plan_clearance
-from storage.remote.opening import verify_archive
-from tests.storage.small_archive import flip, grow_old, small_survey
-
-
-def _problems(archive: Archive) -> list[str]:
-    return [f"{one.uri} {one.problem}" for one in verify_archive(archive) if one.problem is not None]
+from tests.storage.small_archive import flip, grow_old, problems, small_survey
 
 
 def test_what_no_run_names_goes_and_the_rest_stays(archive: Archive) -> None:
@@ -27,7 +22,7 @@ def test_what_no_run_names_goes_and_the_rest_stays(archive: Archive) -> None:
     assert done == planned
     assert done.size > 3 * 40 * 40
     assert {ref.uri for ref in archive.refs()} == {kept.raw.uri, kept.mosaic.uri, kept.map.uri}
-    assert _problems(archive) == []
+    assert problems(archive) == []
     assert clear_up(archive, keep_days=0).removals == ()
 
 
@@ -192,7 +187,7 @@ def test_broken_off_it_leaves_a_whole_archive(archive: Archive, at: int) -> None
 
     with pytest.raises(KeyboardInterrupt):
         clear_up(archive, keep_days=0, progress=stop)
-    assert _problems(archive) == []
+    assert problems(archive) == []
     clear_up(archive, keep_days=0)
     assert len(archive.refs()) == 3
 

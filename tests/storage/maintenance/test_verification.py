@@ -6,16 +6,19 @@ import json
 import random
 import shutil
 import time
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pipeline.errors import IncompleteStoreError
+from storage.archive import run_folders
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.archive.manifests import _seal, _text
 from storage.archive.records import MANIFEST_HASH
+from storage.archive.run_folders import date_of_store
 from storage.arrays.layout import create_group, open_group, read_array, write_image, write_small
 from storage.maintenance.verification import find_shard, name_damage
 from storage.remote.opening import verify_archive
@@ -152,6 +155,33 @@ def test_a_store_made_anew_is_not_doubted(archive: Archive) -> None:
     small_survey(archive, named=False)
     assert archive.manifest_hash(small.mosaic) != recorded
     assert _found(archive) == {}
+
+
+class Back(datetime):
+    """The clock of a machine that was set back by a year."""
+
+    @classmethod
+    def now(cls, tz: object = None) -> datetime:  # type: ignore[override]
+        return datetime.now(UTC) - timedelta(days=365)
+
+
+def test_a_store_made_anew_after_the_clock_was_set_back(archive: Archive, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its date is after that of the run that knows it, so that it is not taken for one that somebody wrote."""
+    small = small_survey(archive)
+    archive.discard(small.mosaic)
+    monkeypatch.setattr(run_folders, "datetime", Back)
+    small_survey(archive, named=False)
+    assert _found(archive) == {}
+
+
+def test_other_stores_have_the_date_of_the_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A clock that was once ahead does not date everything after it."""
+    archive = Archive.open(tmp_path)
+    small = small_survey(archive)
+    monkeypatch.setattr(run_folders, "datetime", Back)
+    behind = datetime.now(UTC) - timedelta(days=364)
+    assert datetime.fromisoformat(date_of_store(tmp_path, "stages/segment/another")) < behind
+    assert datetime.fromisoformat(date_of_store(tmp_path, small.map.uri)) > behind
 
 
 def test_what_is_gone_is_told_once(archive: Archive) -> None:

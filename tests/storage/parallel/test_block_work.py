@@ -22,6 +22,7 @@ from pipeline.errors import SettingsError, ShapeError, WorkerError
 from storage.parallel import cluster_work
 from storage.parallel.crew import Crew, count_cores, run_blocks
 
+ROOT = Path(__file__).parents[3]
 PROCESSES = Crew("processes", 2)
 
 
@@ -269,8 +270,7 @@ import subprocess, sys, time
 from contextlib import suppress
 from pipeline.errors import PipelineError, WorkerError
 from storage.parallel import cluster_work
-from storage.parallel.crew import run_blocks
-from storage.parallel.crew import Crew
+from storage.parallel.crew import Crew, run_blocks
 from tests.storage.parallel.test_block_work import nap
 
 def dask(*words):
@@ -315,22 +315,17 @@ def test_a_scheduler_that_goes_away_is_one_error(tmp_path: Path) -> None:
     """In the middle of the work: one message, no traceback of dask's; one that comes back serves the same crew."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
-    (script := tmp_path / "gone.py").write_text(GONE)
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
-    done = subprocess.run(
-        [sys.executable, str(script), address], env=environment, capture_output=True, text=True, timeout=60, check=True
-    )
+    with run_script(tmp_path, GONE, address) as started:
+        printed, said = started.communicate(timeout=60)
     gone = f"--scheduler {address}: the scheduler is gone; the same command goes on once it is there again"
-    assert done.stdout.splitlines() == [gone, "[0, 1, 2]"]
-    assert done.stderr == ""
+    assert (started.returncode, printed.splitlines(), said) == (0, [gone, "[0, 1, 2]"], "")
 
 
 INTERRUPTED = """
 import signal, sys, time
 from functools import partial
 from pathlib import Path
-from storage.parallel.crew import run_blocks
-from storage.parallel.crew import Crew
+from storage.parallel.crew import Crew, run_blocks
 from tests.storage.parallel.test_block_work import touch_slowly
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs have it ignored
@@ -345,8 +340,7 @@ TERMINATED = """
 import os, signal, sys, threading
 from contextlib import suppress
 from pathlib import Path
-from storage.parallel.crew import run_blocks
-from storage.parallel.crew import Crew
+from storage.parallel.crew import Crew, run_blocks
 def children():
     return [child for task in Path("/proc/self/task").glob("*/children") for child in task.read_text().split()]
 def terminate():
@@ -365,12 +359,19 @@ if __name__ == "__main__":
 """
 
 
+def run_script(folder: Path, text: str, *words: str) -> subprocess.Popen[str]:
+    """A program in a process, and a session, of its own."""
+    (script := folder / "script.py").write_text(text)
+    command, environment = [sys.executable, str(script), *words], {**os.environ, "PYTHONPATH": str(ROOT)}
+    said = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen(command, env=environment, start_new_session=True, **said)  # type: ignore[call-overload, no-any-return]
+
+
 def test_sigterm_while_workers_begin(tmp_path: Path) -> None:
     """It is heard once they are there, and they end without a word."""
-    (script := tmp_path / "terminated.py").write_text(TERMINATED)
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
-    done = subprocess.run([sys.executable, str(script)], env=environment, capture_output=True, timeout=60, check=False)
-    assert (done.returncode, done.stderr) == (143, b"")
+    with run_script(tmp_path, TERMINATED) as started:
+        assert started.communicate(timeout=60) == ("", "")
+    assert started.returncode == 143
 
 
 def touch_slowly(folder: Path, number: int) -> None:
@@ -392,10 +393,7 @@ def test_no_worker_outlives_its_crew(tmp_path: Path, sent: signal.Signals) -> No
     """Ctrl-C ends the workers without a word of theirs; after kill -9 of the process that started them they end too."""
     begun = tmp_path / "begun"
     begun.mkdir()
-    (script := tmp_path / "interrupted.py").write_text(INTERRUPTED)
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
-    command = [sys.executable, str(script), str(begun)]
-    with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, start_new_session=True) as started:
+    with run_script(tmp_path, INTERRUPTED, str(begun)) as started:
         while len(list(begun.iterdir())) < 3:
             assert started.poll() is None
             time.sleep(0.02)
@@ -410,4 +408,4 @@ def test_no_worker_outlives_its_crew(tmp_path: Path, sent: signal.Signals) -> No
         assert time.monotonic() < end
         time.sleep(0.05)
     if sent == signal.SIGINT:
-        assert said == b""
+        assert said == ""

@@ -85,28 +85,23 @@ def test_a_mask_splits_the_labels(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("classes", "words"),
-    [([9], "goes up to 2, but only 1 mask classes"), ([9, 5], r"class 5 is none of the labels' \[4, 9\]")],
+    ("mask", "classes", "words"),
+    [
+        (2, [9], "goes up to 2, but only 1 mask classes"),
+        (2, [9, 5], r"class 5 is none of the labels' \[4, 9\]"),
+        (2**40, None, r"class 1 is none of the labels' \[4, 9\]"),
+    ],
 )
-def test_masks_that_do_not_fit(tmp_path: Path, classes: list[int], words: str) -> None:
-    """Too few mask classes and classes that the labels lack are refused."""
+def test_masks_that_do_not_fit(tmp_path: Path, mask: int, classes: list[int] | None, words: str) -> None:
+    """Too few mask classes, classes that the labels lack and stray numbers, however large, are refused at once."""
     np.save(tmp_path / "a.npy", np.ones((1, 2, 1)))
     np.save(tmp_path / "gt.npy", np.array([[4, 9]]))
-    np.save(tmp_path / "mask.npy", np.array([[1, 2]]))
+    np.save(tmp_path / "mask.npy", np.array([[1, mask]]))
     (tmp_path / "scene.toml").write_text('wavelengths_nm = [600]\nlabels = "gt.npy"')
-    data = load_data_set(tmp_path / "a.npy", train_mask=tmp_path / "mask.npy", mask_classes=classes)
+    chosen = {} if classes is None else {"mask_classes": classes}
+    data = load_data_set(tmp_path / "a.npy", train_mask=tmp_path / "mask.npy", **chosen)  # type: ignore[arg-type]
     with pytest.raises(SceneError, match=words):
         list(data.train())
-
-
-def test_a_stray_number_in_a_mask_is_named(tmp_path: Path) -> None:
-    """A mask number far beyond the classes is refused at once, however large."""
-    np.save(tmp_path / "a.npy", np.ones((1, 2, 1)))
-    np.save(tmp_path / "gt.npy", np.array([[1, 2]]))
-    np.save(tmp_path / "mask.npy", np.array([[1, 2**40]]))
-    (tmp_path / "scene.toml").write_text('wavelengths_nm = [600]\nlabels = "gt.npy"')
-    with pytest.raises(SceneError, match=r"class 3 is none of the labels' \[1, 2\]"):
-        list(load_data_set(tmp_path / "a.npy", train_mask=tmp_path / "mask.npy").train())
 
 
 def test_indian_pines_disjoint_mask(real_data: Path) -> None:

@@ -75,9 +75,10 @@ def test_an_empty_part_is_left_out(tmp_path: Path, lines: NDArray[np.uint16]) ->
     """A part that was opened when the capture died holds nothing; the rest is read."""
     write_part(tmp_path, "raw_0", lines[:6])
     write_part(tmp_path, "raw_6", lines[:0], lines=10)
-    source = open_cube_source(tmp_path)
-    assert source.shape[0] == 6
-    assert source.notes == ("raw_6 is empty and left out",)
+    for name in ("raw_6", "raw_6.bin"):  # whatever its data file is called
+        source = open_cube_source(tmp_path)
+        assert (source.shape[0], source.notes) == (6, (f"{name} is empty and left out",))
+        (tmp_path / "raw_6").rename(tmp_path / "raw_6.bin") if name == "raw_6" else None
 
 
 def test_references_found_by_name(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
@@ -173,16 +174,6 @@ def test_numbers_in_names_count_where_lines_follow_from_them(tmp_path: Path, lin
     assert open_cube_source(tmp_path / "whole").by_names == ((0, 5, 10), (5,))
 
 
-def test_an_empty_part_of_any_ending_is_left_out(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
-    """A part without a byte is left out, whatever its data file is called."""
-    write_part(tmp_path, "raw_0", lines[:5])
-    write_part(tmp_path, "raw_5", lines[5:10])
-    (tmp_path / "raw_5").unlink()
-    (tmp_path / "raw_5.bin").touch()
-    source = open_cube_source(tmp_path)
-    assert (source.shape[0], source.notes) == (5, ("raw_5.bin is empty and left out",))
-
-
 def test_what_is_no_file_is_no_part(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
     """Folders and pipes with the names of parts and indices are passed over; none of them is waited for."""
     write_part(tmp_path, "raw_0", lines[:5])
@@ -211,11 +202,7 @@ def test_layouts(tmp_path: Path, between: str, end: str) -> None:
         assert index.frame.tolist() == [0, 1]
         assert index.stamp_us.tolist() == [1500000, 1510000]
         assert index.notes == ()
-
-
-def test_without_a_heading(tmp_path: Path) -> None:
-    """The first line may be a frame already."""
-    assert load_frame_index(_index(tmp_path, "5 10\n6 20\n")).frame.tolist() == [5, 6]
+    assert load_frame_index(_index(tmp_path, "5 10\n6 20\n")).frame.tolist() == [5, 6]  # without a heading
 
 
 def test_what_is_no_frame_is_counted(tmp_path: Path) -> None:
@@ -246,38 +233,45 @@ def test_no_frame_at_all(tmp_path: Path, text: str) -> None:
         load_frame_index(tmp_path / "none.txt")
 
 
-def test_times_by_number(tmp_path: Path) -> None:
-    """A line's frame is the part's first and so on; where the index has a gap nothing is known."""
-    index = load_frame_index(_index(tmp_path, "f t\n2000 10\n2001 20\n2003 40\n2009 99\n"))
-    times = times_of_lines(index, 2000, 5)
-    assert times.frame.tolist() == [2000, 2001, -1, 2003, -1]
-    assert times.stamp_us.tolist() == [10, 20, -1, 40, -1]
-    assert times.notes == (
-        "the frame index tells the time of 3 of 5 lines",
-        "the frame index lists 1 frames beyond the lines",
-    )
-
-
-def test_frames_dropped_by_the_camera(tmp_path: Path) -> None:
-    """As many frames as lines are the lines, whatever their numbers."""
-    index = load_frame_index(_index(tmp_path, "f t\n0 10\n1 20\n3 40\n"))
-    times = times_of_lines(index, 0, 3)
-    assert times.frame.tolist() == [0, 1, 3]
-    assert times.notes == ("1 frames between the first and the last were dropped by the camera",)
-
-
-def test_numbers_that_begin_anew(tmp_path: Path) -> None:
-    """An index of a later part that counts from 0 counts from the part's own start."""
-    index = load_frame_index(_index(tmp_path, "f t\n0 10\n1 20\n"))
-    assert times_of_lines(index, 2000, 3).stamp_us.tolist() == [10, 20, -1]
-
-
-def test_a_file_that_lost_its_last_lines(tmp_path: Path) -> None:
-    """The index of a file that was whole still tells its lines in order, where frames had been dropped before."""
-    index = load_frame_index(_index(tmp_path, "f t\n0 10\n1 20\n3 40\n4 50\n"))
-    times = times_of_lines(index, 0, 3, lost=1)
-    assert times.frame.tolist() == [0, 1, 3]
-    assert times.stamp_us.tolist() == [10, 20, 40]
+@pytest.mark.parametrize(
+    ("frames", "first", "lost", "found", "notes"),
+    [
+        (
+            # by number: a line's frame is the part's first and so on; where the index has a gap nothing is known
+            {2000: 10, 2001: 20, 2003: 40, 2009: 99},
+            (2000, 5),
+            0,
+            [2000, 2001, -1, 2003, -1],
+            ("the frame index tells the time of 3 of 5 lines", "the frame index lists 1 frames beyond the lines"),
+        ),
+        (
+            # as many frames as lines are the lines, whatever their numbers
+            {0: 10, 1: 20, 3: 40},
+            (0, 3),
+            0,
+            [0, 1, 3],
+            ("1 frames between the first and the last were dropped by the camera",),
+        ),
+        # the index of a later part that counts from 0 counts from the part's own start
+        ({0: 10, 1: 20}, (2000, 3), 0, [0, 1, -1], None),
+        # a file that lost its last line still has its lines in order, where frames had been dropped before
+        ({0: 10, 1: 20, 3: 40, 4: 50}, (0, 3), 1, [0, 1, 3], None),
+    ],
+)
+def test_times_of_lines(
+    tmp_path: Path,
+    frames: dict[int, int],
+    first: tuple[int, int],
+    lost: int,
+    found: list[int],
+    notes: tuple[str, ...] | None,
+) -> None:
+    """Whatever the camera dropped and the file lost, each line has the time of its own frame, or none."""
+    index = load_frame_index(_index(tmp_path, "f t\n" + "".join(f"{frame} {at}\n" for frame, at in frames.items())))
+    times = times_of_lines(index, *first, lost=lost)
+    assert times.stamp_us.tolist() == [frames.get(frame, -1) for frame in found]
+    if notes is not None:
+        assert (times.frame.tolist(), times.notes) == (found, notes)
 
 
 @pytest.mark.parametrize(

@@ -68,21 +68,12 @@ def test_plain_arrays(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
     assert load_scene_file(tmp_path / "flat.zarr", wavelengths=[550]).values.shape == (7, 9, 1)
 
 
-def test_packed_numbers(tmp_path: Path, cube: NDArray[np.uint16]) -> None:
-    """Numbers packed with a scale, an offset and a fill value are read as what they mean."""
-    data = _dataset(np.where(cube > 4000, np.nan, cube * 0.5 + 1), ("y", "x", "band"), units="nm")
-    packing = {"dtype": "i2", "scale_factor": 0.5, "add_offset": 1.0, "_FillValue": -1}
-    data.to_zarr(tmp_path / "a.zarr", encoding={"reflectance": packing}, consolidated=False)
-    scene = load_scene_file(tmp_path / "a.zarr")
-    np.testing.assert_allclose(scene.values, np.where(cube > 4000, np.nan, cube * 0.5 + 1), rtol=1e-6)
-
-
 @pytest.mark.parametrize("version", [2, 3])
 @pytest.mark.parametrize("packing", [{"dtype": "f4"}, {"dtype": "i2", "scale_factor": 0.5, "add_offset": 1.0}])
 def test_void_numbers_as_xarray_keeps_them(
     tmp_path: Path, cube: NDArray[np.uint16], version: int, packing: dict[str, Any]
 ) -> None:
-    """The number that stands for none is found in both versions, of floats and of whole numbers."""
+    """Packed numbers are what they mean, and the one that stands for none is found, in both versions."""
     data = _dataset(np.where(cube > 4000, np.nan, cube * 0.5 + 1), ("y", "x", "band"), units="nm")
     encoding: Any = {"reflectance": {**packing, "_FillValue": -9999}}
     data.to_zarr(tmp_path / "a.zarr", encoding=encoding, zarr_format=version, consolidated=False)
@@ -132,7 +123,7 @@ def test_own_mosaic(tmp_path: Path) -> None:
     values = np.random.default_rng(0).random((8, 9, 5)).astype(np.float32).round(2)
     values[2, 3] = np.nan
     writer = MosaicWriter(tmp_path / "mosaic.zarr", (8, 9), NM, fwhm_nm=NM / 100)
-    writer.write_rows(0, values, np.ones((8, 9), np.float32))
+    writer.write_tile(0, 0, values, np.ones((8, 9), np.float32))
     scene = load_scene_file(tmp_path / "mosaic.zarr")
     np.testing.assert_allclose(scene.values, values, rtol=3e-4)
     assert scene.fwhm_nm is not None

@@ -25,8 +25,8 @@ from storage.arrays.layout import create_group, write_image
 from storage.maintenance.garbage import IN_USE, clear_up
 from storage.remote import object_stores
 from storage.remote.object_stores import AT_ONCE, Objects, UnreachableError, is_remote, parse_place, some_at_a_time
-from tests.storage.small_archive import small_survey
-from tests.storage.small_bucket import FIRST, SECOND, Machine, make, object_of, problems, rot
+from tests.storage.small_archive import problems, small_survey
+from tests.storage.small_bucket import FIRST, SECOND, Machine, make, object_of, rot
 
 
 def test_a_store_is_found_and_fetched_elsewhere(machine: Machine) -> None:

@@ -24,8 +24,8 @@ from storage.remote import object_checks, object_copies
 from storage.remote.object_archive import ObjectArchive
 from storage.remote.object_stores import Objects, UnreachableError
 from storage.remote.opening import put_back_objects, repair_objects, verify_archive
-from tests.storage.small_archive import Small, small_survey
-from tests.storage.small_bucket import FIRST, SECOND, Machine, make, object_of, problems, rot
+from tests.storage.small_archive import Small, problems, small_survey
+from tests.storage.small_bucket import FIRST, SECOND, Machine, make, object_of, rot
 
 THIRD = "third"
 

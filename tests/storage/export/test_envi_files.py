@@ -1,8 +1,9 @@
-"""ENVI against other readers and writers: Spectral Python (SPy) and, where it is installed, GDAL through rasterio."""
+"""ENVI files bit for bit through this project, Spectral Python (SPy) and rasterio; never a pair that is none."""
 
 from __future__ import annotations
 
 import random
+import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from odc.geo.geobox import GeoBox
 
-from pipeline.errors import SceneError
-from storage.export.envi_writer import EnviFile, write_envi
+from pipeline.errors import PoseError, SceneError, ShapeError
+from storage.export.image_files import EnviFile, header_text, write_envi
 from storage.readers.envi_cubes import DATA_TYPES, INTERLEAVES, EnviCube, open_envi_cube
 from storage.readers.scan_files import open_cube_source
 
@@ -20,6 +22,7 @@ pytest.importorskip("spectral", reason="SPy is the oracle: pip install spectral"
 envi = pytest.importorskip("spectral.io.envi", reason="SPy is the oracle: pip install spectral")
 
 pytestmark = [
+    pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning"),  # odc-geo on affine 3
     pytest.mark.filterwarnings("ignore:Parameters with non-lowercase names"),  # SPy says so of keys as ENVI has them
     pytest.mark.filterwarnings("ignore:Dataset has no geotransform"),  # GDAL of a cube that lies on no map
 ]
@@ -27,17 +30,19 @@ ORDERS = {"little": "<", "big": ">"}
 CODES = sorted(DATA_TYPES)
 SHAPE = (6, 7, 5)
 NM = [401.25, 402.5, 550.0, 800.125, 999.875]
+BOX = (500000, 5770000, 500003.5, 5770003)
 WIDTHS = [5.5, 5.25, 6.0, 7.125, 8.0]
 NAMES = ["blue 1", "blue 2", "green", "edge", "last"]
 
 
 def numbers(code: int, seed: int = 0) -> NDArray[Any]:
-    """Random numbers over the whole range of an ENVI type, (line, sample, band); none that float are NaN."""
+    """Random numbers over the whole range of an ENVI type, (line, sample, band); of those that float some are not."""
     kind = np.dtype(DATA_TYPES[code])
     rng = np.random.default_rng(100 * code + seed)
     if kind.kind in "ui":
         return np.frombuffer(rng.bytes(int(np.prod(SHAPE)) * kind.itemsize), kind).reshape(SHAPE).copy()
     values = rng.normal(0, 1e6, SHAPE) + (1j * rng.normal(0, 1, SHAPE) if kind.kind == "c" else 0)
+    values[0, 0], values[1, 1] = np.nan, np.inf
     return values.astype(kind)
 
 
@@ -84,16 +89,23 @@ def shifted(header: Path, offset: int) -> None:
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("interleave", INTERLEAVES)
 @pytest.mark.parametrize("code", CODES)
-def test_what_is_written_spy_reads(tmp_path: Path, code: int, interleave: str, order: str) -> None:
-    """Every type, interleave and byte order: SPy reads the numbers, bands and no-data value that were written."""
+def test_what_is_written_is_read(tmp_path: Path, code: int, interleave: str, order: str) -> None:
+    """Every type, interleave and byte order: SPy and this project read the numbers, bands and no-data value again."""
     values, kind = numbers(code), np.dtype(ORDERS[order] + DATA_TYPES[code])
-    file = EnviFile(SHAPE, kind.str, interleave, np.array(NM), np.array(WIDTHS), "two words", nodata=7.0)
-    write_envi(tmp_path / "a.hdr", file, in_blocks(values))
+    file = EnviFile(SHAPE, kind.str, interleave, np.array(NM), np.array(WIDTHS), "two {x}", nodata=7.0)
+    data = write_envi(tmp_path / "a.hdr", file, in_blocks(values))
+    assert data == tmp_path / "a.img"
     np.testing.assert_array_equal(as_spy_reads(tmp_path / "a.hdr"), values)
     found = envi.open(str(tmp_path / "a.hdr"))
     assert (found.bands.centers, found.bands.bandwidths) == (NM, WIDTHS)
-    assert float(found.metadata["data ignore value"]) == 7.0
-    assert found.metadata["description"] == "two words"
+    assert (float(found.metadata["data ignore value"]), found.metadata["description"]) == (7.0, "two (x)")
+    for address in (data, tmp_path / "a.hdr"):
+        ours = open_envi_cube(address)
+        assert_same(ours, values, code, order)
+        assert (ours.header.interleave, ours.header.nodata, ours.notes) == (interleave, 7.0, ())
+        np.testing.assert_array_equal(ours.header.wavelength_nm, NM)
+        np.testing.assert_array_equal(ours.header.fwhm_nm, WIDTHS)
+        assert ours.header.fields["description"] == "two (x)"
 
 
 def in_blocks(values: NDArray[Any]) -> Iterator[tuple[int, NDArray[Any]]]:
@@ -175,32 +187,95 @@ def test_bytes_between_frames_are_refused_by_both(tmp_path: Path, says: str, wor
 
 
 @pytest.mark.parametrize("interleave", INTERLEAVES)
-def test_cut_off_files_differ_on_purpose(tmp_path: Path, interleave: str) -> None:
-    """SPy does not open a file that is cut off; here the lines that are whole in all bands are kept and flagged."""
-    header, values = written_by_spy(tmp_path, 12, interleave, "little")
-    data = header.with_suffix(".img")
-    row = SHAPE[1] * 2
-    data.write_bytes(data.read_bytes()[: -row * (1 if interleave == "bsq" else SHAPE[2])])
-    with pytest.raises((EOFError, ValueError, IndexError)):  # which of them depends on the interleave
-        as_spy_reads(header)[-1]
-    found = open_envi_cube(header)
-    assert found.lost_lines == 1
-    np.testing.assert_array_equal(found.values, values[:5])
-    assert "a.img is cut off: 5 of 6 lines are whole" in found.notes
+@pytest.mark.parametrize(("dtype", "nodata"), [("<u2", None), (">u2", 0.0), ("<f4", float("nan")), ("<f4", -9999.5)])
+def test_rasterio_reads_the_same(tmp_path: Path, interleave: str, dtype: str, nodata: float | None) -> None:
+    """GDAL's reader agrees on values, bands, nodata and wavelengths."""
+    rasterio = pytest.importorskip("rasterio")
+    code = next(code for code, name in DATA_TYPES.items() if name == dtype[1:])
+    values, box = numbers(code), GeoBox.from_bbox(BOX, crs="EPSG:32632", resolution=0.5)
+    file = EnviFile(SHAPE, dtype, interleave, np.array(NM), np.array(WIDTHS), nodata=nodata, geobox=box)
+    with rasterio.open(write_envi(tmp_path / "a.hdr", file, in_blocks(values))) as found:
+        np.testing.assert_array_equal(np.moveaxis(found.read(), 0, -1), values)
+        assert found.count == 5
+        assert found.nodata == pytest.approx(nodata, nan_ok=True)
+        assert float(found.tags(3)["wavelength"]) == NM[2]
 
 
-@pytest.mark.parametrize("order", ORDERS)
-@pytest.mark.parametrize("interleave", INTERLEAVES)
-@pytest.mark.parametrize("code", [1, 2, 3, 4, 5, 6, 9, 12, 13])
-def test_gdal_reads_the_same(tmp_path: Path, code: int, interleave: str, order: str) -> None:
-    """GDAL agrees on what SPy and this project write (of 64-bit whole numbers older releases know nothing)."""
-    rasterio = pytest.importorskip("rasterio", reason="GDAL comes with rasterio: pip install 'spectralzoom[geo]'")
-    header, values = written_by_spy(tmp_path, code, interleave, order)
-    shifted(header, 16)
-    ours = tmp_path / "b.hdr"
-    kind = np.dtype(ORDERS[order] + DATA_TYPES[code])
-    write_envi(ours, EnviFile(SHAPE, kind.str, interleave), in_blocks(values))
-    for data in (header.with_suffix(".img"), ours.with_suffix(".img")):
-        with rasterio.open(data, driver="ENVI") as found:
-            np.testing.assert_array_equal(np.moveaxis(found.read(), 0, -1), values)
-        np.testing.assert_array_equal(open_envi_cube(data).values, values)
+@pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:25832", "EPSG:3035", "EPSG:32733", "EPSG:2056"])
+def test_map_info_puts_the_image_where_it_lies(tmp_path: Path, crs: str) -> None:
+    """UTM of either half of the earth and other projections: rasterio finds CRS and transform again."""
+    rasterio = pytest.importorskip("rasterio")
+    box = GeoBox.from_bbox(BOX, crs=crs, resolution=0.5)
+    file = EnviFile(SHAPE, "<f4", geobox=box)
+    with rasterio.open(write_envi(tmp_path / "a.hdr", file, in_blocks(np.zeros(SHAPE, np.float32)))) as found:
+        assert found.crs.to_epsg() == int(crs.removeprefix("EPSG:"))
+        assert found.transform == box.affine
+
+
+def test_a_large_cube_is_written_in_little_memory(tmp_path: Path) -> None:
+    """Memory follows the block, not the file: 500 lines of 160 kB stay within three blocks of 64."""
+    shape = (500, 400, 200)
+    block = np.ones((64, *shape[1:]), np.uint16)
+    blocks = ((first, block[: min(64, shape[0] - first)]) for first in range(0, shape[0], 64))
+    tracemalloc.start()
+    data = write_envi(tmp_path / "a.hdr", EnviFile(shape, "<u2"), blocks)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert data.stat().st_size == 2 * int(np.prod(shape))
+    assert peak < 3 * block.nbytes
+
+
+def test_another_order_of_bands_replaces_the_first(tmp_path: Path) -> None:
+    """Exported again, a pair has the new order, and no file of the old one stays to be taken for it."""
+    values = numbers(12)
+    for interleave in ("bsq", "bil"):
+        write_envi(tmp_path / "a.hdr", EnviFile(SHAPE, "<u2", interleave), in_blocks(values))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.hdr", "a.img"]
+    np.testing.assert_array_equal(open_envi_cube(tmp_path / "a.hdr").values, values)
+
+
+def test_a_header_never_stands_beside_other_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Killed between the two renames, the pair has no header and says so; it does not read wrongly."""
+    write_envi(tmp_path / "a.hdr", EnviFile(SHAPE, "<u2", "bsq"), in_blocks(numbers(12)))
+    real = Path.replace
+
+    def killed(self: Path, target: Path) -> Path:
+        if self.suffix == ".hdr":
+            raise KeyboardInterrupt
+        return real(self, target)
+
+    monkeypatch.setattr(Path, "replace", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write_envi(tmp_path / "a.hdr", EnviFile(SHAPE, "<u2", "bil"), in_blocks(numbers(12)))
+    with pytest.raises(SceneError, match="no header beside"):
+        open_envi_cube(tmp_path / "a.img")
+
+
+@pytest.mark.parametrize(
+    ("blocks", "words"),
+    [
+        ([(0, np.zeros((5, 7, 5)))], "5 of 6 lines were given"),
+        ([(0, np.zeros((7, 7, 5)))], "do not follow 0"),
+        ([(1, np.zeros((5, 7, 5)))], "do not follow 0"),
+        ([(0, np.zeros((6, 5, 7)))], "do not follow 0"),
+    ],
+)
+def test_blocks_that_do_not_fill_the_file_leave_nothing(tmp_path: Path, blocks: Any, words: str) -> None:
+    """Missing, shifted or turned blocks are refused, and no file is left."""
+    with pytest.raises(ShapeError, match=words):
+        write_envi(tmp_path / "a.hdr", EnviFile(SHAPE, "<f4"), iter(blocks))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_envi_cannot_say_is_refused() -> None:
+    """Types and orders that it has no word for, wavelengths of other bands, and grids without north up or a CRS."""
+    with pytest.raises(ShapeError, match="ENVI has no float16"):
+        header_text(EnviFile(SHAPE, "<f2"))
+    with pytest.raises(ShapeError, match="in order 'bli'"):
+        header_text(EnviFile(SHAPE, "<f4", "bli"))
+    with pytest.raises(ShapeError, match="wavelength has shape"):
+        header_text(EnviFile(SHAPE, "<f4", wavelength_nm=np.array(NM[:2])))
+    box = GeoBox.from_bbox(BOX, crs="EPSG:32632", resolution=0.5)
+    for wrong in (box.rotate(10), box.flipy(), GeoBox(box.shape, box.affine, None)):
+        with pytest.raises(PoseError, match="north up and a CRS"):
+            header_text(EnviFile(SHAPE, "<f4", geobox=wrong))

@@ -1,4 +1,4 @@
-"""The stored map: what was written comes back, areas in hectares too, and wrong blocks are refused."""
+"""Stored maps: what was written comes back, in blocks or at once, areas in hectares too; wrong blocks are refused."""
 
 from __future__ import annotations
 
@@ -13,14 +13,20 @@ from pyproj import CRS
 
 from pipeline.errors import ChunkError, IncompleteStoreError, PoseError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
-from storage.arrays.class_maps import ClassNames
-from storage.arrays.ground_maps import (
+from storage.arrays.class_maps import (
     BLOCK,
     ON_THE_MAP,
+    ClassMap,
+    ClassNames,
     GroundMapWriter,
+    clear_classes,
+    create_class_map,
+    load_class_map,
     load_geobox,
     load_ground_map,
     map_attributes,
+    write_class_map,
+    write_class_tile,
     write_map_coordinates,
 )
 from storage.arrays.layout import SHARD_COLUMNS, SHARD_ROWS, AngularGrid, create_group, write_image
@@ -203,3 +209,100 @@ def test_a_grid_without_a_crs_is_no_map() -> None:
     for geobox in (GeoBox(box().shape, box().affine, None), box().rotate(20)):
         with pytest.raises(PoseError, match="needs a CRS and a grid along its axes"):
             map_attributes(geobox)
+
+
+# --- class maps on the grid of a mosaic ---------------------------------------------------------------------------
+
+SHAPE = (150, 700)
+
+
+def _contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def _drawn() -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(0)
+    classes = rng.integers(0, 2, SHAPE).astype(np.uint8)
+    classes[:70, :40] = 255
+    return classes, np.where(classes == 255, np.nan, rng.random(SHAPE)).astype(np.float32)
+
+
+def test_tiles_in_any_order_are_the_map_at_once(tmp_path: Path) -> None:
+    """Not a byte tells whether a map was written at once or in whole shards."""
+    (classes, confidence), grid = _drawn(), AngularGrid(1e-4, SHAPE)
+    write_class_map(tmp_path / "one.zarr", ClassMap(classes, confidence, LEGEND.names, LEGEND.colours, grid))
+    create_class_map(tmp_path / "tiles.zarr", SHAPE, LEGEND, grid=grid)
+    begun = load_class_map(tmp_path / "tiles.zarr")
+    assert (begun.classes == 255).all()  # what is not written yet
+    assert np.isnan(begun.confidence).all()
+    for rows, columns in [((64, 150), (640, 700)), ((0, 64), (0, 700)), ((64, 150), (0, 640))]:
+        part = np.s_[slice(*rows), slice(*columns)]
+        write_class_tile(tmp_path / "tiles.zarr", (rows[0], columns[0]), classes[part], confidence[part])
+    assert _contents(tmp_path / "one.zarr") == _contents(tmp_path / "tiles.zarr")
+
+
+@pytest.mark.parametrize(
+    ("origin", "shape", "error", "words"),
+    [
+        ((32, 0), (64, 700), ChunkError, "rows 32:96 split the class map's shards of 64 rows"),
+        ((0, 0), (64, 320), ChunkError, "columns 0:320 split the class map's shards of 640 columns"),
+        ((128, 0), (64, 640), ShapeError, r"rows 128:192 are not all in the class map of \(150, 700\)"),
+    ],
+)
+def test_tiles_that_do_not_fit_are_refused(
+    tmp_path: Path, origin: tuple[int, int], shape: tuple[int, int], error: type[Exception], words: str
+) -> None:
+    """The message names the rows or columns."""
+    create_class_map(tmp_path / "c.zarr", SHAPE, LEGEND)
+    with pytest.raises(error, match=words):
+        write_class_tile(tmp_path / "c.zarr", origin, np.zeros(shape, np.uint8), np.zeros(shape, np.float32))
+
+
+def test_what_a_tile_lacks_is_told(tmp_path: Path) -> None:
+    """A class without a name, a confidence of another size, colours that are missing, and a map that is not there."""
+    create_class_map(tmp_path / "c.zarr", (20, 30), LEGEND)
+    ones = np.ones((20, 30), np.uint8)
+    with pytest.raises(ShapeError, match="class 2 is in the map, but only 2 classes have names"):
+        write_class_tile(tmp_path / "c.zarr", (0, 0), 2 * ones, ones.astype(np.float32))
+    with pytest.raises(ShapeError, match=r"confidence \(19, 30\) do not fit"):
+        write_class_tile(tmp_path / "c.zarr", (0, 0), ones, ones[1:].astype(np.float32))
+    with pytest.raises(ShapeError, match="2 names and 1 colours do not fit"):
+        create_class_map(tmp_path / "d.zarr", (20, 30), ClassNames(LEGEND.names, LEGEND.colours[:1]))
+    with pytest.raises(IncompleteStoreError, match=r"none\.zarr cannot be read"):
+        write_class_tile(tmp_path / "none.zarr", (0, 0), ones, ones.astype(np.float32))
+
+
+def test_classes_are_taken_from_pixels_and_from_no_other(tmp_path: Path) -> None:
+    """In whichever shards they lie; a map of which none is taken keeps its bytes."""
+    classes, confidence = _drawn()
+    write_class_map(tmp_path / "m.zarr", ClassMap(classes, confidence, LEGEND.names, LEGEND.colours))
+    before, where = _contents(tmp_path / "m.zarr"), np.zeros(SHAPE, np.bool_)
+    clear_classes(tmp_path / "m.zarr", where)
+    assert _contents(tmp_path / "m.zarr") == before
+    where[60:70, 630:650], where[149, 699] = True, True
+    clear_classes(tmp_path / "m.zarr", where)
+    found = load_class_map(tmp_path / "m.zarr")
+    np.testing.assert_array_equal(found.classes, np.where(where, 255, classes))
+    np.testing.assert_array_equal(found.confidence, np.where(where, np.nan, confidence))
+
+
+def test_class_map_round_trip(tmp_path: Path) -> None:
+    """Classes, names and colours come back; xarray reads the CF flags and masks what has no class."""
+    classes = np.random.default_rng(0).integers(0, 3, (50, 70), dtype=np.uint8)
+    classes[0, :9] = 255
+    confidence = np.where(classes == 255, np.nan, 0.75).astype(np.float32)
+    colours = np.array([[0, 0, 0], [0, 255, 0], [255, 0, 0]], np.uint8)
+    write_class_map(
+        tmp_path / "c.zarr",
+        ClassMap(classes, confidence, ("bare soil", "crop", "weed"), colours, AngularGrid(1e-4, (50, 70))),
+    )
+    found = load_class_map(tmp_path / "c.zarr")
+    np.testing.assert_array_equal(found.classes, classes)
+    np.testing.assert_array_equal(found.colours, colours)
+    assert found.names == ("bare soil", "crop", "weed")
+    with xr.open_zarr(tmp_path / "c.zarr", consolidated=False) as data:
+        assert data["classes"].attrs["flag_meanings"] == "bare_soil crop weed"
+        assert data["classes"].attrs["flag_values"] == [0, 1, 2]
+        assert int(data["classes"].isnull().sum()) == 9
+    with pytest.raises(ShapeError, match="class 2 is in the map, but only 2 classes"):
+        write_class_map(tmp_path / "d.zarr", ClassMap(classes, confidence, ("a", "b"), colours[:2]))
