@@ -20,8 +20,8 @@ from flows.settings.values import parse_moment, parse_text, to_whole, unit_guess
 from models.network.sizes import TRAINED_VGG_FROM, VGG_FROM
 from pipeline.errors import BudgetError, PoseError, SettingsError
 from pipeline.rig.device_settings import MOST_PAIRS
+from pipeline.setting_fields import number_words, span_of
 from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, REMOVED_LAW
-from pipeline.stated import number_words, span_of
 from storage.archive.staging import read_toml
 
 

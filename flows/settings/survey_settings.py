@@ -31,9 +31,9 @@ from pipeline.geometry.scan import CostModel
 from pipeline.ground.view import RigPose
 from pipeline.rectify.kernels import Kernel
 from pipeline.rig.device_settings import SurveyRig
+from pipeline.setting_fields import stated
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
 from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES, FARM_SHAPE, USUAL_DAY, USUAL_HOUR
-from pipeline.stated import stated
 from storage.parallel.crew import Crew
 
 BUILT_IN_SCENES = FARM_NAMES

@@ -14,11 +14,11 @@ from typing import Annotated
 from pydantic import ByteSize, PlainValidator, TypeAdapter, ValidationError
 
 from pipeline.errors import BudgetError, SettingsError
+from pipeline.setting_fields import number_words
 from pipeline.simulator.effects.probe import Unit
 from pipeline.simulator.effects.registry import BY_NAME
 from pipeline.simulator.scenes.farm.farm_scene import refuse_removed
 from pipeline.simulator.selection.choice import named_effects
-from pipeline.stated import number_words
 from storage.archive.staging import is_name
 from storage.parallel.crew import Crew
 

@@ -6,13 +6,15 @@ Positions along the line and along the scan are in px: one IFOV in the tangent p
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
-from pipeline.stated import assumed, stated
+from pipeline.setting_fields import assumed, stated
 
+Number = TypeVar("Number", float, NDArray[np.float64])
 ONE_DRAW_READ_NOISE_E = 10.0
 LARGEST_SUM_DN = 65535
 
@@ -60,6 +62,10 @@ class LineCamera:
     def frame_ms(self) -> float:
         """Frame period: exposure and readout, never above the highest rate (erratum E13)."""
         return max(self.exposure_ms + self.readout_ms, 1000.0 / self.max_rate_hz)
+
+    def mid_exposure_s(self, line: Number) -> Number:
+        """Time of mid exposure of lines by their number, since the first one began [s]."""
+        return (line * self.frame_ms + self.exposure_ms / 2) * 1e-3
 
     def scan_seconds(self, lines: int) -> float:
         """Time to take ``lines`` lines in one uninterrupted sweep [s] (the paper's t_img = N t_frame)."""

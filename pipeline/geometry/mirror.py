@@ -5,7 +5,7 @@ of the plane of incidence. Scene tangents are xi = o_y / o_x (along the line) an
 reports the point, in units of tan 50 deg, where a ray falling along the rest normal would go (position (0, 0) is rest).
 
 float32 arrays stay float32, as devices keep them; everything else is worked out in float64. What the paper prints
-instead is in :mod:`pipeline.geometry.paper_equations`, and the errata E1 to E18 are told in ERRATA.md.
+instead is in :mod:`pipeline.geometry.paper_equations`, and the errata E1 to E18 are told in docs/errata.md.
 """
 
 from __future__ import annotations
@@ -173,6 +173,8 @@ def line_centre(along: Floats, scan: Floats, across: ArrayLike) -> Floats:
 
 def camera_slope(along: Floats, scan: Floats, across: ArrayLike, centre: Floats) -> Floats:
     """Give the slope k_y / k_z of the camera ray that the mirror, aimed at (across, centre), sends to each point.
+
+    With :func:`line_centre` it undoes the turn of the lines.
 
     The reflection of the ray (1, along, scan) in the normal c - k0, written out for the unit vector c to the line's
     centre. All are tangents; ``centre`` is that of :func:`line_centre`, the point's own line.

@@ -23,7 +23,7 @@ from pipeline.geometry.mirror import (
     position_to_direction,
     scene_to_direction,
 )
-from pipeline.stated import stated
+from pipeline.setting_fields import stated
 
 Axis = Literal["x", "y"]
 Floats = NDArray[np.float64]

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import PoseError, ShapeError
-from pipeline.stated import misfits, stated
+from pipeline.setting_fields import misfits, stated
 
 Floats = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from typing import Literal, get_args
 from pipeline.errors import SettingsError
 from pipeline.geometry.mirror import STRAIGHT, Axes, Mounting
 from pipeline.geometry.scan import CostModel, Ends
-from pipeline.stated import assumed, check_stated, stated
+from pipeline.setting_fields import assumed, check_stated, stated
 
 ReadBack = Literal["none", "sampled", "all"]
 Pulses = Literal["position", "frame", "none"]

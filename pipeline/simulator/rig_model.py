@@ -12,7 +12,7 @@ from typing import Literal
 
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
-from pipeline.stated import assumed, check_stated, stated
+from pipeline.setting_fields import assumed, check_stated, stated
 
 Coating = Literal["aluminium", "gold", "silver", "ideal"]  # ideal: reflects everything, at any angle
 Relief = Literal["flat", "step", "plane"]

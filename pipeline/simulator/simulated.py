@@ -99,7 +99,7 @@ class SimulatedSource:
                 data=data,
                 mirror_x=float(middle[number, 0]),
                 mirror_y=float(middle[number, 1]),
-                time_s=(number * camera.frame_ms + camera.exposure_ms / 2) * 1e-3,
+                time_s=camera.mid_exposure_s(number),
                 exposure_ms=camera.exposure_ms,
             )
             for number, data in zip(numbers, self.render(sweep, numbers), strict=True)
@@ -137,8 +137,7 @@ class SimulatedSweep:
     @property
     def time_s(self) -> NDArray[np.float64]:
         """(line,) of mid exposure, since the start of the sweep [s]."""
-        camera = self.source.camera
-        return (np.arange(self.sweep.lines, dtype=np.float64) * camera.frame_ms + camera.exposure_ms / 2) * 1e-3
+        return self.source.camera.mid_exposure_s(np.arange(self.sweep.lines, dtype=np.float64))
 
     @property
     def valid_line(self) -> NDArray[np.bool_]:

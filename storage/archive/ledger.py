@@ -20,8 +20,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from pipeline.checked_lines import read_checked, with_check
 from pipeline.errors import ArchiveError
+from pipeline.json_lines import read_checked, with_check
 from storage.archive.staging import is_name, open_plain, read_plain, refusals, sync_path
 
 FOLDER = "schedule"

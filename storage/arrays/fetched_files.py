@@ -25,9 +25,9 @@ from pathlib import Path
 from typing import BinaryIO
 from urllib.parse import quote
 
-from pipeline.checked_lines import read_checked, with_check
+from pipeline.json_lines import read_checked, with_check
 from pipeline.rig.devices import NotKept
-from storage.archive.staging import open_plain, plain_reader, plain_size, read_plain, sync_path
+from storage.archive.staging import disk_advice, open_plain, plain_reader, plain_size, read_plain, sync_path
 
 SYNC_BYTES = 1 << 24
 SUMS = "%sums"  # which no quoted name ends with
@@ -105,8 +105,8 @@ class FetchedFiles:
         except OSError as error:
             _cut(path, before)
             raise NotKept(
-                f"cannot keep byte {before} of {name} in {self.folder}: {error.strerror or error}; free space or "
-                f"rights and run again: the {before} bytes before it are kept, and the camera still has the file"
+                f"cannot keep byte {before} of {name} in {self.folder}: {disk_advice(error)}; the {before} bytes "
+                "before it are kept, and the camera still has the file"
             ) from error
 
     def drop(self, name: str) -> None:

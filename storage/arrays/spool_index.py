@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from pipeline.checked_lines import CheckedLine, read_checked, with_check
+from pipeline.json_lines import CheckedLine, read_checked, with_check
 from pipeline.source import Line
 from storage.archive.keys import plain
 

@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from pipeline.checked_lines import read_checked
+from pipeline.json_lines import read_checked
 from pipeline.rig.capture import JOURNAL
 from storage.archive.ledger import FOLDER, SUFFIX
 from storage.archive.staging import NotPlainError, kind_of, plain_reader, read_plain

@@ -84,3 +84,15 @@ def test_a_block_that_does_not_work_is_found(language: str, text: str, mark: str
     block = Block(DOCS / "index.md", 1, language, text, mark)
     with pytest.raises(Exception, match=words):
         Reader(tmp_path).follow(block)
+
+
+def test_rooms_of_the_table_are_those_of_the_tree() -> None:
+    """Every folder named in the first table of architecture is there, and no room is left out."""
+    rows = re.findall(r"^\| `(\w+)` \| (.*) \|$", (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8"), re.M)
+    assert [top for top, _ in rows] == ["pipeline", "models", "storage", "flows"]
+    for top, words in rows:
+        there = {path.name for path in (ROOT / top).rglob("*/") if not path.name.startswith("__")}
+        named = set(re.findall(r"`(\w+)`", words))
+        first = {path.name for path in (ROOT / top).iterdir() if (path / "__init__.py").is_file()}
+        assert named <= there
+        assert first <= named | {"shipped"}

@@ -24,7 +24,7 @@ from pipeline.rig.device_settings import CameraAddress, ControlPatience, FileSer
 from pipeline.rig.mirror.mirror_controller import open_mirror
 from pipeline.rig.rig_check import CheckRow, check_camera, check_mirror
 from tests.faults.fault_table import Clock, Row, told_wrong
-from tests.rig.camera.hostile_camera import (
+from tests.pipeline.rig.camera.hostile_camera import (
     REPLIES,
     Answers,
     Hostile,
@@ -34,8 +34,8 @@ from tests.rig.camera.hostile_camera import (
     flood,
     trickled,
 )
-from tests.rig.chaos_line import Mangler
-from tests.rig.chaotic_surveys import is_message, survey_in_chaos
+from tests.pipeline.rig.chaos_line import Mangler
+from tests.pipeline.rig.chaotic_surveys import is_message, survey_in_chaos
 
 FULL_S, QUICK_S = 600.0, 6.0  # both devices together
 SURVEYS, FEW_SURVEYS = 100, 4

@@ -44,7 +44,7 @@ LOOK_S = 300.0
 LONGEST_LIFE_S = 4.0  # of a survey that is killed
 DEVICES = {"mirror": f"/{LINK}", "camera": "127.0.0.1:"}  # as a reason names them
 CABLE = ("went away", "no connection to", "no answer", "hung up")
-FULL = ("disk is full", "No space left")
+FULL = "disk is full"
 
 
 @dataclass
@@ -214,7 +214,7 @@ def judged(
 ) -> list[Row]:
     """A row for each demand, and whether it was met."""
     wanted, grown, struck = Counter(day.planned), Growth.of(day.samples), day.struck
-    disks, refused = account.failed_by(*FULL), sum(any(one in words for one in FULL) for words in day.told)
+    disks, refused = account.failed_by(FULL), sum(FULL in words for words in day.told)
     again, gone = account.after_kills(struck["kill"])
     named = {which: sum(account.names(*run, name, CABLE) for run in struck[which]) for which, name in DEVICES.items()}
     pulls = {which: len(struck[which]) for which in DEVICES}

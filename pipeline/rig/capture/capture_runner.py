@@ -20,10 +20,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.checked_lines import read_checked, with_check
 from pipeline.errors import RigError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
+from pipeline.json_lines import read_checked, with_check
 from pipeline.rig.camera.camera_files import Kept
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.capture import JOURNAL

@@ -291,12 +291,11 @@ class RigSource:
 
     def _time_s(self, sweep: Sweep, number: int, stamp_us: int) -> float:
         """Of mid exposure since the sweep's first line began, by the camera's stamps; by its rate without them."""
-        half_s = self.camera.exposure_ms / 2 * 1e-3
         known = stamp_us >= 0
         origin = self._journal.origin_us(sweep, stamp_us if known and number == 0 else None)
         if known and origin is not None:
-            return (stamp_us - origin) * 1e-6 + half_s
-        return number * self.camera.frame_ms * 1e-3 + half_s
+            return (stamp_us - origin) * 1e-6 + self.camera.mid_exposure_s(0.0)
+        return self.camera.mid_exposure_s(float(number))
 
     def _give_up(self, taken: CaptureRecord, line: int, why: str, *, last: bool) -> None:
         """Expect no more of a capture: what it lacks is captured again, unless that has been tried already."""

@@ -139,8 +139,7 @@ class SweepBlock:
     @property
     def time_s(self) -> Floats:
         """(line,) of mid exposure, since the survey's start [s]."""
-        camera = self.rig.camera
-        return self.started_s + (self.numbers.astype(np.float64) * camera.frame_ms + camera.exposure_ms / 2) * 1e-3
+        return self.started_s + self.rig.camera.mid_exposure_s(self.numbers.astype(np.float64))
 
     @cached_property
     def positions(self) -> Floats:

@@ -322,7 +322,7 @@ def test_full_disk_anywhere_in_a_survey(
     with FullDisk(out, int(share * writes)) as disk:
         ended = command_line(*survey_words(FULL_WORDS, str(out)))
     assert disk.writes > int(share * writes)
-    ended.refused(1, "the disk is full: free some space|No space left on device; free space")
+    ended.refused(1, "the disk is full: free some space")
     archive = Archive.open(out)
     published = {ref.uri: contents(ref.path) for ref in archive.refs()}
     assert [finding.problem for finding in verify_archive(archive) if finding.problem] == []

@@ -153,7 +153,8 @@ def test_fields_are_asked_for_by_archive_and_day(field_file: Callable[..., Path]
     """One archive given for all wins; each due time is a visit, and the farm is as on that day."""
     files = [field_file("north"), field_file("south", out=str(tmp_path / "other"))]
     assert [Path(one.settings.out).name for one in load_fields(files)] == ["archive", "other"]
-    assert {one.settings.out for one in load_fields(files, "all")} == {"all"}
+    given = str(tmp_path / "all")
+    assert {one.settings.out for one in load_fields(files, given)} == {given}
     due = datetime(2026, 2, 1, 23, 30, tzinfo=UTC)
     one = ServedField("farm", Path("farm.toml"), Settings(scene="farm@2"))
     berlin = parse_timetable("30 0 * * *", None, "Europe/Berlin")

@@ -25,7 +25,7 @@ from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock, ServedRig
 from pipeline.rig.emulator.fault_names import make_fault
 from pipeline.rig.mirror.pro_mode import Command
 from tests.flows.conftest import CommandLine
-from tests.rig.small_rig import small_source
+from tests.pipeline.rig.small_rig import small_source
 
 SETS = {Command.SET_VALUE, Command.SET_VALUES, Command.SET_VECTOR}
 NOWHERE = "127.0.0.1:1:1"

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from pipeline.errors import PoseError, ShapeError
 from pipeline.ground.view import LEAST_SINK, GroundView, RigPose, pixel_places
-from pipeline.stated import span_of
+from pipeline.setting_fields import span_of
 
 IFOV = 7.4e-3 / 70
 

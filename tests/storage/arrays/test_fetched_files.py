@@ -67,7 +67,7 @@ def test_full_disk_keeps_what_there_was(tmp_path: Path, monkeypatch: pytest.Monk
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("storage.arrays.fetched_files.os.write", full)
-    with pytest.raises(NotKept, match=r"cannot keep byte 5 of /a/raw_0 .*No space left.*the 5 bytes before"):
+    with pytest.raises(NotKept, match=r"cannot keep byte 5 of /a/raw_0 .*the disk is full.*the 5 bytes before"):
         kept.append("/a/raw_0", b"torn")
     assert kept.read("/a/raw_0", 0, 99) == b"whole"
 

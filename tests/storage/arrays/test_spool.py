@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.checked_lines import with_check
 from pipeline.errors import RigError
+from pipeline.json_lines import with_check
 from pipeline.source import Line
 from storage.arrays.spool import Spool
 from tests.storage.small_archive import flip
@@ -232,7 +232,7 @@ def test_a_full_disk_keeps_the_lines_before(tmp_path: Path, monkeypatch: pytest.
     with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
         with monkeypatch.context() as patch:
             patch.setattr(os, "write", half)
-            with pytest.raises(RigError, match=r"cannot write line 5.*No space left.*the 5 lines before it are kept"):
+            with pytest.raises(RigError, match=r"cannot write line 5.*the disk is full.*the 5 lines before it"):
                 spool.append(_line(5))
         spool.append(_line(5))
         assert _same(next(spool.blocks()))

@@ -13,7 +13,7 @@ from pipeline.rig.capture.capture_paths import CaptureRecord
 from pipeline.rig.capture.capture_runner import CaptureJournal
 from pipeline.rig.capture.line_positions import LinePositions
 from tests.faults.growing_files import flip_journal
-from tests.rig.small_rig import COARSE, FINE
+from tests.pipeline.rig.small_rig import COARSE, FINE
 
 ONE = CaptureRecord(FINE, 0, 5, "/captured/a", True, (0.0, 0.1), (0.1, 0.2))
 OTHER = replace(ONE, folder="/captured/b", first=3, stop=9)

@@ -13,7 +13,7 @@ from pipeline.rig.camera.headwall_camera import CaptureUnknown, HeadwallCamera
 from pipeline.rig.camera.headwall_replies import ReplyReader
 from pipeline.rig.device_settings import ControlPatience, FileServer
 from pipeline.rig.devices import Clock, DeviceGone, DeviceRefused, ManualClock, StateUnknown
-from tests.rig.scripted import Late, Pair, Reply, ScriptedTransport
+from tests.pipeline.rig.scripted import Late, Pair, Reply, ScriptedTransport
 
 HELLO = b"Hyperspec\r\nhpi> "
 

@@ -23,8 +23,8 @@ from pipeline.rig.mirror.registers import Trigger
 from pipeline.rig.transports import SocketTransport
 from pipeline.simulator.effects.registry import QUIET
 from pipeline.simulator.simulated import SimulatedSource
-from tests.rig.camera.camera_line import wait_for
-from tests.rig.small_rig import CAMERA, COARSE, FINE, small_source
+from tests.pipeline.rig.camera.camera_line import wait_for
+from tests.pipeline.rig.small_rig import CAMERA, COARSE, FINE, small_source
 
 MOST_S = 60.0
 

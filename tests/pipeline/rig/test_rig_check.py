@@ -23,7 +23,7 @@ from pipeline.rig.mirror.path_player import MotionLog
 from pipeline.rig.mirror.pro_mode import Command
 from pipeline.rig.mirror.registers import Status
 from pipeline.rig.rig_check import SQUARE, CheckRow, check_camera, check_mirror, failed, works
-from tests.rig.small_rig import FINE, small_source
+from tests.pipeline.rig.small_rig import FINE, small_source
 
 SETS = {Command.SET_VALUE, Command.SET_VALUES, Command.SET_VECTOR}
 

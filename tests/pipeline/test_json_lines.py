@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.checked_lines import read_checked, with_check
+from pipeline.json_lines import read_checked, with_check
 
 values = st.one_of(
     st.text(max_size=12), st.floats(allow_nan=False), st.booleans(), st.integers(), st.lists(st.integers(), max_size=3)

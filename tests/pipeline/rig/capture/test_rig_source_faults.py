@@ -15,7 +15,7 @@ from pipeline.rig.capture import JOURNAL
 from pipeline.rig.devices import DeviceGone, DeviceRefused, StateUnknown
 from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults, make_fault
 from pipeline.source import Line
-from tests.rig.small_rig import COARSE, FINE, SmallRig, assert_simulated, small_rig, small_source
+from tests.pipeline.rig.small_rig import COARSE, FINE, SmallRig, assert_simulated, small_rig, small_source
 
 
 def assert_same(found: list[Line], first: int = 0) -> None:

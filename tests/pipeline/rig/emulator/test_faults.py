@@ -11,7 +11,7 @@ from pipeline.rig.emulator.mirror_device import MirrorDevice, Mode, VanishedErro
 from pipeline.rig.emulator.mirror_faults import LATE_S, SLOW_S, TICK_S
 from pipeline.rig.mirror.pro_mode import ErrorCode, Frame, ask_status, encode, float_cell, get_value, refuse, set_vector
 from pipeline.rig.mirror.registers import VECTOR_MEMORY, Status, X
-from tests.rig.mirror.mirror_bytes import ASK_FIRMWARE, set_value
+from tests.pipeline.rig.mirror.mirror_bytes import ASK_FIRMWARE, set_value
 
 CODES = {
     "error-frame": ErrorCode.FRAME_INVALID,

@@ -40,7 +40,7 @@ from pipeline.rig.mirror.registers import (
     Y,
     log_slot,
 )
-from tests.rig.mirror.mirror_bytes import set_value
+from tests.pipeline.rig.mirror.mirror_bytes import set_value
 
 STIFF = Stiffness(20.0, 0.7)
 

@@ -15,9 +15,9 @@ from pipeline.rig.devices import ManualClock
 from pipeline.rig.emulator.camera_device import CameraDevice, CameraUnit
 from pipeline.rig.emulator.camera_server import CameraServer
 from pipeline.rig.emulator.fault_names import CameraFault
-from tests.rig.camera.camera_line import LinesOf, control_of
-from tests.rig.chaos_line import ChaosLine
-from tests.rig.chaotic_surveys import survey_in_chaos
+from tests.pipeline.rig.camera.camera_line import LinesOf, control_of
+from tests.pipeline.rig.chaos_line import ChaosLine
+from tests.pipeline.rig.chaotic_surveys import survey_in_chaos
 
 DARK = "/captured/000000/darkReference"
 

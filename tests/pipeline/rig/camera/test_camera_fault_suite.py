@@ -24,8 +24,8 @@ from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults, make_fa
 from pipeline.rig.emulator.mirror_device import Fault
 from pipeline.rig.mirror.registers import Status
 from pipeline.source import Line
-from tests.rig.mirror.test_fault_suite import moves
-from tests.rig.small_rig import SmallRig, assert_simulated, small_rig
+from tests.pipeline.rig.mirror.test_fault_suite import moves
+from tests.pipeline.rig.small_rig import SmallRig, assert_simulated, small_rig
 
 SEEDS = range(20)
 SWEEP = Sweep("fine-5", "fine", "x", 1.5, -4.5, 7)

@@ -18,7 +18,15 @@ from pipeline.rig.capture.capture_runner import CaptureJournal
 from pipeline.rig.mirror.path_player import wire_positions
 from pipeline.rig.mirror.pro_mode import Command
 from pipeline.source import Line
-from tests.rig.small_rig import CAMERA, COARSE, FINE, assert_simulated, simulated_lines, small_rig, small_source
+from tests.pipeline.rig.small_rig import (
+    CAMERA,
+    COARSE,
+    FINE,
+    assert_simulated,
+    simulated_lines,
+    small_rig,
+    small_source,
+)
 
 
 def assert_same(found: list[Line], sweep: Sweep, first: int = 0) -> None:

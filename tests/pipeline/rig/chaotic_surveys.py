@@ -18,8 +18,8 @@ from pipeline.rig.device_settings import CameraAddress, ControlPatience, FileSer
 from pipeline.rig.devices import ManualClock
 from pipeline.rig.emulator.camera_server import CameraServer
 from pipeline.source import Line, References
-from tests.rig.chaos_line import OFTEN, ChaosLine
-from tests.rig.small_rig import COARSE, FINE, SmallRig, assert_simulated, small_rig
+from tests.pipeline.rig.chaos_line import OFTEN, ChaosLine
+from tests.pipeline.rig.small_rig import COARSE, FINE, SmallRig, assert_simulated, small_rig
 
 SWEEPS = (COARSE, FINE)
 QUICK = ControlPatience(0.3, 2, 0.01)

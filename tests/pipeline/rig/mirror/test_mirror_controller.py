@@ -18,9 +18,9 @@ from pipeline.rig.mirror import mirror_controller
 from pipeline.rig.mirror.mirror_controller import MirrorController, open_mirror
 from pipeline.rig.mirror.mirror_requests import Identity
 from pipeline.rig.mirror.registers import Status, Trigger
-from tests.rig.mirror import mirror_bytes as w
-from tests.rig.mirror.mirror_bytes import connected, pair
-from tests.rig.scripted import Late, Pair, ScriptedTransport, scripted
+from tests.pipeline.rig.mirror import mirror_bytes as w
+from tests.pipeline.rig.mirror.mirror_bytes import connected, pair
+from tests.pipeline.rig.scripted import Late, Pair, ScriptedTransport, scripted
 
 WRONG = pair(
     "7E 00 15 05 26 00 00 00 18 4D 59 7E",

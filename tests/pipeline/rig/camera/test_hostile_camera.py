@@ -13,7 +13,7 @@ from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.device_settings import CameraAddress, ControlPatience, FileServer
 from pipeline.rig.devices import DeadlinePassed, DeviceGone
 from pipeline.rig.rig_check import check_camera
-from tests.rig.camera.hostile_camera import Answers, HostileControl, HostileFiles, Pieces, flood, trickled
+from tests.pipeline.rig.camera.hostile_camera import Answers, HostileControl, HostileFiles, Pieces, flood, trickled
 
 STALL_S = 0.3
 FILE = RemoteFile("/captured/a/raw_0", None, False, most=1000)

@@ -19,7 +19,7 @@ from pipeline.rig.emulator.camera_device import CameraDevice, CameraUnit, FrameC
 from pipeline.rig.emulator.camera_server import CameraServer
 from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults
 from pipeline.rig.transports import SocketTransport
-from tests.rig.camera.camera_line import LinesOf, wait_for
+from tests.pipeline.rig.camera.camera_line import LinesOf, wait_for
 
 
 def remote_files(device: CameraDevice, folder: str) -> list[RemoteFile]:

@@ -24,7 +24,7 @@ from pipeline.rig.capture.capture_paths import (
 )
 from pipeline.rig.capture.line_positions import MirrorTrack
 from pipeline.rig.device_settings import check_capture
-from tests.rig.small_rig import CAMERA, COARSE, FINE
+from tests.pipeline.rig.small_rig import CAMERA, COARSE, FINE
 
 
 def test_prefix_of_a_sweep_is_readable() -> None:

@@ -7,7 +7,7 @@ from typing import Any
 from pipeline.rig.device_settings import MirrorSettings
 from pipeline.rig.mirror.mirror_controller import MirrorController
 from pipeline.rig.mirror.pro_mode import Command, Frame, Value, to_cell
-from tests.rig.scripted import Pair, ScriptedTransport
+from tests.pipeline.rig.scripted import Pair, ScriptedTransport
 
 
 def pair(sent: str, received: str) -> Pair:

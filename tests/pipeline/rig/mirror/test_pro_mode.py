@@ -39,7 +39,7 @@ from pipeline.rig.mirror.pro_mode import (
     values_reply,
 )
 from pipeline.rig.mirror.registers import FEEDBACK_X, FEEDBACK_Y, VECTOR_MEMORY, Status, VectorRegister, X, Y, log_slot
-from tests.rig.mirror.mirror_bytes import ASK_FIRMWARE, set_value
+from tests.pipeline.rig.mirror.mirror_bytes import ASK_FIRMWARE, set_value
 
 nasty = st.one_of(
     st.binary(max_size=50), st.lists(st.sampled_from([0x7D, 0x7E, 0x5D, 0x5E, 0]), max_size=50).map(bytes)

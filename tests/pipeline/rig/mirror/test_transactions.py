@@ -11,7 +11,7 @@ from pipeline.errors import RigError
 from pipeline.rig.device_settings import Patience
 from pipeline.rig.devices import DeadlinePassed, DeviceGone, ManualClock, StateUnknown
 from pipeline.rig.transports import Kind, Wire
-from tests.rig.scripted import Late, Pair, ScriptedTransport, scripted
+from tests.pipeline.rig.scripted import Late, Pair, ScriptedTransport, scripted
 
 
 def one_line(data: bytes) -> bytes | None:

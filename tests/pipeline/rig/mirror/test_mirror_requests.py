@@ -23,8 +23,8 @@ from pipeline.rig.mirror.mirror_requests import (
 )
 from pipeline.rig.mirror.pro_mode import cell_int, get_value
 from pipeline.rig.transports import Wire
-from tests.rig.mirror.mirror_bytes import CONNECT, ENTER, GREET, LEAVE, WELL, WHO, connected, set_value
-from tests.rig.scripted import Pair, Reply, ScriptedTransport, scripted
+from tests.pipeline.rig.mirror.mirror_bytes import CONNECT, ENTER, GREET, LEAVE, WELL, WHO, connected, set_value
+from tests.pipeline.rig.scripted import Pair, Reply, ScriptedTransport, scripted
 
 OTHER = bytes.fromhex("7E 00 13 0A 00 02 3F 00 00 00 BE 80 00 00 9B D7 7E")
 SET, DONE = bytes.fromhex("7E 00 10 06 50 02 3F 00 00 00 1E 88 7E"), bytes.fromhex("7E 00 10 00 0D C0 7E")
