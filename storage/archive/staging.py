@@ -174,14 +174,20 @@ def refusals(path: Path, doing: str) -> Iterator[None]:
     except OSError as error:
         named = error.filename
         elsewhere = isinstance(named, str) and Path(named).is_absolute() and not Path(named).is_relative_to(path)
-        if error.errno not in _ADVICE or elsewhere:
+        advice = disk_advice(error)
+        if advice is None or elsewhere:
             raise
-        raise ArchiveError(f"cannot {doing} {path}: {disk_advice(error)} (nothing published was changed)") from error
+        raise ArchiveError(f"cannot {doing} {path}: {advice} (nothing published was changed)") from error
 
 
-def disk_advice(error: OSError) -> str:
-    """What a refusal of the disk means and what to do about it."""
-    return _ADVICE.get(error.errno or 0) or f"{error.strerror or error}; free space or rights and run again"
+def disk_advice(error: OSError) -> str | None:
+    """What a refusal of the disk means and what to do about it; None where the error is another."""
+    return _ADVICE.get(error.errno or 0)
+
+
+def disk_words(error: OSError) -> str:
+    """`disk_advice`, or what the system says."""
+    return disk_advice(error) or f"{error.strerror or error}; free space or rights and run again"
 
 
 def remove_tree(path: Path) -> None:

@@ -27,7 +27,7 @@ from urllib.parse import quote
 
 from pipeline.json_lines import read_checked, with_check
 from pipeline.rig.devices import NotKept
-from storage.archive.staging import disk_advice, open_plain, plain_reader, plain_size, read_plain, sync_path
+from storage.archive.staging import disk_words, open_plain, plain_reader, plain_size, read_plain, sync_path
 
 SYNC_BYTES = 1 << 24
 SUMS = "%sums"  # which no quoted name ends with
@@ -105,7 +105,7 @@ class FetchedFiles:
         except OSError as error:
             _cut(path, before)
             raise NotKept(
-                f"cannot keep byte {before} of {name} in {self.folder}: {disk_advice(error)}; the {before} bytes "
+                f"cannot keep byte {before} of {name} in {self.folder}: {disk_words(error)}; the {before} bytes "
                 "before it are kept, and the camera still has the file"
             ) from error
 

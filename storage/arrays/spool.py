@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import RigError
 from pipeline.source import Line
-from storage.archive.staging import disk_advice, open_plain, plain_reader, read_plain, sync_path
+from storage.archive.staging import disk_words, open_plain, plain_reader, read_plain, sync_path
 from storage.arrays.spool_index import FORMAT, Head, SpoolEntry, difference, read_head
 
 SYNC_LINES = 64
@@ -295,7 +295,7 @@ def _refusals(path: Path, lines: int) -> Iterator[None]:
         raise
     except OSError as error:
         raise RigError(
-            f"cannot write line {lines} to {path}: {disk_advice(error)}; the {lines} lines before it are kept"
+            f"cannot write line {lines} to {path}: {disk_words(error)}; the {lines} lines before it are kept"
         ) from error
 
 

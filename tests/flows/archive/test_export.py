@@ -289,27 +289,28 @@ def _flip_classes(archive: Path, published: Published) -> None:
     flip(next(path for path in sorted(classes.rglob("*")) if path.is_file() and path.name != "zarr.json"), at=40)
 
 
-def _lose_mosaic(archive: Path, published: Published) -> None:
-    shutil.rmtree((archive / published.receipt["products"]["mosaic"]).parent)
-
-
 @pytest.mark.parametrize(
     ("spoil", "words"),
-    [
-        (_change_receipt, "is damaged: receipt.json has changed .*run verify"),
-        (_flip_classes, "ground_map.*classes"),
-        (_lose_mosaic, "the mosaic of run .* does not; run its survey again"),
-    ],
+    [(_change_receipt, "is damaged: receipt.json has changed .*run verify"), (_flip_classes, "ground_map.*classes")],
 )
 def test_what_cannot_be_believed_is_named_and_gives_no_image(
     posed: Exported, tmp_path: Path, spoil: Callable[[Path, Published], None], words: str
 ) -> None:
-    """A receipt that was changed, a flipped bit, a store that is gone: what it is, what to do, and no image of it."""
+    """A receipt that was changed, a flipped bit: what it is, what to do, and no image of it."""
     archive = Path(shutil.copytree(posed.archive, tmp_path / "field-a"))
     spoil(archive, posed.published)
     with pytest.raises(IncompleteStoreError, match=words):
         run_export(archive, posed.id, tmp_path / "out", envi=False, console=QUIET)
     assert not list((tmp_path / "out").rglob("*.tif"))
+
+
+def test_a_store_that_is_gone_is_named(posed: Exported, tmp_path: Path) -> None:
+    """Which product it is and what to do; what was written before it stays, and no catalogue names it."""
+    archive, out = Path(shutil.copytree(posed.archive, tmp_path / "field-a")), tmp_path / "out"
+    shutil.rmtree((archive / posed.published.receipt["products"]["mosaic"]).parent)
+    with pytest.raises(IncompleteStoreError, match=r"the mosaic of run .* does not; run its survey again"):
+        run_export(archive, posed.id, out, envi=False, console=QUIET)
+    assert not (out / "collection.json").exists()
 
 
 @pytest.mark.parametrize("package", ["rasterio", "pystac"])

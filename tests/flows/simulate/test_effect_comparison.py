@@ -22,7 +22,7 @@ from flows.survey.stages.effects import choose_effects, chosen_effects, load_man
 from pipeline.errors import BoundError, IncompleteStoreError
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.registry import BY_NAME, EFFECTS
-from pipeline.simulator.scenes.scene import RasterScene
+from pipeline.simulator.scenes.scene import SceneRaster
 from storage.archive.keys import StageRef
 
 ASKED = "rotation,vignetting,shot,read-noise"
@@ -236,7 +236,7 @@ def test_a_decision_that_is_there_draws_nothing(
         raise AssertionError("the scene was looked at")
 
     run = opened(scene_files, decided[0], budget="0.9", policy="random")
-    monkeypatch.setattr(RasterScene, "sample", refuse)
+    monkeypatch.setattr(SceneRaster, "thinned", refuse)
     monkeypatch.setattr(effect_choice, "probe_survey", refuse)
     assert choose(run) == decided[1]
 

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from flows.publish.receipt_table import print_effects
 from pipeline.simulator.effects.registry import EFFECTS
-from pipeline.simulator.scenes.scene import RasterScene
+from pipeline.simulator.scenes.scene import SceneRaster
 from pipeline.simulator.simulated import SimulatedSource
 
 ASKED = "rotation,vignetting,shot,read-noise"
@@ -56,7 +56,7 @@ def test_a_scan_that_is_there_draws_nothing(
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError("the scene was looked at")
 
-    monkeypatch.setattr(RasterScene, "sample", refuse)
+    monkeypatch.setattr(SceneRaster, "thinned", refuse)
     ended = command_line(*words(scene_files, archive))
     assert (ended.code, ended.out) == (0, "")
     for name in (
