@@ -4,7 +4,7 @@ PY ?= python3
 VENV ?= .venv
 ARCHIVE ?= archive
 SCENE ?= farm
-PYTEST_ARGS ?= -n 2
+PYTEST_ARGS ?= -n 3 --dist worksteal
 BENCH ?=
 BIN := $(VENV)/bin
 
