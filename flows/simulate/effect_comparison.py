@@ -228,8 +228,9 @@ class _Ways:
             sums.greatest = float(change[line, sample, band])
             sums.place = ViewPlace(sweep.name, lines[line], sample * sweep.binning, band)
         if change.max() > self.bound:  # what of it arithmetic may have made
-            share = misplaced_share(dict(self.exact.choice.effects), dict(self.chosen.choice.effects))
-            contrast = contrast_about(self.exact.block(sweep, lines), partial(expected_light, self.exact.scene))
+            block = self.exact.block(sweep, lines)
+            share = misplaced_share(block, dict(self.exact.choice.effects), dict(self.chosen.choice.effects))
+            contrast = contrast_about(block, partial(expected_light, self.exact.scene))
             misplaced = misplaced_electrons(both.exact, stored_mean(contrast, sweep.binning), share)
             change -= misplaced / self._unit(both, sweep)
         sums.unexplained = max(sums.unexplained, float(change.max()))

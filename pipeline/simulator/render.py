@@ -156,6 +156,15 @@ def _looker(
     return Looker(fold(box_of(slit, rig), box_parts(slit, rig, views), folded_positions(sweep, smear), together), views)
 
 
+def kernel_error(block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> float:
+    """Give by how much of a wave's amplitude the kernels of a choice's footprint are wrong at most."""
+    choice, normal = Choice.of(chosen), middle_normal(block.sweep, block.rig.camera)
+    found = [one.moments(block.rig, block.wavelength_nm, way, normal) for one, way in choice.doing("moments")]
+    held = folded_positions(block.sweep, choice.variant("smear"))
+    box = box_of(choice.variant("slit"), block.rig)
+    return fold(box, (1, 1), held, Moments.together(found, len(block.wavelength_nm))).error
+
+
 def views_all_over(rig: Rig, sweep: Sweep, *, exact: bool) -> RayViews:
     """Give views all over a sweep: the shape of a footprint varies smoothly between them."""
     whole = line_positions(replace(sweep, lines=max(sweep.lines, 1)), rig.camera)

@@ -49,7 +49,7 @@ from storage.archive.whole_files import to_json
 from storage.arrays.class_maps import load_class_map
 
 RECORD = "accuracy.json"
-ACCURACY = Product("evaluate", version=7, files=(RECORD,), by_weights=True)
+ACCURACY = Product("evaluate", version=8, files=(RECORD,), by_weights=True)
 
 
 @stage(

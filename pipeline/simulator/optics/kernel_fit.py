@@ -23,7 +23,8 @@ Floats = NDArray[np.float64]
 Transfer = NDArray[np.complex128]
 NEGLIGIBLE = 1.5e-3  # of a wave's amplitude, that kernels may pass too much or too little: .07 sigma of a full well's
 THINNED = 5 / 6  # variance that a thinned scene gains, over what its pixels' size squared grows
-_SHARPEST = 0.16  # least size on the ladder, over the wave's: 0.4 is the core of the pattern
+_SHARPEST = 0.16  # least size on the ladder, over the widest wave's
+_CORE = 0.4  # of a pattern, over its wave's: the ladder reaches down to that of the narrowest
 _RATIOS = (4.1, 2.6, 1.9)  # of sizes on the ladder's lower part
 _SMOOTH = 0.14  # variance of what looks at a level, beyond that [px^2 of it]: images are then too faint to tell
 _FARTHEST = 64  # px, or waves: the widest Gaussian
@@ -56,11 +57,11 @@ class Kernels:
 
 
 @lru_cache(maxsize=64)
-def _fit(told: bytes, bands: int, box: tuple[float, float], held: int) -> tuple[Kernels, Floats, Floats]:
-    """Kernels and shares for bands (6, band), no two alike: shift, variance and waves."""
+def _fit(told: bytes, bands: int, box: tuple[float, float], held: int) -> tuple[Kernels, Floats, Floats, float]:
+    """Kernels, shares and their error for bands (6, band), no two alike: shift, variance and waves."""
     moments = np.frombuffer(told).reshape(6, bands)
     if bands <= _OWN and not moments[4:].any():
-        return Kernels(moments[:2], moments[2:4], np.ones(bands, np.intp)), np.eye(bands), np.eye(bands)
+        return Kernels(moments[:2], moments[2:4], np.ones(bands, np.intp)), np.eye(bands), np.eye(bands), 0.0
     size = np.concatenate([moments[:2], np.sqrt(moments[2:4]), moments[4:]])
     place = np.linalg.svd(size - size.mean(axis=1, keepdims=True), full_matrices=False)[2][0]
     order = np.argsort(place)
@@ -84,7 +85,7 @@ def _fit(told: bytes, bands: int, box: tuple[float, float], held: int) -> tuple[
         error = float(np.abs(passed @ (shares @ between[:, judged]) - wanted).max())
         if error <= enough or count >= bands:
             break
-    return chosen, shares, between
+    return chosen, shares, between, error
 
 
 def _needed(passed: Transfer, wanted: Transfer, enough: float) -> list[int]:
@@ -110,7 +111,8 @@ def _some(order: NDArray[np.intp], most: int) -> NDArray[np.intp]:
 def _candidates(moments: Floats, place: Floats) -> Iterator[Kernels]:
     waves = moments[4:]
     widest = waves[:, waves[0].argmax()]
-    ladders = [_ladder(widest, ratio) for ratio in _RATIOS] if waves.any() else [[(0.0, 1)]]
+    core = _CORE * float(waves.min())
+    ladders = [_ladder(widest, core, ratio) for ratio in _RATIOS] if waves.any() else [[(0.0, 1)]]
     stretch = widest**2 / widest.min() ** 2 if waves.any() else np.ones(2)
     for count in _NODES:
         if waves.any() and count > _MOST_NODES:
@@ -129,10 +131,10 @@ def _candidates(moments: Floats, place: Floats) -> Iterator[Kernels]:
             return
 
 
-def _ladder(widest: Floats, ratio: float) -> list[tuple[float, int]]:
+def _ladder(widest: Floats, core: float, ratio: float) -> list[tuple[float, int]]:
     """Sizes [px, the smaller of along and scan] and the levels at which they are looked through."""
     wave = float(widest.min())
-    least = _SHARPEST * wave
+    least = min(_SHARPEST * wave, core)
     afar = 2 * _size_at(2)
     steps = max(math.ceil(math.log(afar / least) / math.log(ratio)), 0)
     sizes = [(float(size), 1) for size in np.geomspace(least, afar, steps + 1)[:-1]]
@@ -231,7 +233,8 @@ class Footprint:
 
     ``shift`` and ``variance`` are (2, kernel) along the line and the scan; ``shares`` (kernel, node) of some bands, and
     ``between`` (node, band) between which two each band lies; ``parts`` how many boxes across and along stand for one
-    that lies turned; ``level`` (kernel,) of which pixels each looks at: 1 is all, 2 every second, and so on.
+    that lies turned; ``level`` (kernel,) of which pixels each looks at: 1 is all, 2 every second, and so on; ``error``
+    by how much of its amplitude a wave is passed too much or too little at most.
     """
 
     box: tuple[float, float]  # across and along; 0 is none
@@ -242,6 +245,7 @@ class Footprint:
     shares: Floats
     between: Floats
     level: NDArray[np.intp]
+    error: float
 
     @property
     def kernels(self) -> int:
@@ -286,6 +290,6 @@ def fold(box: tuple[float, float], parts: tuple[int, int], held: int, blurs: Mom
     """
     waves = blurs.waves if blurs.waves is not None and blurs.waves.any() else np.zeros_like(blurs.shift)
     told, band = np.unique(np.concatenate([blurs.shift, blurs.variance, waves]), axis=1, return_inverse=True)
-    kernels, shares, between = _fit(told.tobytes(), told.shape[1], box, held)
+    kernels, shares, between, error = _fit(told.tobytes(), told.shape[1], box, held)
     between = between[:, band.ravel()]
-    return Footprint(box, parts, held, kernels.shift, kernels.variance, shares, between, kernels.level)
+    return Footprint(box, parts, held, kernels.shift, kernels.variance, shares, between, kernels.level, error)

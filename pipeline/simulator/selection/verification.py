@@ -18,6 +18,7 @@ from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR
 from pipeline.simulator.effects.probe import stored_mean
 from pipeline.simulator.optics.kernel_fit import NEGLIGIBLE
 from pipeline.simulator.optics.tap_sums import TABULATED
+from pipeline.simulator.render import kernel_error
 from pipeline.simulator.selection.choice import TOTAL, UNIT_WORDS, Decision
 from pipeline.simulator.selection.options import acts_on_light
 
@@ -147,8 +148,7 @@ def verify(decision: Decision, render: Render, blocks: Mapping[str, SweepBlock],
         variants = {effect: instead.get(effect.name, variant) for effect, variant in decision.exact.items()}
         bound = math.fsum(one.option.error for one in inexact)
         chosen = {effect: variant for effect, variant in variants.items() if variant != OFF}
-        share = misplaced_share(decision.exact, chosen)
-        found = [_greatest_change(one, render(one.block, chosen), bound, share) for one in full] if inexact else []
+        found = [_greatest_change(one, decision.exact, chosen, bound) for one in full] if inexact else []
         worst = max(found, key=lambda one: one.unexplained, default=_Change(0.0))
         if not worst.unexplained <= bound:
             raise BoundError(
@@ -173,14 +173,16 @@ def _rendered(name: str, block: SweepBlock, render: Render, decision: Decision, 
     return _Rendered(name, block, light, unit, render)
 
 
-def _greatest_change(one: _Rendered, light: Light, bound: float, share: float) -> _Change:
+def _greatest_change(
+    one: _Rendered, exact: Mapping[Effect, str], chosen: Mapping[Effect, str], bound: float
+) -> _Change:
     binning = one.block.sweep.binning
-    change = np.abs(stored_mean(light, binning).astype(np.float64) - one.light) / one.unit
+    change = np.abs(stored_mean(one.render(one.block, chosen), binning).astype(np.float64) - one.light) / one.unit
     if not change.size:
         return _Change(0.0)
     rounding = np.zeros(change.shape)
     if not change.max() <= bound:
-        rounding = misplaced_electrons(one.light, one.contrast, share) / one.unit
+        rounding = misplaced_electrons(one.light, one.contrast, misplaced_share(one.block, exact, chosen)) / one.unit
     worst = np.unravel_index(int(np.argmax(change - rounding)), change.shape)  # the first NaN, if there is one
     line, number, band = worst
     block, summed = one.block, "" if binning == 1 else f" (of {binning} summed)"
@@ -198,14 +200,16 @@ def misplaced_electrons(light: NDArray[np.floating], contrast: NDArray[np.floati
     return share * contrast.astype(np.float64) + ROUNDING * float(np.abs(light).max(initial=0.0))
 
 
-def misplaced_share(exact: Mapping[Effect, str], chosen: Mapping[Effect, str]) -> float:
+def misplaced_share(block: SweepBlock, exact: Mapping[Effect, str], chosen: Mapping[Effect, str]) -> float:
     """Give the share of the contrast about a sample by which two ways to compute its light may differ at most.
 
     Tables of weights misplace up to `TABULATED` of the light along either axis, in either image; where blurs or held
-    positions differ, so do the kernels that stand for those of all bands, each right to `NEGLIGIBLE`. Half counts.
+    positions differ, so do the kernels that stand for those of all bands, each right to `NEGLIGIBLE` unless its
+    footprint says otherwise. Half counts.
     """
-
-    return 2 * TABULATED + (0.0 if _folded(exact) == _folded(chosen) else NEGLIGIBLE)
+    if _folded(exact) == _folded(chosen):
+        return 2 * TABULATED
+    return 2 * TABULATED + sum(max(kernel_error(block, one), NEGLIGIBLE) for one in (exact, chosen)) / 2
 
 
 def _folded(ways: Mapping[Effect, str]) -> dict[str, str]:

@@ -86,7 +86,8 @@ def trials(case: Case, binnings: Sequence[int] = (1,)) -> Iterator[Trial]:
         for variant in (OFF, *(option.variant for option in menu.variants[1:])):
             chosen = {effect: variant if effect is menu.effect else way for effect, way in exact.items()}
             light = [_light(case, block, chosen) for block in blocks]
-            share = misplaced_share(exact, {one: way for one, way in chosen.items() if way != OFF})
+            shown = {one: way for one, way in chosen.items() if way != OFF}
+            share = max(misplaced_share(block, exact, shown) for block in blocks)
             for one in stored:
                 bound = _error(one.menus, menu.name, variant) / SAFETY
                 yield Trial(menu.name, variant, one.binning, bound, *one.change(light, full, share), one.rounding)

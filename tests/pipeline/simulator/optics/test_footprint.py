@@ -12,6 +12,7 @@ from hypothesis.extra.numpy import arrays
 
 from pipeline.geometry.mirror import direction_to_normal, position_to_normal, scene_to_direction
 from pipeline.geometry.scan import Sweep
+from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
 from pipeline.simulator.optics.kernel_fit import NEGLIGIBLE, Footprint, Moments, fold
 from pipeline.simulator.optics.rays import REST_NORMAL, middle_normal, normals_met, spread_of_rays, spread_of_waves
 from pipeline.simulator.optics.tap_sums import box_weight
@@ -132,3 +133,13 @@ def test_no_sweep_leaves_the_rest_position():
     for sweeps in ((), (replace(SWEEP, lines=0),)):
         assert normals_met(sweeps, RIG.camera) == pytest.approx(REST_NORMAL[None])
     assert middle_normal(replace(SWEEP, start_px=-11.5), RIG.camera) == pytest.approx(REST_NORMAL)
+
+
+@pytest.mark.parametrize("reach", [(400.0, 1000.0, 1.5e-3), (300.0, 1760.0, 6e-3), (300.0, 2500.0, 0.02)])
+def test_a_footprint_says_how_wrong_its_kernels_are(reach: tuple[float, float, float]) -> None:
+    """Also where bands lie so far apart that few kernels stand for the sharpest pattern and the widest."""
+    first, last, most = reach
+    blurs = (DIFFRACTION, ABERRATION, KEYSTONE)
+    nm = np.linspace(first, last, 9)
+    found = fold((2.7, 1.0), (1, 1), 1, Moments.together([one.moments(RIG, nm, one.variants[0]) for one in blurs], 9))
+    assert 0 < found.error <= most

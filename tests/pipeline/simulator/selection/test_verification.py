@@ -219,12 +219,13 @@ def test_contrast_is_that_of_the_scene_about_a_sample() -> None:
 
 def test_kernels_that_differ_misplace_more() -> None:
     """Another blur, or held positions folded; not the parts of a slit nor an effect without a kernel."""
-    same = misplaced_share(EXACT, {**EXACT, SLIT: "3x1"})
-    assert same == misplaced_share(EXACT, EXACT) < NEGLIGIBLE
+    block = sweep_block(image_scene(np.ones((48, 64, 1)), RIG.camera, [550.0]), RIG, SWEEP, range(2))
+    same = misplaced_share(block, EXACT, {**EXACT, SLIT: "3x1"})
+    assert same == misplaced_share(block, EXACT, EXACT) < NEGLIGIBLE
     without = {effect: way for effect, way in EXACT.items() if effect is not KEYSTONE}
     boxless = {effect: way for effect, way in EXACT.items() if effect is not SLIT}
     for other in (without, boxless, {**EXACT, SMEAR: "folded"}, {**EXACT, DIFFRACTION: "one-width"}):
-        assert misplaced_share(EXACT, other) == pytest.approx(same + NEGLIGIBLE)
+        assert misplaced_share(block, EXACT, other) == pytest.approx(same + NEGLIGIBLE)
 
 
 @pytest.mark.parametrize("pattern", ["rows", "columns"])
@@ -240,7 +241,7 @@ def test_two_ways_to_fold_the_same_light_differ_by_no_more(pattern: str) -> None
     other = unshifted if pattern == "rows" else {**EXACT, SMEAR: "folded"}
     light, full = (expected_light(scene, block, one) for one in (other, EXACT))
     contrast = contrast_about(block, lambda block, chosen: expected_light(scene, block, chosen))
-    bound = misplaced_electrons(full, contrast, misplaced_share(EXACT, other))
+    bound = misplaced_electrons(full, contrast, misplaced_share(block, EXACT, other))
     assert (np.abs(light.astype(np.float64) - full) <= bound).all()
 
 
