@@ -26,7 +26,7 @@ from models.network.spectral import Normalisation, SpectralBasis
 from models.weights.files import Weights, save_weights
 from storage.readers.labels import default_colour
 from tests.object_server import bucket, machine, s3_server  # noqa: F401 - fixtures
-from tests.remembered_work import WORKED_OUT, remember
+from tests.remembered_work import WORKED_OUT, remember, with_effects, without_effects
 
 RGB_NM = (640.0, 550.0, 460.0)
 CLASSES = ("class_0", "class_1", "class_2")  # as a label file of the numbers 0..2 names them
@@ -83,6 +83,13 @@ def choosing_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every survey of this test works out its choice of effects, and draws its picture, by itself."""
     for name, (module, real) in WORKED_OUT.items():
         monkeypatch.setattr(module, name, real)
+
+
+@pytest.fixture
+def no_effects() -> Iterator[None]:
+    """No survey of this test looks at its scene to choose effects, and none is simulated that it does not name."""
+    with without_effects():
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -142,7 +149,8 @@ def surveyed_png(survey_png: Survey, tmp_path_factory: pytest.TempPathFactory) -
     def copy(out: Path) -> Published:
         if not made:
             root = tmp_path_factory.mktemp("surveyed") / "archive"
-            made.append((root, survey_png(root)))
+            with with_effects():  # whichever test is the first to ask
+                made.append((root, survey_png(root)))
         root, published = made[0]
         shutil.copytree(root, out, dirs_exist_ok=True)
         return replace(published, folder=out / published.folder.relative_to(root))

@@ -98,6 +98,7 @@ def test_two_budgets_are_told_apart_either_way(
     }
 
 
+@pytest.mark.usefixtures("no_effects")
 def test_new_weights_and_hectares_are_told(
     survey_png: Survey, make_weights: WeightsMaker, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -112,6 +113,7 @@ def test_new_weights_and_hectares_are_told(
     assert "ha in B" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("no_effects")
 def test_runs_of_different_fields_are_refused(survey_png: Survey, scene_files: Path, tmp_path: Path) -> None:
     """Also by `previous`, which looks for the same field."""
     other = turned(scene_files / "scene.png", tmp_path / "turned.png")

@@ -27,6 +27,7 @@ from storage.export.image_files import cog_problems
 from storage.export.stac_items import stac_problems
 from storage.readers.envi_cubes import open_envi_cube
 from storage.remote.opening import verify_archive
+from tests.remembered_work import without_effects
 from tests.storage.export.stac_rules import extension_problems
 from tests.storage.small_archive import flip
 
@@ -79,7 +80,8 @@ def surveys(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Publis
         "seed": "1",
     }
     settings = load_settings(None, flags)
-    return archive, [run_survey(settings, QUIET), run_survey(replace(settings, pose=POSE), QUIET)]
+    with without_effects():
+        return archive, [run_survey(settings, QUIET), run_survey(replace(settings, pose=POSE), QUIET)]
 
 
 @pytest.fixture(scope="module")

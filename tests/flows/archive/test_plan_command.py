@@ -50,6 +50,7 @@ def _tree(root: Path) -> dict[str, tuple[int, int]]:
 @pytest.mark.parametrize(
     "changes", [{}, {"kernel": "nearest"}, {"budget": 0.7}, {"policy": "sobel"}, {"seed": 5}], ids=str
 )
+@pytest.mark.usefixtures("no_effects")
 def test_the_survey_does_what_the_plan_said(
     settings: Settings, archive: Path, survey_png: Any, changes: dict[str, Any]
 ) -> None:

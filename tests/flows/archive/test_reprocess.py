@@ -27,6 +27,7 @@ from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 from tests.conftest import Survey, WeightsMaker
 from tests.flows.conftest import be_version, turned
+from tests.remembered_work import without_effects
 from tests.storage.small_archive import flip
 
 QUIET = Console(quiet=True)
@@ -37,8 +38,9 @@ def surveyed(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey, scene
     """Two fields, scene (two budgets) and turned, on an archive that is not to be changed."""
     folder = tmp_path_factory.mktemp("reprocessed")
     scenes = [turned(scene_files / "scene.png", folder / "turned.png"), scene_files / "scene.png"]
-    for scene, budget in ((scenes[0], "0.8"), (scenes[1], "0.8"), (scenes[1], "0.7")):
-        survey_png(folder / "archive", scene=str(scene), labels=None, budget=budget)
+    with without_effects():
+        for scene, budget in ((scenes[0], "0.8"), (scenes[1], "0.8"), (scenes[1], "0.7")):
+            survey_png(folder / "archive", scene=str(scene), labels=None, budget=budget)
     return folder / "archive"
 
 
@@ -293,6 +295,7 @@ def test_fields_are_told_apart_by_what_they_asked_for_and_are_called(surveyed: P
     assert [one.run for one in generations.newest_runs(Catalogue.read(tmp_path))] == [runs[n] for n in (0, 1, 3, 4)]
 
 
+@pytest.mark.usefixtures("no_effects")
 def test_fields_of_one_file_name_are_told_apart(
     tmp_path: Path, survey_png: Survey, scene_files: Path, monkeypatch: pytest.MonkeyPatch, reprocess: Reprocess
 ) -> None:
@@ -306,6 +309,7 @@ def test_fields_of_one_file_name_are_told_apart(
     assert reprocess.states(tmp_path / "archive") == [("scene", "skipped")] * 2
 
 
+@pytest.mark.usefixtures("no_effects")
 def test_an_older_farm_law_is_not_current(
     tmp_path: Path,
     survey_png: Survey,

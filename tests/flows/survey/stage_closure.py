@@ -15,6 +15,7 @@ import ast
 import gc
 import hashlib
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from copy import copy
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,14 @@ class Sources:
         finally:
             if collecting:
                 gc.enable()
+
+    def edited(self, path: str, text: str) -> Sources:
+        """Give these sources with another text of one module that binds the same names; no other is parsed again."""
+        changed = copy(self)
+        changed.modules = self.modules | {path: Module(self, path, ast.parse(text))}
+        if changed.modules[path].names != self.modules[path].names:
+            raise LookupError(f"the new text of {path} binds other names")
+        return changed
 
     def named(self, name: str) -> Target:
         """Find the only definition of that name: ``attend``, or ``stages.attend`` where several modules have one.

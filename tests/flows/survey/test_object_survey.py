@@ -21,9 +21,9 @@ from storage.arrays.class_maps import load_class_map
 from storage.remote.object_archive import ObjectArchive
 from storage.remote.object_stores import Objects
 from tests.conftest import Survey
-from tests.flows.conftest import CommandLine
+from tests.flows.conftest import FEW_BANDS, CommandLine
 
-SMALL = ("--size", "96x64", "--no-controls", "--engine", "plain")
+SMALL = ("--size", "96x64", "--bands", FEW_BANDS, "--no-controls", "--engine", "plain")
 CACHED = {"cached", "skipped"}
 
 
@@ -67,17 +67,18 @@ def test_a_rerun_makes_nothing_and_moves_next_to_nothing(
     np.testing.assert_array_equal(map_of(open_archive(bucket), elsewhere), beside)
 
 
+@pytest.mark.usefixtures("no_effects")
 def test_verbs_read_an_archive_in_a_bucket(
     bucket: str, command_line: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """survey, plan, ls, explain, verify, compare, reprocess and gc take s3://bucket/prefix where they take a folder."""
     monkeypatch.chdir(tmp_path)
-    assert command_line("plan", "--out", bucket, *SMALL[:3]).code == 0
+    assert command_line("plan", "--out", bucket, *SMALL[:5]).code == 0
     ended = command_line("survey", "--out", bucket, *SMALL, "--json")
     assert (ended.code, ended.errors) == (0, [])
     receipt = json.loads(ended.out)
     monkeypatch.setenv("SPECTRALZOOM_WORK", str(tmp_path / "elsewhere"))
-    plan = json.loads(command_line("plan", "--out", bucket, *SMALL[:3], "--json").out)
+    plan = json.loads(command_line("plan", "--out", bucket, *SMALL[:5], "--json").out)
     assert plan["to_make"] == 0
     listed = json.loads(command_line("ls", bucket, "--json").out)
     assert listed["archive"] == bucket

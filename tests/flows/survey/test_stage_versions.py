@@ -77,7 +77,7 @@ def test_an_edited_constant_concerns_the_stages_that_reach_it() -> None:
     texts = read_packages(ROOT)
     edited = re.sub(rf"^{name} = ", f"{name} = 0.5 * ", texts[module], flags=re.M)
     assert edited != texts[module]
-    changed = Sources(texts | {module: edited})
+    changed = sources().edited(module, edited)
     concerned = {stage for stage in ROOTS if digest_of(stage, changed) != digest_of(stage, sources())}
     assert concerned == {"attend", "segment", "evaluate"}
 

@@ -25,6 +25,7 @@ from storage.arrays.quicklooks import load_quicklook
 from storage.arrays.spool import Spool
 from storage.remote.opening import verify_archive
 from tests.conftest import Survey
+from tests.remembered_work import without_effects
 from tests.storage.small_archive import flip
 
 
@@ -46,7 +47,8 @@ def _survey_farm(root: Path) -> Published:
         "budget": "0.95",
         "out": str(root),
     }
-    return run_survey(load_settings(None, flags), Console(quiet=True))
+    with without_effects():
+        return run_survey(load_settings(None, flags), Console(quiet=True))
 
 
 @pytest.fixture

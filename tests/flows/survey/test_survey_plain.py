@@ -33,6 +33,8 @@ from storage.archive.archive import Archive
 from storage.arrays.class_maps import ClassMap, load_class_map
 from storage.remote.opening import verify_archive
 from tests.conftest import CLASSES, RGB_NM, patchy_scene, random_weights
+from tests.flows.conftest import FEW_BANDS
+from tests.remembered_work import with_effects
 
 STAGES = [
     "choose_effects",
@@ -77,7 +79,8 @@ class Done:
 def farm(tmp_path_factory: pytest.TempPathFactory) -> Done:
     """The built-in scene, small, with the weights that are shipped and with controls."""
     out = tmp_path_factory.mktemp("farm")
-    flags = {"size": f"{FARM[1]}x{FARM[0]}", "budget": "0.9", "engine": "plain", "out": str(out), "seed": "1"}
+    size = {"size": f"{FARM[1]}x{FARM[0]}", "bands": FEW_BANDS}
+    flags = {**size, "budget": "0.9", "engine": "plain", "out": str(out), "seed": "1"}
     return Done(run_survey(load_settings(None, flags), Console(quiet=True)), out)
 
 
@@ -163,7 +166,8 @@ def test_savings_are_those_of_the_stored_cubes(name: str, request: pytest.Fixtur
 def test_same_seed_gives_the_same_receipt(picture: Done, survey_png: Any, tmp_path: Path) -> None:
     """In another archive, but for times and memory; another seed gives other light along the same path."""
     again = survey_png(tmp_path / "again").receipt
-    other = survey_png(tmp_path / "other", seed="1").receipt
+    with with_effects():
+        other = survey_png(tmp_path / "other", seed="1").receipt
     assert comparable(again) == comparable(picture.receipt)
     assert comparable(other) != comparable(picture.receipt)
     keys = [{stage["name"]: stage["key"] for stage in receipt["stages"]} for receipt in (again, other)]
@@ -223,6 +227,7 @@ def test_without_a_fine_seat_the_map_is_the_glance(survey_png: Any, weights: Pat
     assert done.receipt["accuracy"]["miou"] == done.receipt["accuracy"]["none"]["miou"]
 
 
+@pytest.mark.usefixtures("no_effects")
 def test_what_is_not_judged_is_left_out(picture: Done, survey_png: Any, scene_files: Path, tmp_path: Path) -> None:
     """Without controls neither other placements nor `all` are judged; without labels there is no accuracy."""
     accuracy = picture.receipt["accuracy"]
@@ -291,6 +296,7 @@ def _map(survey: Any, scene: Path) -> ClassMap:
     return load_class_map(scene.parent / "a" / survey.receipt["products"]["class_map"])
 
 
+@pytest.mark.usefixtures("no_effects")
 def test_no_data_neither_darkens_nor_becomes_a_class(survey_png: Any, tmp_path: Path) -> None:
     """The hole alone has none, the rest of the field is as light as without it, and the receipt counts the pixels."""
     stated, whole = _scene(tmp_path / "stated", 1e30, "nodata = 1e30"), _scene(tmp_path / "whole", None)
@@ -321,6 +327,7 @@ def test_no_data_that_nobody_stated_ends_a_survey(survey_png: Any, tmp_path: Pat
     assert not (scene.parent / "a").exists()
 
 
+@pytest.mark.usefixtures("no_effects")
 def test_readings_that_the_weights_cannot_take_are_counted(survey_png: Any, tmp_path: Path) -> None:
     """Weights for numbers a million times smaller: no pixel can be read, which the receipt says."""
     weights = random_weights(RGB_NM, CLASSES)
@@ -336,6 +343,7 @@ def test_readings_that_the_weights_cannot_take_are_counted(survey_png: Any, tmp_
     assert json.loads((store / "strange.json").read_text())["coarse_px"] == 64 * 96 // 16
 
 
+@pytest.mark.usefixtures("no_effects")
 def test_scores_of_any_size_make_a_survey(survey_png: Any, tmp_path: Path) -> None:
     """A mask of 1e307 buys what a mask of 1 does, without a warning."""
     scene = _scene(tmp_path / "s", None)

@@ -29,6 +29,8 @@ from pipeline.errors import SettingsError, WeightsError
 from storage.archive.keys import StageRef
 from storage.arrays.mosaics import load_attention
 from tests.conftest import Survey
+from tests.flows.conftest import FEW_BANDS
+from tests.remembered_work import without_effects
 
 FREE = [policy for policy in POLICIES if policy not in ("mask", *NETWORK_POLICIES)]
 
@@ -37,12 +39,13 @@ FREE = [policy for policy in POLICIES if policy not in ("mask", *NETWORK_POLICIE
 def archive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One archive for all, with a survey in it: its coarse look serves the others."""
     folder = tmp_path_factory.mktemp("policies")
-    run_survey(load_settings(None, _flags(folder, "random")), Console(quiet=True))
+    with without_effects():
+        run_survey(load_settings(None, _flags(folder, "random")), Console(quiet=True))
     return folder
 
 
 def _flags(archive: Path, policy: str, **more: str) -> dict[str, Any]:
-    size = {"size": "128x128", "budget": "0.9", "engine": "plain", "controls": False}
+    size = {"size": "128x128", "bands": FEW_BANDS, "budget": "0.9", "engine": "plain", "controls": False}
     return {**size, "out": str(archive), "seed": "1", "policy": policy, **more}
 
 
@@ -113,9 +116,11 @@ FLAGS: dict[str, Any] = {"budget": "0.9", "cost.reload_s": str(RELOAD_S)}
 def without(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey) -> tuple[Published, Path]:
     """A survey without a threshold, and its archive."""
     out = tmp_path_factory.mktemp("one")
-    return survey_png(out, **FLAGS), out
+    with without_effects():
+        return survey_png(out, **FLAGS), out
 
 
+@pytest.mark.usefixtures("no_effects")
 def test_a_threshold_leaves_seconds_and_says_so(
     without: tuple[Published, Path], survey_png: Survey, tmp_path: Path
 ) -> None:
@@ -139,6 +144,7 @@ def test_a_threshold_leaves_seconds_and_says_so(
     assert not {"threshold", "spared_s"} & set(receipt["plan"])
 
 
+@pytest.mark.usefixtures("no_effects")
 def test_a_threshold_above_all_gains_draws_the_coarse_map(survey_png: Survey, tmp_path: Path) -> None:
     """Nothing pays: no fine line, and the map is that of the coarse look alone."""
     done = survey_png(tmp_path, threshold="1e6", **FLAGS)

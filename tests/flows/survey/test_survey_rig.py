@@ -49,6 +49,7 @@ from storage.arrays.cubes import open_raw_cube
 from storage.remote.opening import verify_archive
 from tests.conftest import patchy_scene
 from tests.flows.conftest import CommandLine
+from tests.remembered_work import without_effects
 
 QUIET = Console(quiet=True)
 SMALL: dict[str, Any] = {
@@ -133,7 +134,7 @@ def references_of_frames(patch: pytest.MonkeyPatch) -> None:
 
 def test_every_line_is_the_simulated_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By Prefect: coarse sweep, attention, plan and fine sweeps give each line of the simulated survey, and its map."""
-    with pytest.MonkeyPatch.context() as patch:
+    with without_effects(), pytest.MonkeyPatch.context() as patch:  # but for those that it names
         references_of_frames(patch)
         simulated = run_survey(small_settings(tmp_path / "sim"), QUIET)
     effects = chosen_effects(next(ref for ref in Archive.open(tmp_path / "sim").refs("effects")))
@@ -188,6 +189,7 @@ def test_a_mounting_that_does_not_reach_the_field_is_refused_first(tmp_path: Pat
         open_run(small_settings(tmp_path, source="rig", **beside), planning=True)
 
 
+@pytest.mark.usefixtures("no_effects")
 def test_pulses_of_frames_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """One pulse a frame, as cameras give: fine lines are stepped by it, coarse ones lie where the mirror's log says."""
     settings = small_settings(tmp_path, source="rig", visit="first", **{"rig.pulses": "frame", "effects": "none"})
