@@ -1,8 +1,9 @@
 """What takes most of a small survey's time and is the same for the same question, remembered.
 
 Only what is pure is kept: the look at the scene that a choice of effects rests on, and the changes that were measured.
-Of pictures one of each kind is drawn, and is that of all fields alike. Decision, stores, receipt and run are made each time. Tests that surveys repeat
-themselves put `WORKED_OUT` back; those that ask nothing of effects have no scene looked at: `without_effects`.
+Of pictures one of each kind is drawn, and stands for all of that kind. Decision, stores, receipt and run are made each
+time. Tests that surveys repeat themselves put `WORKED_OUT` back; those that ask nothing of effects have no scene
+looked at: `without_effects`.
 """
 
 from __future__ import annotations
