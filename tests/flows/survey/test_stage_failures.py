@@ -189,14 +189,10 @@ def test_a_run_that_cannot_be_drawn_is_not_published(
 
 @pytest.fixture(scope="module")
 def server(prefect_home: Path) -> Iterator[None]:
-    """Flows of this module run on a throw-away Prefect server, without the heartbeat that costs a second each."""
+    """Flows run on the server that surveys of this process share, without the heartbeat that costs a second each."""
     from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
-    from prefect.testing.utilities import prefect_test_harness
 
-    with (
-        prefect_test_harness(server_startup_timeout=120),
-        temporary_settings(updates={PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}),
-    ):
+    with temporary_settings(updates={PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}):
         yield
 
 
