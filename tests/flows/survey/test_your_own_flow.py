@@ -28,19 +28,15 @@ def check_rig(answers: bool) -> None:
         raise RigError("no reply from the rig; is it on?")
 
 
-# (2) A server for the tests of one file: its files are in a folder that goes away. It takes seconds to start, and each
-# flow a second more for its heartbeat, which is switched off here: share the fixture, and keep such tests few.
+# (2) A server for the tests: Prefect starts it at the first flow, which takes seconds, and its files are in a folder
+# that goes away. Each flow takes a second more for its heartbeat, which is switched off here: keep such tests few.
 # ``prefect_home`` (conftest.py) comes before anything imports Prefect, which reads its settings only then.
 @pytest.fixture(scope="module")
 def server(prefect_home: Path) -> Iterator[None]:
-    """Flows of this module run on a throw-away server."""
+    """Flows of this module run on a throw-away server, which surveys of this process share."""
     from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
-    from prefect.testing.utilities import prefect_test_harness
 
-    with (
-        prefect_test_harness(server_startup_timeout=120),
-        temporary_settings(updates={PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}),
-    ):
+    with temporary_settings(updates={PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}):
         yield
 
 
