@@ -268,12 +268,14 @@ def start(workers: int) -> ProcessTeam:
     with ExitStack() as closing:
         closing.enter_context(_quiet_logs())
         closing.enter_context(_environment_restored())
+        # imported before our settings are set: with them would go what distributed adds to dask's, which xarray reads
+        local_cluster = dask_distributed.LocalCluster
         closing.enter_context(dask.config.set(_QUIET))
         scratch = closing.enter_context(TemporaryDirectory(prefix="spectralzoom-", ignore_cleanup_errors=True))
         try:
             with _termination_held(), _interrupts_held():
                 cluster = closing.enter_context(
-                    dask_distributed.LocalCluster(  # type: ignore[no-untyped-call]
+                    local_cluster(  # type: ignore[no-untyped-call]
                         n_workers=workers,
                         threads_per_worker=1,
                         memory_limit=0,
