@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import xarray as xr
 import zarr
 from rich.console import Console
 
@@ -154,7 +155,7 @@ def test_lost_lines_are_rendered_again(
 
 
 def test_processes_make_the_same_archive(tmp_path: Path, survey_png: Survey, surveyed_png: Survey) -> None:
-    """A whole survey by two processes publishes the same keys and the same bytes as one by threads."""
+    """A whole survey by two processes publishes the same keys and bytes as one by threads; then xarray reads them."""
     roots = tmp_path / "threads", tmp_path / "processes"
     surveyed_png(roots[0])
     survey_png(roots[1], scheduler="processes", workers=2)
@@ -167,3 +168,6 @@ def test_processes_make_the_same_archive(tmp_path: Path, survey_png: Survey, sur
         for root in roots
     ]
     assert kept[0] == kept[1]
+    (drawn,) = roots[1].glob("stages/segment/*/class_map.zarr")
+    with xr.open_zarr(drawn, consolidated=False) as found:
+        assert found["classes"].values.shape == (96, 128)
