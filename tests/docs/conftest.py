@@ -11,7 +11,10 @@ from PIL import Image
 
 from tests.conftest import Survey, WeightsMaker, patchy_scene
 
-SETTINGS = 'name = "{name}"\nscene = "field.png"\nlabels = "labels.png"\nweights = "mine.safetensors"\nbudget = 0.8\n'
+SETTINGS = (
+    'name = "{name}"\nscene = "field.png"\nlabels = "labels.png"\nweights = "mine.safetensors"\nbudget = 0.8\n{camera}'
+)
+CAMERA = "[camera]\nsamples = 320\n"  # a narrow one: most of a small survey's time goes into samples beside the field
 CLASSES = 'labels = "labels/{number}_labels.png"\n[classes]\nclass_0 = 0\nclass_1 = 1\nclass_2 = 2\n'
 HEADER = "ENVI\nsamples = 40\nlines = 24\nbands = 3\ndata type = 4\ninterleave = bip\nbyte order = 0\n"
 
@@ -40,9 +43,11 @@ def surveyed(
             Image.fromarray(picture).save(path)
     (folder / "fields" / "scene.toml").write_text(CLASSES)
     for name in ("north", "south", "survey"):
-        (folder / f"{name}.toml").write_text(SETTINGS.format(name="south" if name == "south" else "north"))
+        told = SETTINGS.format(name="south" if name == "south" else "north", camera=CAMERA)
+        (folder / f"{name}.toml").write_text(told)
+    (folder / "camera.toml").write_text(CAMERA)
     for given in ({"budget": "0.6"}, {"accuracy": False}):
-        survey_png(folder / "archive", name="north", **given)
+        survey_png(folder / "archive", name="north", **{"camera.samples": 320}, **given)
     return folder
 
 

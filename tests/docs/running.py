@@ -5,13 +5,15 @@ The comment before a block says what is other than written, `<!-- test: WORDS --
     with FLAGS      the flags are added to each command: smaller, and nobody waits for a server
     parses          not run: every command's words are read by its own parser, every target and file is there
     bucket          s3://bucket/prefix is an archive on the S3 server of the tests
-    tree            run with a copy of the four folders to which the page's files and changes were added
+    tree FLAGS      run, in one process, with a copy of the four folders to which the page's files and changes were
+                    added; the flags are added to the first command
     meanwhile       begun, and ended once the page is through; the others begin when the file after -o is there
 """
 
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
 import re
 import shlex
@@ -38,6 +40,15 @@ SHOWN = ("text",)  # what programs print, and pictures made of letters: nothing 
 BUILT = ("{toctree}", "{generated} settings", "{generated} stages", "{eval-rst}")  # run by `make docs`
 BUCKET = "s3://bucket/prefix"
 BEGUN_WITHIN_S = 120.0
+EACH = """
+import json, sys
+from flows.cli.main import main
+for words in json.loads(sys.argv[1]):
+    try:
+        main(words)
+    except SystemExit as ended:
+        assert not ended.code, words
+"""
 
 
 @dataclass
@@ -58,6 +69,8 @@ class Reader:
             assert word in ("", "with", "parses", "bucket", "tree", "meanwhile"), f"{block.place}: {block.mark}?"
             for command in commands_of(block):
                 self._command(block, command, word, rest)
+            if word == "tree":
+                self._elsewhere(block, rest)
         elif block.language == "python":
             self._python(block)
         elif block.language == "toml":
@@ -73,7 +86,7 @@ class Reader:
         root = self.folder / "tree"
         if not root.exists():
             for name in TREE:
-                shutil.copytree(ROOT / name, root / name, ignore=shutil.ignore_patterns("__pycache__"))
+                shutil.copytree(ROOT / name, root / name)  # with bytecode, which is good for files of the same dates
         return root
 
     def _command(self, block: Block, command: str, word: str, rest: str) -> None:
@@ -83,22 +96,23 @@ class Reader:
         if word == "parses":
             return
         assert program == "spectralzoom", f"{block.place}: only spectralzoom is run; say what is to parse"
+        if word == "tree":
+            return  # run together
         given = [*words[1:], *shlex.split(rest)]
         if word == "bucket":
             assert self.bucket is not None
             given = [one.replace(BUCKET, self.bucket) for one in given]
-        if word == "tree":
-            self._elsewhere(block, given)
-        elif word == "meanwhile":
+        if word == "meanwhile":
             self._begin(block, given)
         else:
             code = run_here(given)
             assert code == 0, f"{block.place}: {command} ended with {code}"
 
-    def _elsewhere(self, block: Block, words: list[str]) -> None:
-        """Run with the copy of the folders, in a process of its own."""
+    def _elsewhere(self, block: Block, flags: str) -> None:
+        """Run the commands with the copy of the folders, in a process of its own."""
+        first, *others = [shlex.split(command)[1:] for command in commands_of(block)]
         environment = {**os.environ, "PYTHONPATH": str(self.tree)}
-        command = [sys.executable, "-m", "flows.cli.main", *words]
+        command = [sys.executable, "-c", EACH, json.dumps([[*first, *shlex.split(flags)], *others])]
         ended = subprocess.run(command, env=environment, cwd=self.folder, capture_output=True, text=True, check=False)
         assert ended.returncode == 0, f"{block.place}: {ended.stderr[-2000:]}"
 

@@ -141,7 +141,11 @@ def serve(choices: Path) -> None:
         "flows.cli.survey_verbs",
         "flows.archive.commands",
         "matplotlib.backends.backend_agg",
+        "models.network.segmenter",
+        "rich.status",
+        "safetensors.torch",
         "scipy.optimize",
+        "tests.faults.injection",
     ):
         importlib.import_module(name)
     importlib.import_module("tests.remembered_work").remember(choices)

@@ -35,9 +35,9 @@ def test_disk_full_under_spool_manifest_and_run(subject: Subject) -> None:
 
 def test_writes_refused_at_random_calls(subject: Subject) -> None:
     """Wherever in a survey, by whichever library, and whether once or for good."""
-    found = disk_full.refuse_places(subject, 4, seed=3)
+    found = disk_full.refuse_places(subject, 3, seed=3)
     assert found.wrong == []
-    assert found.told >= 3
+    assert found.told >= 2
     assert len(subject.changing_calls) > 500
     # Writes of Zarr count too: else nothing would be refused where most is written.
     names = {name for _, name, _ in subject.changing_calls}
@@ -62,7 +62,7 @@ def test_clock_set_back(subject: Subject, fault: str, tmp_path: Path) -> None:
 
 def test_power_fails_in_a_capture(tmp_path: Path) -> None:
     """At most the lines since the last sync are lost, and the capture goes on to the same bytes."""
-    found = lost_lines.try_power(60, tmp_path, seed=1)
+    found = lost_lines.try_power(30, tmp_path, seed=1)
     assert found.wrong == []
     assert 0 < max(found.lost) <= 64
 

@@ -30,8 +30,8 @@ from tests.faults.small_survey import Subject, problems, stored, words, wrong_af
 from tests.flows.small_fields import write_field, write_weights
 
 GOING_ON = "terminated; the same command goes on from here"
-SYNCS = (2, 30, 60, 110)  # of a survey's files, before which it is stopped
-TAKEN = 20  # lines of a sweep
+SYNCS = (2, 60, 110)  # of a survey's files, before which it is stopped
+TAKEN = 9  # lines of a sweep
 CODES = {signal.SIGKILL: -signal.SIGKILL, signal.SIGTERM: TERMINATED}
 BEGUN = ("flows.survey.stages.accuracy:load_class_map", 1)
 PLACES = {  # function and call before which a survey is stopped that has its map, and with what
@@ -42,9 +42,9 @@ PLACES = {  # function and call before which a survey is stopped that has its ma
     "after the run has changed": ("storage.archive.run_folders:remove_tree", 1, signal.SIGKILL),
 }
 ADDED = "after the run has changed"
-KILLS = 6
+KILLS = 4
 MOMENTS = [(number + random.Random(number).random()) / KILLS for number in range(KILLS)]  # of the time it takes
-LIVES = (0.5, 0.35, 0.35, 0.35) * 3  # of it too: what was not published begins anew
+LIVES = (0.5, 0.35, 0.35) * 2  # of it too: what was not published begins anew
 
 
 def told(ended: Ended) -> bool:

@@ -27,6 +27,7 @@ from tests.flows.conftest import act_instead
 ROOT = Path(__file__).parents[3]
 NM = "460,500,550,600,620,640"
 RAN = "looked twice at"
+CAMERA = "[camera]\nsamples = 64\n"  # a narrow one: most of a small survey's time goes into samples beside the field
 
 
 @pytest.fixture(scope="module")
@@ -41,12 +42,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory, scene_files: Path, weights:
     (here / "corrupt.safetensors").write_bytes(weights.read_bytes()[:5000])
     (here / "corrupt.png").write_bytes((here / "scene.png").read_bytes()[:300])
     (here / "a_file").write_text("no folder")
+    (here / "camera.toml").write_text(CAMERA)
     picture, labels = (np.asarray(Image.open(here / name)) for name in ("scene.png", "labels.png"))
     for name, values in {
         "small": labels[:50],
         "tiny": picture[:5, :6],
         "odd": picture[:37, :53],
-        "black": np.zeros_like(picture[:64]),
+        "black": np.zeros_like(picture[:32, :48]),
     }.items():
         Image.fromarray(values).save(here / f"{name}.png")
     cube = np.load(here / "cube.npy")
@@ -57,9 +59,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory, scene_files: Path, weights:
 
 
 @pytest.fixture(scope="module")
-def surveyed(folder: Path, survey_png: Any) -> Path:
+def surveyed(folder: Path, surveyed_png: Any) -> Path:
     """An archive with one survey in it."""
-    survey_png(folder / "archive")
+    surveyed_png(folder / "archive")
     return folder / "archive"
 
 
@@ -165,7 +167,7 @@ def test_unusual_input_works(
     """The survey ends with 0, says what it assumed, every pixel with a value has a class, the archive verifies."""
     words, says = WORKS[case]
     monkeypatch.chdir(folder)
-    ended = command_line(*survey_words(words, str(tmp_path / "archive")))
+    ended = command_line(*survey_words(words, str(tmp_path / "archive")), "--settings", "camera.toml")
     assert (ended.code, ended.errors) == (0, [])
     assert says in " ".join(ended.err.split())
     archive = Archive.open(tmp_path / "archive", create=False)
@@ -306,7 +308,7 @@ def undisturbed(folder: Path, tmp_path_factory: pytest.TempPathFactory, survey_p
 
 
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="tells a descriptor's file by /proc")
-@pytest.mark.parametrize("share", [0.0, 0.2, 0.5, 0.8, 0.985, 0.9999])
+@pytest.mark.parametrize("share", [0.0, 0.4, 0.985, 0.9999])
 def test_full_disk_anywhere_in_a_survey(
     share: float,
     undisturbed: tuple[int, np.ndarray],

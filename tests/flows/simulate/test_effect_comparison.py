@@ -26,13 +26,14 @@ from pipeline.simulator.scenes.scene import SceneRaster
 from storage.archive.keys import StageRef
 
 ASKED = "rotation,vignetting,shot,read-noise"
+CAMERA = {"camera.samples": 160}  # as wide as the small picture: all of what else it sees takes its time
 
 
 @pytest.fixture(scope="module")
 def scan(scene_files: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[CaptureRun, list[Sweep], StageRef]:
     """A coarse scan of the small picture, decided and not taken."""
     out = tmp_path_factory.mktemp("compared")
-    given = {"scene": str(scene_files / "scene.png"), "out": str(out), "effects": ASKED}
+    given = {"scene": str(scene_files / "scene.png"), "out": str(out), "effects": ASKED, **CAMERA}
     run, sweeps, _ = open_simulation(load_settings(None, given), coarse=True)
     return run, sweeps, choose(run)
 
@@ -101,7 +102,7 @@ def test_figures_are_beside_all_that_the_rig_has(
 
 def test_what_is_exact_differs_by_nothing(scene_files: Path, tmp_path: Path) -> None:
     """Neither in light nor in raw numbers."""
-    given = {"scene": str(scene_files / "scene.png"), "out": str(tmp_path), "effects": "all"}
+    given = {"scene": str(scene_files / "scene.png"), "out": str(tmp_path), "effects": "all", **CAMERA}
     run, sweeps, _ = open_simulation(load_settings(None, given), coarse=True)
     same = compare_with_everything(run, sweeps, choose(run), lambda words: None)
     assert (same.measured, same.raw_unequal, same.raw_most_dn) == (0, 0, 0)
@@ -175,8 +176,10 @@ def test_the_command_writes_the_picture_and_tells_its_figures(
     """In words and in the record."""
     picture = tmp_path / "new" / "made.png"
     scene = scene_files / "scene.png"
-    words = ["simulate", scene, "-o", tmp_path / "scan", "--coarse", "--effects", ASKED, "--compare", picture, "--json"]
-    ended = command_line(*words)
+    settings = tmp_path / "camera.toml"
+    settings.write_text(f"[camera]\nsamples = {CAMERA['camera.samples']}\n")
+    words = ["simulate", scene, "--settings", settings, "-o", tmp_path / "scan", "--coarse", "--effects", ASKED]
+    ended = command_line(*words, "--compare", picture, "--json")
     record = json.loads(ended.out)["comparison"]
     assert record["picture"] == str(picture)
     assert width_of(picture) == 1600
@@ -196,7 +199,7 @@ def key_of(run: CaptureRun) -> str:
 def opened(scene_files: Path, out: Path, **flags: Any) -> CaptureRun:
     """A simulation of the small picture."""
     given = {"scene": str(scene_files / "scene.png"), "out": str(out), "effects": ASKED}
-    return open_simulation(load_settings(None, given | flags))[0]
+    return open_simulation(load_settings(None, given | CAMERA | flags))[0]
 
 
 @pytest.fixture(scope="module")

@@ -180,7 +180,7 @@ def test_rig_in_order(command_line: CommandLine, tmp_path: Path) -> None:
 def test_emulated_rig_is_checked_by_the_file_that_it_writes(command_line: CommandLine, tmp_path: Path) -> None:
     """The file is a survey's settings: both devices are where it says, mounted so, until the emulation ends."""
     file = tmp_path / "emulated.toml"
-    wanted = {"size": "64x48", "bands": "40,90", "effects": "none", "seed": "3", "rig.mirror_axes": "y,-x"}
+    wanted = {"size": "64x48", "bands": "40,90", "effects": "all", "seed": "3", "rig.mirror_axes": "y,-x"}
     settings = emulated_settings(None, wanted)
     request = EmulateRequest(settings, ("split-replies:1",), 0, 20.0, file)
     ended, codes = threading.Event(), []
@@ -210,7 +210,7 @@ def test_emulated_rig_is_checked_by_the_file_that_it_writes(command_line: Comman
 
 def test_emulation_ends_in_order() -> None:
     """At Ctrl-C: exit code 0, and the port is gone."""
-    words = ["rig", "emulate", "--size", "48x48", "--bands", "40", "--effects", "none"]
+    words = ["rig", "emulate", "--size", "48x48", "--bands", "40", "--effects", "all"]
     with subprocess.Popen(
         [sys.executable, "-m", "flows.cli.main", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:

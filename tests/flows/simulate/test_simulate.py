@@ -19,11 +19,20 @@ from pipeline.simulator.scenes.scene import SceneRaster
 from pipeline.simulator.simulated import SimulatedSource
 
 ASKED = "rotation,vignetting,shot,read-noise"
+SAMPLES = 192  # of a line; a narrow camera is quick to simulate
+
+
+def narrow(folder: Path) -> list[str]:
+    """Flags that name settings of a narrow camera, which are written to a folder."""
+    file = folder / "camera.toml"
+    file.write_text(f"[camera]\nsamples = {SAMPLES}\n")
+    return ["--settings", str(file)]
 
 
 def words(scene_files: Path, out: Path, *more: str) -> list[str]:
     """A command that scans the small picture coarsely."""
-    return ["simulate", str(scene_files / "scene.png"), "-o", str(out), "--coarse", "--effects", ASKED, *more]
+    given = ["-o", str(out), "--coarse", "--effects", ASKED, *narrow(out.parent)]
+    return ["simulate", str(scene_files / "scene.png"), *given, *more]
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +52,7 @@ def test_the_cubes_are_there_with_their_manifest(scan: Any, archive: Path) -> No
     (cube,) = [xr.open_zarr(archive / name, consolidated=False) for name in scan["cubes"]]
     assert cube["dn"].dims == ("line", "sample", "band")
     assert scan["lines"] == cube.sizes["line"]
-    assert scan["px_bands"] == cube.sizes["line"] * 640 * 3
+    assert scan["px_bands"] == cube.sizes["line"] * SAMPLES * 3
     assert cube.attrs["simulation"] == {"effects": scan["effects"], "total": scan["effects_total"]}
     assert [row["name"] for row in scan["effects"]] == [effect.name for effect in EFFECTS]
 
@@ -125,14 +134,16 @@ def test_unusual_files_are_scanned_or_refused(command_line: Any, tmp_path: Path)
     """One band, sixty full wells beside dark rows; of pixels without a value the first is named."""
     np.save(tmp_path / "one.npy", np.random.default_rng(0).uniform(0.1, 1, (20, 30, 1)).astype(np.float32))
     out = tmp_path / "scan"
-    ended = command_line("simulate", tmp_path / "one.npy", "-o", out, "--coarse", "--wavelengths", "650", "--json")
+    ended = command_line(
+        "simulate", tmp_path / "one.npy", "-o", out, *narrow(tmp_path), "--coarse", "--wavelengths", "650", "--json"
+    )
     rows = {row["name"]: row for row in json.loads(ended.out)["effects"]}
     assert (rows["smile"]["reason"], rows["smear"]["state"]) == ("absent", "on")
     rows = np.zeros((128, 160, 3), np.float32)
     rows[1::2] = 1
     np.save(tmp_path / "rows.npy", rows)
     flags = ["--wavelengths", "640,550,460", "--exposure-ms", "10000", "-o", str(tmp_path / "scan"), "--json"]
-    record = json.loads(command_line("simulate", str(tmp_path / "rows.npy"), *flags).out)
+    record = json.loads(command_line("simulate", str(tmp_path / "rows.npy"), *narrow(tmp_path), *flags).out)
     assert record["lines"] == 131
     assert record["effects_total"]["within"]
     values = np.ones((20, 30, 4), np.float32)

@@ -18,7 +18,7 @@ from pipeline.errors import SettingsError
 
 ROOT = Path(__file__).parents[3]
 NOWHERE = "/proc/nonexistent"  # where not even root can write
-FARM = ["--scene", "farm", "--size", "64x64", "--effects", "shot"]
+FARM = ["--scene", "farm", "--size", "64x64", "--effects", "all"]
 VERBS = """
 from flows.cli.main import main
 for words in ({survey}, {plan}, {report}):
@@ -123,9 +123,11 @@ def test_a_farm_is_surveyed_by_a_user_without_a_home(tmp_path: Path) -> None:
     """Survey, plan and report end well and say nothing of homes; numba keeps its work in the private folder."""
     temporary, out = tmp_path / "temporary", str(tmp_path / "archive")
     temporary.mkdir()
+    settings = tmp_path / "camera.toml"
+    settings.write_text("[camera]\nsamples = 96\n")  # quick to simulate
     code = VERBS.format(
-        survey=["survey", *FARM, "--engine", "plain", "--no-controls", "--out", out],
-        plan=["plan", *FARM, "--out", out],
+        survey=["survey", str(settings), *FARM, "--engine", "plain", "--no-controls", "--out", out],
+        plan=["plan", str(settings), *FARM, "--out", out],
         report=["report", out, "-o", str(tmp_path / "index.html")],
     )
     environment = {
