@@ -25,8 +25,7 @@ from pipeline.simulator.scenes.daylight import sun_elevation_deg
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.farm.seasons import LOWEST_SUN_DEG, sun_over_farm
 from pipeline.simulator.selection.choice import Decision, decide
-from pipeline.simulator.selection.survey_probe import probe_scene
-from tests.hard_cases.simulated_scene import CAMERA, RIG, SWEEP, block_of, decided, left_out, scene_of
+from tests.hard_cases.simulated_scene import CAMERA, RIG, block_of, decided, left_out, probed, scene_of
 
 TEXTURE = scene_of(np.random.default_rng(0).uniform(0.2, 1, (60, 80, 3)))
 FLAT = scene_of(np.ones((60, 80, 3)))
@@ -104,7 +103,7 @@ def test_light_goes_out_at_the_horizon() -> None:
 def test_survey_into_the_night_loses_all_of_its_light(variant: str) -> None:
     """Left out, drift errs by the whole level; it is on, and no variant errs by more than that."""
     rig = replace(RIG, sky=EVENING)
-    probe = replace(probe_scene(FLAT, rig, [SWEEP]), seconds=2 * 3600.0)
+    probe = replace(probed(FLAT, rig), seconds=2 * 3600.0)
     assert DRIFT.bound(probe, rig).value == pytest.approx(probe.level.max())
     assert DRIFT.bound(probe, rig, variant).value <= probe.level.max() * (1 + 1e-9)
     decision = decide(probe, rig, EFFECTS, 0.1)
@@ -187,7 +186,7 @@ def test_flat_scene_at_infinity_shows_no_turbulence() -> None:
     """Infinite ways through the air and a slope of 0 are no NaN: unseen."""
     rig = replace(RIG, air=Air(distance_m=math.inf))
     assert math.isfinite(turbulence_px(rig))
-    assert TURBULENCE.bound(probe_scene(FLAT, rig, [SWEEP]), rig).value == 0
+    assert TURBULENCE.bound(probed(FLAT, rig), rig).value == 0
 
 
 def test_turbulence_turns_the_ends_of_lines() -> None:
