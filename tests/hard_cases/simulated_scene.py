@@ -63,9 +63,7 @@ def probed(scene: RasterScene, rig: Rig, sweep: Sweep = SWEEP) -> Probe:
     asked = scene.planes.tobytes(), scene.planes.shape, scene.electrons.tobytes(), rig, sweep
     if asked not in PROBES:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(
-                survey_probe, "MOST_SAMPLES", 3000
-            )  # a sweep here has 1920: usually it is seen many times over
+            patch.setattr(survey_probe, "MOST_SAMPLES", 3000)  # of a sweep's 1920, some seen twice
             patch.setattr(survey_probe, "FINEST_SAMPLES", 300)
             PROBES[asked] = survey_probe.probe_scene(scene, rig, [sweep])
     return PROBES[asked]

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
+import dask
 import numpy as np
 import pytest
 from dask.distributed import LocalCluster
@@ -139,7 +140,7 @@ def test_a_killed_worker_costs_only_time(tmp_path: Path, processes: Crew) -> Non
 
 def test_a_block_that_kills_its_workers_is_one_error() -> None:
     """Where every try kills the worker, the error says so and what to do; a crew kept open gets other workers."""
-    with Crew("processes", 1).open() as crew:
+    with dask.config.set({"distributed.scheduler.allowed-failures": 1}), Crew("processes", 1).open() as crew:
         (before, _), *_ = run_blocks(threads_here, [0], crew)
         with pytest.raises(
             WorkerError, match=r"1 worker processes: workers died .* in the same block.*--scheduler threads"

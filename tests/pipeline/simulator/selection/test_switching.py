@@ -45,6 +45,7 @@ class Case:
     seconds: float | None = None  # from the first line to the last; None is that of the sweeps
 
 
+@cache
 def scene_of(case: Case) -> RasterScene:
     """Pixels of one component that all bands show alike."""
     y, x = np.mgrid[:1000, :680]
