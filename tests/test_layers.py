@@ -60,9 +60,15 @@ def source() -> dict[Path, ast.Module]:
     return {path.relative_to(ROOT): ast.parse(path.read_text(encoding="utf-8"), str(path)) for path in found}
 
 
+@cache
+def nodes(tree: ast.AST) -> list[ast.AST]:
+    """All nodes of a tree, walked once for every rule."""
+    return list(ast.walk(tree))
+
+
 def imported(tree: ast.AST) -> Iterator[str]:
     """Names of all modules imported anywhere in the file, those for type checkers included."""
-    for node in ast.walk(tree):
+    for node in nodes(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -94,7 +100,7 @@ def module_name(path: Path) -> str:
 def imported_files(path: Path, tree: ast.Module, known: set[str]) -> set[str]:
     """Modules of the house that a file names, ``from package import module`` included."""
     names = set(imported(tree))
-    for node in ast.walk(tree):
+    for node in nodes(tree):
         if isinstance(node, ast.ImportFrom):
             names |= {f"{node.module}.{alias.name}" for alias in node.names}
     return (names & known) - {module_name(path)}
@@ -141,7 +147,7 @@ def test_pipeline_opens_no_files() -> None:
     numeric = {path: tree for path, tree in source().items() if path.parts[0] == "pipeline" and path.parts[1] != "rig"}
     assert [path for path, tree in numeric.items() if FILE_MODULES & {n.split(".")[0] for n in imported(tree)}] == []
     opening = {"open", "memmap", "getenv"}
-    calls = ((path, node) for path, tree in numeric.items() for node in ast.walk(tree) if isinstance(node, ast.Call))
+    calls = ((path, node) for path, tree in numeric.items() for node in nodes(tree) if isinstance(node, ast.Call))
     assert [f"{path}:{node.lineno}" for path, node in calls if called_name(node) in opening] == []
 
 
@@ -165,7 +171,7 @@ def test_files_say_at_their_heads_what_they_need() -> None:
     """What takes long to load is deferred at a file's head; functions import only what the table gives a reason for."""
     found: dict[str, set[str]] = {}
     for path, tree in source().items():
-        inner = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+        inner = [node for node in nodes(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
         if names := {name.split(".")[0] for function in inner for name in imported(function)}:
             found[path.as_posix()] = names
     assert found == {path: set(packages.split()) for path, (packages, _) in IN_FUNCTIONS.items()}
@@ -179,9 +185,7 @@ def test_folders_can_be_held_in_mind() -> None:
 
 def test_class_names_are_unique() -> None:
     """Whoever reads the name of a class knows which one is meant."""
-    names = Counter(
-        node.name for tree in source().values() for node in ast.walk(tree) if isinstance(node, ast.ClassDef)
-    )
+    names = Counter(node.name for tree in source().values() for node in nodes(tree) if isinstance(node, ast.ClassDef))
     assert {name: count for name, count in names.items() if count > 1} == {}
 
 

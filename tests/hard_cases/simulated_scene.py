@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
+from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep
 from pipeline.lazy import Once
 from pipeline.simulator.effects.effect import Effect, SweepBlock
-from pipeline.simulator.effects.probe import noise_electrons
+from pipeline.simulator.effects.probe import Probe, noise_electrons
 from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Rig, Sky
 from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
+from pipeline.simulator.selection import survey_probe
 from pipeline.simulator.selection.choice import Decision, decide
 from pipeline.simulator.selection.options import acts_on_light
-from pipeline.simulator.selection.survey_probe import probe_scene
 from pipeline.simulator.simulated import sweep_block
 
 ROUNDING = 4e-6  # of the light over its noise: sums of float32 in another order
@@ -26,6 +28,7 @@ CAMERA = LineCamera(samples=64)
 RIG = Rig(camera=CAMERA)
 SWEEP = Sweep("s", "fine", "x", strip_px=0.0, start_px=-15.5, lines=30)
 NOON = datetime(2026, 6, 21, 11, 20, tzinfo=UTC)
+PROBES: dict[tuple[Any, ...], Probe] = {}  # made already: most of a small decision is its look at the scene
 EVERYTHING = Rig(  # that a rig may have
     camera=CAMERA,
     mirror=MirrorMotion(positions_per_line=0.7, repeatability_urad=40.0, hysteresis_px=2.0, drift_px_per_min=1.0),
@@ -55,9 +58,20 @@ def block_of(scene: RasterScene, rig: Rig, lines: range = range(0, 30, 5), sweep
     return sweep_block(scene, rig, sweep, lines)
 
 
+def probed(scene: RasterScene, rig: Rig, sweep: Sweep = SWEEP) -> Probe:
+    """What the decision sees of a sweep, looked at once however many tolerances or tests ask."""
+    asked = scene.planes.tobytes(), scene.planes.shape, scene.electrons.tobytes(), rig, sweep
+    if asked not in PROBES:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(survey_probe, "MOST_SAMPLES", 3000)  # of a sweep's 1920, some seen twice
+            patch.setattr(survey_probe, "FINEST_SAMPLES", 300)
+            PROBES[asked] = survey_probe.probe_scene(scene, rig, [sweep])
+    return PROBES[asked]
+
+
 def decided(scene: RasterScene, rig: Rig, tolerance: float = 0.1, sweep: Sweep = SWEEP) -> Decision:
     """What the rule makes of a scene and a rig."""
-    return decide(probe_scene(scene, rig, [sweep]), rig, EFFECTS, tolerance)
+    return decide(probed(scene, rig, sweep), rig, EFFECTS, tolerance)
 
 
 def left_out(scene: RasterScene, rig: Rig) -> dict[str, tuple[float, float]]:

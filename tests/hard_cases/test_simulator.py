@@ -21,7 +21,17 @@ from pipeline.simulator.render import expected_light, read_out
 from pipeline.simulator.rig_model import Detector, Optics, Rig
 from pipeline.simulator.selection.options import ALWAYS_ON
 from pipeline.simulator.selection.survey_probe import probe_scene
-from tests.hard_cases.simulated_scene import CAMERA, EVERYTHING, RIG, SWEEP, block_of, decided, left_out, scene_of
+from tests.hard_cases.simulated_scene import (
+    CAMERA,
+    EVERYTHING,
+    RIG,
+    SWEEP,
+    block_of,
+    decided,
+    left_out,
+    probed,
+    scene_of,
+)
 
 TOLERANCES = [0.0, 0.1, math.inf]
 TEXTURE = np.random.default_rng(0).uniform(0.2, 1, (60, 80, 3))
@@ -65,7 +75,7 @@ def test_black_scene_without_dark_current_has_no_shot_noise() -> None:
 
 def test_gradient_bounds_a_point_of_infinite_curvature() -> None:
     """Where the image has no second derivative the bound is slope times width, and no axis without blur counts."""
-    probe = probe_scene(scene_of(TEXTURE), RIG, [SWEEP])
+    probe = probed(scene_of(TEXTURE), RIG)
     point = replace(probe, curvature=np.full((2, 3), np.inf))
     width = RIG.optics.aberration_px
     by_slope = np.minimum(width * point.slope.sum(axis=0), point.span).max()

@@ -28,7 +28,7 @@ def drawn(grid: SceneGrid, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).exponential(size=int(np.prod(grid.seat_shape))) ** 3
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=7, deadline=None)
 @given(
     st.floats(0, 60), st.floats(0, 60), st.integers(0, 99), st.sampled_from(["x", "y"]), st.none() | st.floats(0.05, 3)
 )
@@ -43,7 +43,7 @@ def test_price_within_budget_and_worth_grows_with_it(
     assert large.worth >= small.worth * (1 - 1e-12)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=5, deadline=None)
 @given(st.integers(40, 700), st.integers(40, 1500), st.floats(0, 80), st.integers(0, 99))
 def test_plans_hold_together(height: int, width: int, budget_s: float, seed: int):
     """Sweeps lie apart, the price is the cost model's, and the seats shown are worth at least what was bought."""
@@ -124,7 +124,7 @@ def test_a_seat_alone_costs_its_own_lines():
     assert (nothing.lines, nothing.seconds) == (0, 0.0)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(st.sets(st.integers(0, 55), min_size=2, max_size=20))
 def test_neighbours_share_their_lines(seats: set[int]):
     """Seats bought together take at most the lines of each by itself, and no fewer than the dearest of them."""
@@ -201,7 +201,7 @@ def test_a_margin_shows_the_seats_wherever_the_mirror_looks() -> None:
         assert set(plan.seats) <= set(covered_seats(grid, camera, beside))
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=5, deadline=None)
 @given(st.floats(0, 4), st.floats(0, 4), st.floats(1, 80), st.integers(0, 99), st.sampled_from(["x", "y"]))
 @example(1.0, 4.0, 46.0, 54, "x")  # the budget pays for the full scan, and at the low threshold the last seats do not
 def test_a_higher_threshold_never_buys_more(one: float, other: float, budget_s: float, seed: int, along: str):
@@ -256,7 +256,7 @@ def test_the_full_scan_has_to_pay_as_well():
     assert kinds == ["full", "full", "lines"]
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=5, deadline=None)
 @given(st.integers(0, 99), st.floats(5, 40))
 def test_negative_scores_ride_along_and_change_nothing(seed: int, budget_s: float):
     """The plan is that of scores of 0 in their place: negative seats are shown by runs made for others alone."""

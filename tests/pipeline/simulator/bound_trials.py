@@ -67,11 +67,11 @@ class _Stored:
         return most, left
 
 
-def trials(case: Case, binnings: Sequence[int] = (1,)) -> Iterator[Trial]:
+def trials(case: Case, binnings: Sequence[int] = (1,), only: str = "") -> Iterator[Trial]:
     """Leave out every effect that the rig has, and take each variant, beside all others exact.
 
     Changes are over the noise of every stored number of all sweeps, with everything on; draws are paired. The same
-    light is stored in each of the ``binnings``.
+    light is stored in each of the ``binnings``. ``only`` names the one effect that is tried, where it is not every one.
     """
     probes = [case.stored_in_sums_of(binning).probe() for binning in binnings]
     menus = [list_options(probe, case.rig, IN_THE_LIGHT) for probe in probes]
@@ -82,7 +82,7 @@ def trials(case: Case, binnings: Sequence[int] = (1,)) -> Iterator[Trial]:
     render = partial(expected_light, case.scene)
     contrast = [np.asarray(contrast_about(block, render)) for block in blocks]
     stored = [_stored(full, contrast, case, binning, found) for binning, found in zip(binnings, menus, strict=True)]
-    for menu in present:
+    for menu in (one for one in present if only in ("", one.name)):
         for variant in (OFF, *(option.variant for option in menu.variants[1:])):
             chosen = {effect: variant if effect is menu.effect else way for effect, way in exact.items()}
             light = [_light(case, block, chosen) for block in blocks]

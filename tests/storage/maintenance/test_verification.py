@@ -24,7 +24,7 @@ from storage.maintenance.verification import find_shard, name_damage
 from storage.remote.opening import verify_archive
 from tests.storage.small_archive import flip, small_survey
 
-FLIPS = 80
+FLIPS = 30
 
 
 def _with_cube(archive: Archive) -> StageRef:

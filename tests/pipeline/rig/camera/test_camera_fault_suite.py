@@ -27,7 +27,7 @@ from pipeline.source import Line
 from tests.pipeline.rig.mirror.test_fault_suite import moves
 from tests.pipeline.rig.small_rig import SmallRig, assert_simulated, small_rig
 
-SEEDS = range(20)
+SEEDS = range(8)
 SWEEP = Sweep("fine-5", "fine", "x", 1.5, -4.5, 7)
 PAIRS = 5  # of the vector memory, with its lead-in: four lines a capture
 CAPTURES = [(0, 4), (4, 7)]
@@ -175,7 +175,7 @@ def session(looks: Looks, undisturbed: list[Line], camera: CameraFaults, mirror:
 
 @pytest.mark.parametrize("fault", CameraFault, ids=lambda fault: str(fault.value))
 def test_no_fault_of_the_camera_loses_lines_or_hangs(fault: CameraFault, looks: Looks, undisturbed: list[Line]) -> None:
-    """Twenty sweeps with each: struck once at some occasion, or so often that asking again does not help."""
+    """Eight sweeps with each: struck once at some occasion, or so often that asking again does not help."""
     ended, struck = 0, 0
     for seed in SEEDS:
         rng = np.random.default_rng(seed)
@@ -197,7 +197,7 @@ def test_no_fault_of_the_camera_loses_lines_or_hangs(fault: CameraFault, looks: 
 
 @pytest.mark.parametrize("name", OF_MIRROR)
 def test_no_fault_of_the_mirror_spoils_a_sweep(name: str, looks: Looks, undisturbed: list[Line]) -> None:
-    """Twenty sweeps with each: lines are right or not given, and the sweep is ended once the mirror is mended."""
+    """Eight sweeps with each: lines are right or not given, and the sweep is ended once the mirror is mended."""
     ended = 0
     for seed in SEEDS:
         session(looks, undisturbed, CameraFaults(), (make_fault(name, seed),))

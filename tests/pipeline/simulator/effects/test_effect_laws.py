@@ -91,9 +91,9 @@ def scene(flat: bool = False) -> RasterScene:
 
 
 @cache
-def probe() -> Probe:
+def probe(flat: bool = False) -> Probe:
     """What the decision sees of it."""
-    return replace(probe_scene(scene(), RIG, (FINE,)), seconds=600.0)
+    return replace(probe_scene(scene(flat), RIG, (FINE,)), seconds=600.0)
 
 
 def rig_without(name: str) -> Rig:
@@ -163,9 +163,8 @@ def test_effects_are_complete(effect: Effect):
 @pytest.mark.parametrize("effect", [*AIMS, *RAYS, *FOOTPRINT], ids=lambda effect: effect.name)
 def test_flat_scenes_show_no_shift_and_no_blur(effect: Effect):
     """Bound 0 without slope, curvature and span; none where no line is taken but for the air's and the footprint's."""
-    flat = probe_scene(scene(flat=True), RIG, (FINE,))
     for variant in (OFF, *effect.variants):
-        assert effect.bound(flat, RIG, variant).value == pytest.approx(0, abs=1e-3)
+        assert effect.bound(probe(flat=True), RIG, variant).value == pytest.approx(0, abs=1e-3)
     none = even_probe(sweeps=(), lines=0, slope=np.ones((2, 1)), curvature=np.ones((2, 1)))
     if effect in AIMS[:-1] or effect.name in ("parallax", "rotation", "smear"):
         assert effect.bound(none, RIG).value == 0

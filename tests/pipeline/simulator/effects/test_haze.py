@@ -24,7 +24,7 @@ from pipeline.simulator.effects.haze import (
 )
 from pipeline.simulator.effects.probe import fixed_variance
 from pipeline.simulator.rig_model import Air, Optics, Rig, Sky
-from pipeline.simulator.selection.survey_probe import probe_scene
+from pipeline.simulator.selection import survey_probe
 from tests.pipeline.simulator.outdoors import (
     BANDS,
     MORNING,
@@ -157,13 +157,14 @@ def test_air_is_dark_at_night() -> None:
 
 @pytest.mark.parametrize("air", [CLEAR_30_M, HAZY_300_M, Air(math.inf), SLOPING])
 @pytest.mark.parametrize("black", [slice(1, 2), slice(None)], ids=["one band", "all bands"])
-def test_bands_without_light_have_a_finite_bound(air: Air, black: slice) -> None:
+def test_bands_without_light_have_a_finite_bound(air: Air, black: slice, monkeypatch: pytest.MonkeyPatch) -> None:
     """What air adds to them is all that there is; nothing overflows, with any effect of the view."""
     values = np.random.default_rng(0).uniform(0, 1, (24, 32, 3))
     values[..., black] = 0
+    monkeypatch.setattr(survey_probe, "MOST_SAMPLES", 1500)  # as many as there are in so small a field
     scene = image_scene(values, LineCamera(samples=32), [640.0, 550.0, 460.0])
     rig = Rig(LineCamera(samples=32), air=air, sky=Sky(brdf_per_rad=0.3, hot_spot=0.2))
-    probe = probe_scene(scene, rig, full_sweeps(SceneGrid(24, 32, 8, 4), rig.camera, "x"))
+    probe = survey_probe.probe_scene(scene, rig, full_sweeps(SceneGrid(24, 32, 8, 4), rig.camera, "x"))
     found = [PATH_RADIANCE.bound(probe, rig, variant).value for variant in (OFF, *PATH_RADIANCE.variants)]
     assert np.isfinite(found).all()
     assert found[0] > 0

