@@ -40,9 +40,11 @@ class RayViews:
         """Some of the samples."""
         return RayViews(*(getattr(self, one.name)[which] for one in fields(self)))
 
-    def thinned(self, level: int) -> RayViews:
-        """The same places in px of a scene of which every ``level``-th pixel is left, the first one first."""
-        return self if level == 1 else replace(self, along=self.along / level, scan=self.scan / level)
+    def thinned(self, level: int, before: int) -> RayViews:
+        """The same places in px of a scene of which every ``level``-th pixel is left, after ``before`` others."""
+        if level == 1:
+            return self
+        return replace(self, along=self.along / level + before, scan=self.scan / level + before)
 
     def flat(self) -> RayViews:
         return RayViews(*(np.ravel(getattr(self, one.name)) for one in fields(self)))

@@ -16,7 +16,7 @@ from pipeline.rectify.kernels import tensor_rows
 from pipeline.simulator.optics.kernel_fit import Footprint
 from pipeline.simulator.optics.rays import RayViews
 from pipeline.simulator.optics.tap_sums import Gatherer, ScenePixels
-from pipeline.simulator.scenes.scene import RasterScene
+from pipeline.simulator.scenes.scene import THINNED_MARGIN, RasterScene
 
 if TYPE_CHECKING:
     import torch
@@ -104,7 +104,7 @@ class Looker:
             for number, views in enumerate(steps):
                 into = more if number else parts
                 for level, some, gatherer in self.gatherers:
-                    gatherer.gather(pixels[level], views[chunk].thinned(level), into[:, :rows], some)
+                    gatherer.gather(pixels[level], views[chunk].thinned(level, THINNED_MARGIN), into[:, :rows], some)
                 if number:
                     parts[:, :rows] += more[:, :rows]
             bands.write(parts, light[chunk])

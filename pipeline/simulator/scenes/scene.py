@@ -21,6 +21,7 @@ from pipeline.readings import MOST_VALUE, find_beyond
 
 Drawn = tuple[NDArray[np.float32], NDArray[np.uint8] | None]
 _BINOMIAL = (np.array([1, 8, 28, 56, 70, 56, 28, 8, 1]) / 256).astype(np.float32)
+THINNED_MARGIN = 4  # pixels of a level beside the scene: as far as the binomial kernel reaches
 DEFAULT_EXPOSURE_MS = 100.0  # the exposure at which a scene's electrons are stated
 WELL_SHARE = 0.6  # of the full well, filled by the bright end of a scene without a radiance law
 BRIGHT_PERCENTILE = 99.9
@@ -54,17 +55,23 @@ class SceneRaster:
         return self._drawn()
 
     def thinned(self, level: int) -> NDArray[np.float32]:
-        """Give the planes blurred, and every ``level``-th pixel of them, the first one first; 1, 2, 4, 8, ...
+        """Give the planes blurred, and every ``level``-th pixel of them: 1, 2, 4, 8, ...
 
-        From each level to the next every second pixel is left, after the binomial kernel of nine taps (variance 2,
-        Burt, Adelson, 1983): what it passes of waves that fewer pixels would show as others is below 2 % from 0.3
-        cycles per px on. Outside of the scene its edge is repeated; light is kept.
+        Beyond 1 the scene's first pixel comes after `THINNED_MARGIN` others, and as many follow: where blurred pixels
+        end all is edge, so that repeating the outermost one goes on as repeating the scene's edge does. From each level
+        to the next every second pixel is left, after the binomial kernel of nine taps (variance 2, Burt, Adelson,
+        1983): what it passes of waves that fewer pixels would show as others is below 2 % from 0.3 cycles per px on.
+        Light is kept.
         """
         if level == 1:
             return self.drawn()[0]
         with self._lock:
-            once = self._thinned.setdefault(level, Once(lambda: _halved(_halved(self.thinned(level // 2), 0), 1)))
+            once = self._thinned.setdefault(level, Once(lambda: self._halved(level // 2)))
         return once()
+
+    def _halved(self, level: int) -> NDArray[np.float32]:
+        before = 0 if level == 1 else THINNED_MARGIN
+        return _halved(_halved(self.thinned(level), 0, before), 1, before)
 
     def _checked(self, planes: NDArray[np.float32], labels: NDArray[np.uint8] | None) -> Drawn:
         size = None if labels is None else labels.shape
@@ -73,12 +80,13 @@ class SceneRaster:
         return planes, labels
 
 
-def _halved(planes: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
-    size, count = planes.shape[axis], planes.shape[axis] // 2 + 1
-    half = len(_BINOMIAL) // 2
+def _halved(planes: NDArray[np.float32], axis: int, before: int) -> NDArray[np.float32]:
+    """Every second pixel of blurred planes, counted from the one that ``before`` others precede."""
+    size, half = planes.shape[axis], len(_BINOMIAL) // 2
+    count = -(-(size - 1 + half - before) // 2) + THINNED_MARGIN + 1
     total = np.zeros((*planes.shape[:axis], count, *planes.shape[axis + 1 :]), np.float32)
     for offset, weight in enumerate(_BINOMIAL):
-        at = np.clip(2 * np.arange(count) + offset - half, 0, size - 1)
+        at = np.clip(before + 2 * (np.arange(count) - THINNED_MARGIN) + offset - half, 0, size - 1)
         total += weight * planes.take(at, axis=axis)
     return total
 

@@ -111,6 +111,20 @@ def test_thinned_scenes_keep_their_light(level: int) -> None:
     np.testing.assert_allclose(found.sum(axis=(0, 1)) * level**2, 1, rtol=1e-5)
 
 
+@pytest.mark.parametrize("pattern", ["rows", "columns", "noise"])
+def test_beyond_the_scene_its_edge_goes_on(pattern: str) -> None:
+    """A scene has the same light as one whose edge is repeated for 320 px more, also through the far tails."""
+    y, x = np.mgrid[:41, :52]
+    noise = np.random.default_rng(3).random((41, 52))
+    plane = {"rows": y % 2, "columns": x // 3 % 2, "noise": noise}[pattern]
+    values = np.repeat(plane[..., None] + 0.0, len(NM), axis=2)
+    wide = np.pad(values, ((320, 320), (320, 320), (0, 0)), mode="edge")
+    sweep = Sweep("s", "fine", "x", 0.0, -24.0, 49)
+    chosen = {SLIT: "3x1", DIFFRACTION: "airy", ABERRATION: "gaussian", KEYSTONE: "linear"}
+    light, same = (seen(image_scene(one, RIG.camera, NM), sweep, chosen) for one in (values, wide))
+    np.testing.assert_allclose(light / light.max(), same / same.max(), atol=3e-5)
+
+
 def test_tails_of_diffraction_reach_as_far_as_the_pupil_says() -> None:
     """Beside an edge, 10 to 50 px in the dark, lies 2 / pi^3 lambda / (D x) of the bright side.
 
