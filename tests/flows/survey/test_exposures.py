@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +39,5 @@ def test_a_faster_coarse_pass_leaves_its_seconds_to_the_fine_one(survey_png: Any
 @pytest.mark.parametrize("given", ["0", "-3", "nan", "1e9", "fast"])
 def test_an_exposure_that_no_camera_has_is_refused(given: str) -> None:
     """One message names the setting, what came and the limits."""
-    with pytest.raises(SettingsError, match="coarse_exposure_ms") as refused:
+    with pytest.raises(SettingsError, match=r"--coarse-exposure-ms must be a number from 0\.5 to 10000 ms, got"):
         load_settings(None, {"coarse_exposure_ms": given})
-    assert "0.5" in str(refused.value) or "number" in str(refused.value)
-    assert math.isclose(load_settings(None, {"coarse_exposure_ms": "12.5"}).coarse_exposure_ms or 0, 12.5)
