@@ -90,6 +90,9 @@ class Settings:
     budget: Budget = stated(
         0.5, "Seconds of coarse and fine capture over those of the full scan, above 0 and at most 1"
     )
+    coarse_exposure_ms: float | None = stated(
+        None, "Exposure of a coarse line; by default the camera's", "ms", 0.5, 10_000, example=25.0
+    )
     policy: Policy = stated("gain", "Where to look twice")
     mask: str | None = stated(None, "Image of where to look twice, for the policy mask", example="mask.png")
     vgg: str | None = stated(None, "Weights of VGG19, for the policies vgg-static and vgg-trained", example="vgg19.pth")

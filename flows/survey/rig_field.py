@@ -10,7 +10,7 @@ from typing import Any
 
 from flows.settings.survey_settings import Settings
 from pipeline.geometry.mirror import STRAIGHT
-from pipeline.geometry.scan import Sweep, sweep_positions
+from pipeline.geometry.scan import Sweep, exposing, sweep_positions
 from pipeline.rig.camera.camera_files import KeptInMemory
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.capture.capture_runner import RigDevices
@@ -54,7 +54,8 @@ class RigField:
 def rig_field(scene: RasterScene, settings: Settings, planned: Sequence[Sweep]) -> RigField:
     """The rig, not yet connected; SettingsError: times the camera does not take, PoseError: beyond the mirror."""
     camera, rig = settings.camera, settings.rig
-    check_times(camera.exposure_ms, camera.frame_ms, CameraLimits(most_rate_hz=camera.max_rate_hz))
+    for exposed in {exposing(camera, sweep) for sweep in planned} | {camera}:
+        check_times(exposed.exposure_ms, exposed.frame_ms, CameraLimits(most_rate_hz=camera.max_rate_hz))
     if rig.mounting != STRAIGHT:
         for sweep in planned:
             rig.mounting.to_device(sweep_positions(sweep, camera))

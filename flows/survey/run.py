@@ -96,8 +96,9 @@ def lay_out_sweeps(settings: Settings, grid: SceneGrid) -> tuple[Axis, list[Swee
     camera, cost, apart = settings.camera, settings.cost, 2 * settings.pointing_px
     coarse_overlap = _overlap(settings, grid.factor)
     along, full, _ = cheapest_full(grid, camera, cost, overlap_px=_overlap(settings, 1))
-    coarse = with_margin(coarse_sweeps(grid, camera, along, overlap_px=coarse_overlap), camera, apart)
-    return along, coarse, with_margin(full, camera, apart)
+    exposure_ms = settings.coarse_exposure_ms
+    looks = coarse_sweeps(grid, camera, along, overlap_px=coarse_overlap, exposure_ms=exposure_ms)
+    return along, with_margin(looks, camera, apart), with_margin(full, camera, apart)
 
 
 def _overlap(settings: Settings, step: int) -> float:

@@ -6,8 +6,8 @@ Points of a sweep are (along, scan) in px from the undeflected direction: (x, y)
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -46,6 +46,7 @@ class Sweep:
     lines: int
     step: int = 1
     binning: int = 1
+    exposure_ms: float | None = None  # of a line; the camera's own where it is None
 
     def held_px(self) -> NDArray[np.float64]:
         """Scan coordinate of every held position, (line, step) [px]."""
@@ -54,6 +55,21 @@ class Sweep:
     def line_px(self) -> NDArray[np.float64]:
         """Scan coordinate at mid exposure of every line, (line,) [px]."""
         return self.start_px + (self.step - 1) / 2 + np.arange(self.lines, dtype=np.float64) * self.step
+
+
+def exposing(camera: LineCamera, sweep: Sweep) -> LineCamera:
+    """Give the camera as it takes the lines of a sweep: with the sweep's exposure, if it has one of its own."""
+    return camera if sweep.exposure_ms in (None, camera.exposure_ms) else replace(camera, exposure_ms=sweep.exposure_ms)
+
+
+def count_by_exposure(sweeps: Sequence[Sweep], camera: LineCamera) -> dict[LineCamera, tuple[int, int]]:
+    """Count lines and sweeps of each exposure, by the camera as it takes them, in the order in which they come."""
+    counts: dict[LineCamera, tuple[int, int]] = {}
+    for sweep in sweeps:
+        exposed = exposing(camera, sweep)
+        lines, count = counts.get(exposed, (0, 0))
+        counts[exposed] = lines + sweep.lines, count + 1
+    return counts
 
 
 @dataclass(frozen=True)
@@ -73,9 +89,15 @@ class CostModel:
 
     def seconds(self, sweeps: list[Sweep], camera: LineCamera) -> float:
         """Price of the sweeps in the given order [s]: lines, a set-up each, and reloads of the vector memory."""
-        lines = sum(sweep.lines for sweep in sweeps)
         reloads = count_loads(sweeps, self.vector_pairs)
-        return camera.scan_seconds(lines) + len(sweeps) * self.setup_seconds(camera) + reloads * self.reload_s
+        return self.line_seconds(count_by_exposure(sweeps, camera)) + reloads * self.reload_s
+
+    def line_seconds(self, counts: Mapping[LineCamera, tuple[int, int]]) -> float:
+        """Price of so many lines of each exposure, with the set-ups of so many sweeps [s]."""
+        return sum(
+            exposed.scan_seconds(lines) + sweeps * self.setup_seconds(exposed)
+            for exposed, (lines, sweeps) in counts.items()
+        )
 
 
 def sweep_positions(sweep: Sweep, camera: LineCamera) -> Floats:

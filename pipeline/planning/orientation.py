@@ -154,19 +154,21 @@ def compare_orientations(
     overlap_px: float = 0,
     margin_px: float = 0,
     threshold: float | None = None,
+    coarse_exposure_ms: float | None = None,
 ) -> OrientationReport:
     """Plan the same scores with lines along the other axis, for the seconds that both passes have here.
 
-    Scores, budget, margin and threshold are those of :func:`pipeline.planning.fine_pass.plan_fine`, ``overlap_px`` that
-    of the coarse pass; its sweeps begin earlier and end later by the margin. ``plan`` is the plan with lines along
-    ``along`` where it is made already, ``rows`` the crop rows of the coarse image, for the sentence.
+    Scores, budget, margin and threshold are those of :func:`pipeline.planning.fine_pass.plan_fine`, ``overlap_px`` and
+    ``coarse_exposure_ms`` those of the coarse pass; its sweeps begin earlier and end later by the margin. ``plan`` is
+    the plan with lines along ``along`` where it is made already, ``rows`` the crop rows of the coarse image, for the
+    sentence.
 
     Raises PoseError: the field is beyond the mirror's range with lines along ``along``; the other axis is only
     reported.
     """
 
     def coarse_seconds(axis: Axis) -> float:
-        sweeps = coarse_sweeps(grid, camera, axis, overlap_px=overlap_px)
+        sweeps = coarse_sweeps(grid, camera, axis, overlap_px=overlap_px, exposure_ms=coarse_exposure_ms)
         return cost.seconds(with_margin(sweeps, camera, margin_px), camera)
 
     def fine(axis: Axis, seconds: float) -> FinePlan:

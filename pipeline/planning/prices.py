@@ -85,7 +85,8 @@ def check_budget(budget: float, coarse_seconds: float, full_seconds: float) -> f
         raise BudgetError(
             f"--budget {budget} gives {budget * full_seconds:.1f} s, but the coarse pass alone takes "
             f"{coarse_seconds:.1f} of the full scan's {full_seconds:.1f} s; "
-            f"the least possible is {least_budget(coarse_seconds, full_seconds)}"
+            f"the least possible is {least_budget(coarse_seconds, full_seconds)}, or less with a shorter "
+            "--coarse-exposure-ms"
         )
     return max(left, 0.0)
 

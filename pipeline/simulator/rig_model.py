@@ -6,12 +6,13 @@ Nothing here was measured on a unit: what is not of a data sheet (from memory) i
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from typing import Literal
 
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep, exposing
 from pipeline.setting_fields import assumed, check_stated, stated
 
 Coating = Literal["aluminium", "gold", "silver", "ideal"]  # ideal: reflects everything, at any angle
@@ -130,6 +131,11 @@ class Rig:
             check_stated(getattr(self, place), place)
         if self.sky.started is not None and self.sky.started.tzinfo is None:
             raise SettingsError(f"sky.started needs a time zone, got {self.sky.started}; add +00:00 for UTC")
+
+    def taking(self, sweep: Sweep) -> Rig:
+        """Give the rig as it takes the lines of a sweep: with the sweep's exposure, if it has one of its own."""
+        camera = exposing(self.camera, sweep)
+        return self if camera is self.camera else replace(self, camera=camera)
 
     @property
     def distances_m(self) -> tuple[float, float] | None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
 from pipeline.geometry.camera import LineCamera, bin_samples
-from pipeline.geometry.scan import CostModel, Sweep, line_positions, memory_loads
+from pipeline.geometry.scan import CostModel, Sweep, exposing, line_positions, memory_loads
 from pipeline.simulator.effects.counting import DEFECTS, dead_elements, hot_electrons
 from pipeline.simulator.effects.effect import OFF, SweepBlock
 from pipeline.simulator.effects.mirror_throughput import VIGNETTING
@@ -92,7 +92,7 @@ class SimulatedSource:
 
     def lines_of(self, sweep: Sweep, numbers: range) -> list[Line]:
         """Give some lines of the sweep, as `lines` does. Threads may ask at the same time."""
-        camera, middle = self.camera, line_positions(sweep, self.camera)
+        camera, middle = exposing(self.camera, sweep), line_positions(sweep, self.camera)
         return [
             Line(
                 number=number,
@@ -137,7 +137,8 @@ class SimulatedSweep:
     @property
     def time_s(self) -> NDArray[np.float64]:
         """(line,) of mid exposure, since the start of the sweep [s]."""
-        return self.source.camera.mid_exposure_s(np.arange(self.sweep.lines, dtype=np.float64))
+        camera = exposing(self.source.camera, self.sweep)
+        return camera.mid_exposure_s(np.arange(self.sweep.lines, dtype=np.float64))
 
     @property
     def valid_line(self) -> NDArray[np.bool_]:
@@ -162,12 +163,14 @@ def sweep_starts(
         for part in load.parts:
             loads_before.setdefault(part.sweep, number)
     starts: dict[str, float] = {}
-    lines = loads = 0
+    taken: dict[LineCamera, tuple[int, int]] = {}
+    loads = 0
     for place, sweep in enumerate(sweeps):
-        loads = loads_before.get(place, loads)
-        spent = camera.scan_seconds(lines) + (place + 1) * cost.setup_seconds(camera) + loads * cost.reload_s
-        starts[sweep.name] = after_s + spent
-        lines += sweep.lines
+        loads, exposed = loads_before.get(place, loads), exposing(camera, sweep)
+        lines, count = taken.get(exposed, (0, 0))
+        taken[exposed] = lines, count + 1
+        starts[sweep.name] = after_s + (cost.line_seconds(taken) + loads * cost.reload_s)
+        taken[exposed] = lines + sweep.lines, count + 1
     return starts
 
 
@@ -175,6 +178,7 @@ def sweep_block(
     scene: RasterScene, rig: Rig, sweep: Sweep, lines: range, *, seed: int = 0, started_s: float = 0.0
 ) -> SweepBlock:
     """Give some lines of a sweep, which starts ``started_s`` after the survey did, as effects ask about them."""
+    rig = rig.taking(sweep)
     white = scene.panel_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
     return SweepBlock(rig, sweep, lines, scene.wavelength_nm, scene.shape, seed, started_s, scene.fwhm_nm, white)
 
@@ -224,6 +228,7 @@ def take_references(scene: RasterScene, rig: Rig, choice: Choice, sweep: Sweep) 
     rest, by the light of the survey's start. Dead and hot elements are told as bad; the panel's values are in the rig's
     bands.
     """
+    rig = rig.taking(sweep)
     block = sweep_block(scene, rig, AT_REST, range(1))
     dark = dark_frame(block, choice)
     assert block.white_e is not None

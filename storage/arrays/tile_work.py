@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import exposing
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.line_cache import LineCache
 from pipeline.rectify.line_numbers import LineNumbers, number_lines
@@ -72,10 +73,10 @@ def sight_sweeps(cubes: Sequence[RawCube], registration: Path | None, camera: Li
             shifts[name] = SweepShift(name, np.array(one["offset_px"]), np.array(one["drift_px_per_line"]))
             if one["gain"] is not None:
                 gains[name] = np.array(one["gain"], np.float32)
-    frame_s = camera.frame_ms * 1e-3
+    frames_s = [exposing(camera, cube.sweep).frame_ms * 1e-3 for cube in cubes]
     return [
         Sighted(cube, number_lines(cube.time_s, frame_s), shifts[cube.sweep.name], gains.get(cube.sweep.name))
-        for cube in cubes
+        for cube, frame_s in zip(cubes, frames_s, strict=True)
     ]
 
 

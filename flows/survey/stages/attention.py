@@ -118,6 +118,7 @@ def compare_turned(run: SurveyRun, mosaic: StageRef, attention: StageRef) -> Wan
             overlap_px=run.plan.overlap_px,
             margin_px=run.plan.margin_px,
             threshold=settings.threshold,
+            coarse_exposure_ms=settings.coarse_exposure_ms,
         )
         write_table(path / FILE, asdict(turned) | {"sentence": turned.sentence})
 

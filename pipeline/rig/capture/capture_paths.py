@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import RigError, SettingsError
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Axis, Sweep, line_positions, memory_loads, sweep_positions
+from pipeline.geometry.scan import Axis, Sweep, exposing, line_positions, memory_loads, sweep_positions
 from pipeline.rig.camera.camera_cubes import CapturedLines
 from pipeline.rig.capture.clock_fit import FrameTimes
 from pipeline.rig.capture.line_positions import (
@@ -137,7 +137,7 @@ def path_of(sweep: Sweep, lines: tuple[int, int], camera: LineCamera, *, trigger
     cells, middle = (
         wire_positions(some) for some in (np.concatenate([lead, held]), line_positions(sweep, camera)[slice(*lines)])
     )
-    return CapturePath(sweep, *lines, cells, middle, sweep.step * 1000 / camera.frame_ms, triggered)
+    return CapturePath(sweep, *lines, cells, middle, sweep.step * 1000 / exposing(camera, sweep).frame_ms, triggered)
 
 
 def can_trigger(pulses: Pulses, sweep: Sweep) -> bool:
@@ -207,7 +207,8 @@ def place_lines(
         number = np.where(number >= 0, number - captured.first_frame, -1)
     elif len(captured.values) == path.lines:
         number = np.arange(held)
-    frames = FrameTimes(number, captured.times.stamp_us[:held], camera.exposure_ms, camera.frame_ms)
+    exposed = exposing(camera, path.sweep)
+    frames = FrameTimes(number, captured.times.stamp_us[:held], exposed.exposure_ms, exposed.frame_ms)
     try:
         tied = _tied(frames, path, taken, camera, track, total=len(captured.values))
     except RigError as error:

@@ -22,7 +22,7 @@ import numpy as np
 
 from pipeline.errors import RigError
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.scan import Sweep
+from pipeline.geometry.scan import Sweep, exposing
 from pipeline.json_lines import read_checked, with_check
 from pipeline.rig.camera.camera_files import Kept
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
@@ -58,7 +58,7 @@ class CaptureJournal:
         self._origins: dict[str, int] = {}  # stamp of line 0 [us], by the sweep's name
         self._ties: dict[str, dict[str, Any]] = {}
         self._ended: set[str] = set()  # folders
-        self.references = ""
+        self.references: dict[float | None, str] = {}  # folders by the exposure that sweeps have of their own
         self.damage: list[str] = []
         self._read()
 
@@ -97,9 +97,10 @@ class CaptureJournal:
             for one in self._taken.values()
         ]
 
-    def refer(self, folder: str) -> None:
-        """Take down where the dark and white frames are."""
-        self._write({"what": "references", "folder": folder})
+    def refer(self, folder: str, exposure_ms: float | None = None) -> None:
+        """Take down where the dark and white frames of an exposure are; None is the camera's own."""
+        told = {} if exposure_ms is None else {"exposure_ms": exposure_ms}
+        self._write({"what": "references", "folder": folder, **told})
 
     def origin_us(self, sweep: Sweep, stamp_us: int | None = None) -> int | None:
         """Stamp of the sweep's line 0, taken down when it is first given."""
@@ -155,7 +156,7 @@ class CaptureJournal:
             case "tied":
                 self._ties[record["folder"]] = {name: record[name] for name in (*_TIES, "notes")}
             case "references":
-                self.references = record["folder"]
+                self.references[record.get("exposure_ms")] = record["folder"]
             case "origin":
                 self._origins[record["sweep"]] = record["stamp_us"]
 
@@ -197,7 +198,7 @@ class CaptureRunner:
         self.devices = devices
         self._kept, self._journal = kept, journal
         self._camera, self._rig, self._say = camera, rig, say
-        self._configured = False
+        self._times_ms: tuple[float, float] | None = None  # that the camera was told: exposure and frame period
 
     def take(self, path: CapturePath) -> CaptureRecord:
         """Take the lines of a path, and wait until they are on the camera.
@@ -206,18 +207,19 @@ class CaptureRunner:
         told to stop.
         """
         steering, prefix = self.devices.steering, capture_prefix(path.sweep, path.first)
-        self._configure()
+        exposed = exposing(self._camera, path.sweep)
+        self._configure(exposed)
         steering.load_path(path.cells, progress=lambda done, total: self._say(f"path: {done} of {total} cells"))
         steering.goto(*(float(place) for place in path.cells[0]))
         steering.settle(self._rig.settle_s)
         with self._stopped_on_error():
             if path.triggered:
                 if self._rig.log_pulses:
-                    steering.start_log(self._log_rate_hz(path.lines), with_index=True)
+                    steering.start_log(self._log_rate_hz(path.lines, exposed), with_index=True)
                 run_s = self._run(path)
                 capture = self.devices.camera.capture(path.lines, prefix=prefix)
             else:
-                steering.start_log(self._log_rate_hz(path.lines))
+                steering.start_log(self._log_rate_hz(path.lines, exposed))
                 capture = self.devices.camera.capture(path.lines, prefix=prefix)
                 run_s = self._run(path)
             at_s = (capture.sent_s, capture.acknowledged_s)
@@ -237,7 +239,7 @@ class CaptureRunner:
         RigError where it does not end, though it was told to.
         """
         camera, clock = self.devices.camera, self.devices.clock
-        began, wanted = clock.now(), self._seconds(taken.stop - taken.first)
+        began, wanted = clock.now(), exposing(self._camera, taken.sweep).scan_seconds(taken.stop - taken.first)
         until, stopped = began + wanted + SLACK_S, False
         while camera.is_capturing():
             self._say(f"capturing: {clock.now() - began:.0f} of {wanted:.0f} s")
@@ -259,16 +261,20 @@ class CaptureRunner:
             return taken
         return self._journal.ended(replace(taken, index_at_end=self.devices.steering.index()))
 
-    def look_at_rest(self, prefix: str) -> str:
-        """Take one frame with the mirror at 0; 0 (unless the settings say otherwise), and give its folder."""
-        self._configure()
+    def look_at_rest(self, prefix: str, exposure_ms: float | None = None) -> str:
+        """Take one frame with the mirror at 0; 0 (unless the settings say otherwise), and give its folder.
+
+        ``exposure_ms`` is the camera's own where it is None.
+        """
+        at_rest = replace(AT_REST, exposure_ms=exposure_ms)
+        self._configure(exposing(self._camera, at_rest))
         if self._rig.white_at_rest:
             self.devices.steering.park()
             self.devices.steering.settle(self._rig.settle_s)
         with self._stopped_on_error():
             capture = self.devices.camera.capture(1, prefix=prefix)
             at = (capture.sent_s, capture.acknowledged_s)
-            self.wait(CaptureRecord(AT_REST, 0, 1, capture.folder, False, at, at))
+            self.wait(CaptureRecord(at_rest, 0, 1, capture.folder, False, at, at))
         return capture.folder
 
     def log_of(self, taken: CaptureRecord) -> MirrorTrack | None:
@@ -286,10 +292,12 @@ class CaptureRunner:
         index = np.frombuffer(files[1][: len(files[1]) // 4 * 4], _INDEX).astype(np.int64)
         return MirrorTrack(time_s, position, line_edges(index, time_s[: len(index)], LEAD, taken.sweep.step))
 
-    def _configure(self) -> None:
-        if not self._configured:
-            self.devices.camera.configure(self._camera.exposure_ms, self._camera.frame_ms)
-        self._configured = True
+    def _configure(self, camera: LineCamera) -> None:
+        times_ms = camera.exposure_ms, camera.frame_ms
+        if times_ms != self._times_ms:
+            self._times_ms = None  # nobody knows which it has, should it not answer
+            self.devices.camera.configure(*times_ms)
+        self._times_ms = times_ms
 
     def _run(self, path: CapturePath) -> tuple[float, float]:
         clock, trigger = self.devices.clock, Trigger.RISING_EDGE if path.triggered else Trigger.OFF
@@ -312,12 +320,9 @@ class CaptureRunner:
         names = (name if number == 1 else f"{name}-{number}" for number in itertools.count(1))
         return next(one for one in names if not self._kept.size(one))
 
-    def _log_rate_hz(self, lines: int) -> float:
+    def _log_rate_hz(self, lines: int, camera: LineCamera) -> float:
         """As fast as the logger goes, or so that it holds the whole capture."""
-        return min(self._rig.log_rate_hz, (self._rig.log_samples - 1) / (self._seconds(lines) + SLACK_S))
-
-    def _seconds(self, lines: int) -> float:
-        return lines * self._camera.frame_ms * 1e-3
+        return min(self._rig.log_rate_hz, (self._rig.log_samples - 1) / (camera.scan_seconds(lines) + SLACK_S))
 
     @contextmanager
     def _stopped_on_error(self) -> Iterator[None]:

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from pipeline.errors import RigError
 from pipeline.geometry.camera import LineCamera, bin_samples
 from pipeline.geometry.mirror import STRAIGHT
-from pipeline.geometry.scan import Sweep
+from pipeline.geometry.scan import Sweep, exposing
 from pipeline.rig.camera.camera_cubes import as_references
 from pipeline.rig.camera.camera_files import NOT_LOGGED_IN, Kept
 from pipeline.rig.camera.headwall_camera import FrameClaim
@@ -104,7 +104,8 @@ class RigSource:
         }
         if self.rig.mounting != STRAIGHT:
             told["mounting"] = asdict(self.rig.mounting)
-        _, notes = self._whole.get(self._journal.references, (None, ()))
+        found = [self._whole[folder][1] for folder in self._journal.references.values() if folder in self._whole]
+        notes = dict.fromkeys(note for some in found for note in some)
         damage = {"journal": self._journal.damage} if self._journal.damage else {}
         return {"rig": told, "references": list(notes), "captures": self._journal.captures, **damage}
 
@@ -210,28 +211,28 @@ class RigSource:
         frame = (self.camera.samples // sweep.binning, len(self.wavelength_nm))
         nothing, (x, y) = np.zeros(frame, np.uint16), path.middle[0]
         time_s = self._time_s(sweep, number, -1)
-        return Line(number, nothing, float(x), float(y), time_s, self.camera.exposure_ms, valid=False)
+        return Line(number, nothing, float(x), float(y), time_s, exposing(self.camera, sweep).exposure_ms, valid=False)
 
     def references(self, sweep: Sweep) -> References:
-        """Dark and white frames with the sweep's binning, captured and fetched once for all sweeps.
+        """Dark and white frames with the sweep's binning, captured and fetched once for all sweeps of its exposure.
 
         RigError where the camera has none beside its captures, they do not fit, or a device failed.
         """
-        if self._journal.references not in self._whole:
+        exposure_ms, folders = sweep.exposure_ms, self._journal.references
+        if folders.get(exposure_ms, "") not in self._whole:
             with self.session() as runner:
-                known = self._journal.references and self._known_references(runner)
+                known = self._known_references(runner, folders[exposure_ms]) if exposure_ms in folders else None
                 if not known:
-                    self._journal.refer(runner.look_at_rest(REFERENCES))
-                    known = self._whole_references(runner, self._journal.references)
-                self._whole[self._journal.references] = known
-        whole, _ = self._whole[self._journal.references]
+                    self._journal.refer(runner.look_at_rest(REFERENCES, exposure_ms), exposure_ms)
+                    known = self._whole_references(runner, folders[exposure_ms])
+                self._whole[folders[exposure_ms]] = known
+        whole, _ = self._whole[folders[exposure_ms]]
         bad = None if whole.bad is None or not whole.bad.any() else _sums(whole.bad, sweep.binning) > 0
         dark, white = (_sums(frame, sweep.binning) for frame in (whole.dark, whole.white))
         return References(dark, white, whole.panel, bad, by_mirror=self.rig.white_at_rest)
 
-    def _known_references(self, runner: CaptureRunner) -> tuple[References, tuple[str, ...]] | None:
+    def _known_references(self, runner: CaptureRunner, folder: str) -> tuple[References, tuple[str, ...]] | None:
         """The frames of an earlier session; None where the camera has them no more: it was emptied, or is another."""
-        folder = self._journal.references
         try:
             return self._whole_references(runner, folder)
         except RigError as error:
@@ -274,7 +275,7 @@ class RigSource:
 
     def _given(self, values: NDArray[np.uint16], placed: PlacedLines, path: CapturePath, line: int) -> Iterator[Line]:
         """Lines from ``line`` on; one that the camera dropped, or that nothing places, is there and not valid."""
-        sweep = path.sweep
+        sweep, exposed = path.sweep, exposing(self.camera, path.sweep)
         nothing = np.zeros((values.shape[1] // sweep.binning, values.shape[2]), np.uint16)
         for place in range(line - path.first, len(placed.row)):
             row, valid = int(placed.row[place]), placed.is_valid(place)
@@ -285,17 +286,17 @@ class RigSource:
                 mirror_x=float(x),
                 mirror_y=float(y),
                 time_s=self._time_s(sweep, path.first + place, int(placed.stamp_us[row]) if row >= 0 else -1),
-                exposure_ms=self.camera.exposure_ms,
+                exposure_ms=exposed.exposure_ms,
                 valid=valid,
             )
 
     def _time_s(self, sweep: Sweep, number: int, stamp_us: int) -> float:
         """Of mid exposure since the sweep's first line began, by the camera's stamps; by its rate without them."""
-        known = stamp_us >= 0
+        known, exposed = stamp_us >= 0, exposing(self.camera, sweep)
         origin = self._journal.origin_us(sweep, stamp_us if known and number == 0 else None)
         if known and origin is not None:
-            return (stamp_us - origin) * 1e-6 + self.camera.mid_exposure_s(0.0)
-        return self.camera.mid_exposure_s(float(number))
+            return (stamp_us - origin) * 1e-6 + exposed.mid_exposure_s(0.0)
+        return exposed.mid_exposure_s(float(number))
 
     def _give_up(self, taken: CaptureRecord, line: int, why: str, *, last: bool) -> None:
         """Expect no more of a capture: what it lacks is captured again, unless that has been tried already."""

@@ -111,10 +111,10 @@ def decide(
     """Choose off or a variant for every effect, so that the sum of their errors stays within the tolerance.
 
     Tolerance 0 is everything that the rig has, exact; an infinite one switches off all that may be off. Quantisation
-    and saturation are never off; what the rig has none of always is. ``probes``: one for each binning of the survey;
-    the worst counts. ``effects``: in the order of the chain, which does not change what is chosen. ``tolerance``:
-    greatest change of any stored number, in the unit of the probes. ``asked``: ``auto``; ``all``: on and exact;
-    ``none``; or names with commas: those on, in the variants that the tolerance lets them have, and the others off.
+    and saturation are never off; what the rig has none of always is. ``probes``: one for each binning and exposure of
+    the survey; the worst counts. ``effects``: in the order of the chain, which does not change what is chosen.
+    ``tolerance``: greatest change of any stored number, in the unit of the probes. ``asked``: ``auto``; ``all``: on and
+    exact; ``none``; or names with commas: those on, in the variants that the tolerance lets them have, the others off.
 
     Raises SettingsError: the tolerance is negative or no number, or an asked name is not known.
     """

@@ -98,7 +98,7 @@ def acts_on_light(effect: Effect) -> bool:
 def list_options(probes: Probe | Sequence[Probe], rig: Rig, effects: Sequence[Effect]) -> tuple[Menu, ...]:
     """Ask every effect for the bounds of its options; errors are in the unit of the probes.
 
-    Of several probes, one for each binning of a survey, every option has the error of the worst.
+    Of several probes, one for each binning and exposure of a survey, every option has the error of the worst.
 
     Raises SettingsError: two effects have one name, or a bound is negative or not a number; names it.
     """
@@ -107,7 +107,8 @@ def list_options(probes: Probe | Sequence[Probe], rig: Rig, effects: Sequence[Ef
         if effect.name in seen:
             raise SettingsError(f"two effects are named {effect.name!r}; register each once")
         seen.add(effect.name)
-    each = [_options_of(probe, rig, effects) for probe in ([probes] if isinstance(probes, Probe) else probes)]
+    some = [probes] if isinstance(probes, Probe) else probes
+    each = [_options_of(probe, rig.taking(probe.sweeps[0]) if probe.sweeps else rig, effects) for probe in some]
     return tuple(_worst_of(menus) for menus in zip(*each, strict=True))
 
 

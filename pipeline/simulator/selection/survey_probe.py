@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError
-from pipeline.geometry.scan import CostModel, Sweep
+from pipeline.geometry.scan import CostModel, Sweep, exposing
 from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE
 from pipeline.simulator.effects.effect import OFF
 from pipeline.simulator.effects.line import SLIT, UPRIGHT, box_of, box_parts
@@ -48,28 +48,42 @@ _PHASES = tuple(((along, scan), (0.0, 0.0)) for along in (0.0, 0.5) for scan in 
 
 
 def probe_survey(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit = "sigma") -> tuple[Probe, ...]:
-    """Probe the scene for sweeps of any binning: one probe for each binning that they have, the smallest first.
+    """Probe the scene for sweeps of any binning and exposure: one probe for each pair, the smallest binning first.
 
-    Time, lines and the usual light they have in common. Raises SceneError, SettingsError, PoseError as `probe_scene`.
+    Time, lines and the usual light, by the exposure, they have in common.
+
+    Raises SceneError, SettingsError, PoseError as `probe_scene`.
     """
     taken = _taken(sweeps)
-    each = [tuple(one for one in taken if one.binning == binning) for binning in sorted({one.binning for one in taken})]
-    probes = [probe_scene(scene, rig, some, unit) for some in each]
+    alike: dict[tuple[int, float], list[Sweep]] = {}
+    for sweep in taken:
+        alike.setdefault((sweep.binning, exposing(rig.camera, sweep).exposure_ms), []).append(sweep)
+    each = sorted(alike.items())
+    probes = [probe_scene(scene, rig, some, unit) for _, some in each]
     lines, seconds = sum(one.lines for one in probes), CostModel().seconds(list(taken), rig.camera)
-    return tuple(replace(one, lines=lines, seconds=seconds, usual_e=probes[0].usual_e) for one in probes)
+    first, usual = each[0][0][1], probes[0].usual_e
+    assert usual is not None
+    return tuple(
+        replace(one, lines=lines, seconds=seconds, usual_e=usual * (exposure_ms / first))
+        for one, ((_, exposure_ms), _) in zip(probes, each, strict=True)
+    )
 
 
 def probe_scene(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Unit = "sigma") -> Probe:
     """Look at the scene through the footprint alone where it is steepest, brightest and darkest, and along some lines.
 
     Where to look is found on the scene's own pixels, so that the maxima hold for the whole image. Raises SceneError:
-    the scene holds a number that is not finite; SettingsError: no line to take, or sweeps of several binnings;
+    the scene holds a number that is not finite; SettingsError: no line to take, or sweeps of several binnings or
+    exposures;
     PoseError: a sweep is out of the mirror's reach.
     """
     taken = _taken(sweeps)
     binnings = {sweep.binning for sweep in taken}
     if len(binnings) > 1:
         raise SettingsError(f"expected sweeps of one binning, got {sorted(binnings)}; probe each of them")
+    if len({exposing(rig.camera, sweep) for sweep in taken}) > 1:
+        raise SettingsError("expected sweeps of one exposure, got several; probe each of them")
+    rig = rig.taking(taken[0])
     binning, camera, bands = binnings.pop(), rig.camera, len(scene.wavelength_nm)
     room = max(min(MOST_VALUES // bands, MOST_SAMPLES), 64)
     lines = views_of_lines(taken, camera, room // 3)

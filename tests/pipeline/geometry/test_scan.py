@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -17,6 +18,7 @@ from pipeline.geometry.scan import (
     Sweep,
     count_loads,
     device_range,
+    exposing,
     line_positions,
     memory_loads,
     points_of_scan,
@@ -103,6 +105,18 @@ def test_price_counts_lines_setups_and_reloads():
     assert cost.setup_seconds(LineCamera(readout_ms=5)) == pytest.approx(0.05 + 0.2 + 2 * 0.105)
     assert cost.seconds([path, path], CAMERA) == pytest.approx(200 + 2 * 0.45 + 6 * 1.6)
     assert cost.seconds([], CAMERA) == 0
+
+
+def test_sweeps_of_other_exposures_cost_their_own_frames():
+    """Lines and settling by each sweep's exposure, reloads once for all; the camera's own where a sweep has none."""
+    cost, slow, fast = CostModel(), sweep(lines=100), replace(sweep(lines=400), exposure_ms=10.0)
+    assert exposing(CAMERA, slow) is CAMERA
+    assert exposing(CAMERA, fast) == replace(CAMERA, exposure_ms=10.0)
+    assert cost.seconds([slow, fast], CAMERA) == pytest.approx(10 + 0.45 + 4 + 0.27 + 1.6)
+    parts = [cost.seconds([one], CAMERA) for one in (slow, fast)]
+    assert cost.seconds([slow, fast], CAMERA) == pytest.approx(sum(parts) - 1.6)
+    own = replace(slow, exposure_ms=CAMERA.exposure_ms)
+    assert cost.seconds([own, fast], CAMERA) == cost.seconds([slow, fast], CAMERA)
 
 
 COST = CostModel()

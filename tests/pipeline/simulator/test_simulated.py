@@ -22,7 +22,7 @@ from pipeline.simulator.effects.registry import BY_NAME, EFFECTS, USUAL, effects
 from pipeline.simulator.effects.sensor import response_gain, stripe_gain
 from pipeline.simulator.rig_model import Detector, Rig, Sky
 from pipeline.simulator.scenes.scene import RasterScene
-from pipeline.simulator.simulated import SimulatedSource, sweep_starts
+from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_starts
 from pipeline.source import References, Source
 from tests.pipeline.simulator.small_scenes import image_scene, made_scene
 
@@ -51,6 +51,27 @@ def test_lines_do_not_depend_on_where_one_starts() -> None:
             np.testing.assert_array_equal(line.data, same.data)
             assert replace(line, data=same.data) == same
     assert list(source.lines(SWEEP, 40)) == []
+
+
+@pytest.mark.parametrize("exposure_ms", [3.0, 250.0])
+def test_a_sweep_of_its_own_exposure_is_as_by_a_camera_that_has_it(exposure_ms: float) -> None:
+    """Numbers, times, exposures and references, of light that drifts while the survey goes on."""
+    values = np.random.default_rng(2).random((40, 100, 3))
+    other = replace(CAMERA, exposure_ms=exposure_ms)
+    options: dict[str, Any] = {
+        "seed": 5,
+        "chosen": effects_on(*QUIET, "lag", "shot", "dark-current"),
+        "clock": {"s": 7.0},
+    }
+    source, told = source_of(values, **options), source_of(values, other, **options)
+    own = replace(SWEEP, exposure_ms=exposure_ms)
+    for line, same in zip(source.lines(own), told.lines(SWEEP), strict=True):
+        np.testing.assert_array_equal(line.data, same.data)
+        assert replace(line, data=same.data) == same
+        assert line.exposure_ms == exposure_ms
+    found, wanted = source.references(own), told.references(SWEEP)
+    np.testing.assert_array_equal([found.dark, found.white], [wanted.dark, wanted.white])
+    np.testing.assert_array_equal(SimulatedSweep(source, own).time_s, SimulatedSweep(told, SWEEP).time_s)
 
 
 def test_line_says_when_and_where() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from ftplib import FTP
 from itertools import islice
 
@@ -37,6 +37,28 @@ def assert_same(found: list[Line], sweep: Sweep, first: int = 0) -> None:
     times = [line.time_s for line in simulated_lines(sweep)[first:]]
     np.testing.assert_allclose([line.time_s for line in found], times, atol=1e-6)
     assert all(line.valid and line.exposure_ms == CAMERA.exposure_ms for line in found)
+
+
+def test_sweeps_have_exposures_of_their_own():
+    """The camera is told each, lines and references are those of that exposure, and the journal knows them again."""
+    own, kept = replace(COARSE, exposure_ms=25.0), KeptInMemory()
+    with small_rig() as rig:
+        source = rig.source(kept)
+        for sweep in (own, FINE):
+            expected = list(small_source().lines(sweep))
+            found = list(source.lines(sweep))
+            np.testing.assert_array_equal([line.data for line in found], [line.data for line in expected])
+            np.testing.assert_allclose([line.time_s for line in found], [line.time_s for line in expected], atol=1e-6)
+            assert {line.exposure_ms for line in found} == {sweep.exposure_ms or CAMERA.exposure_ms}
+            dark, white = source.references(sweep).dark, source.references(sweep).white
+            wanted = small_source().references(sweep)
+            np.testing.assert_allclose(dark, wanted.dark, atol=0.6)
+            np.testing.assert_allclose(white, wanted.white, atol=0.6)
+        assert len(rig.captures) == 2
+        again = rig.source(kept)  # as another process
+        np.testing.assert_array_equal(again.references(own).white, source.references(own).white)
+        assert [line.exposure_ms for line in again.lines_again(own, [2])] == [25.0]
+        assert len(rig.captures) == 2
 
 
 @pytest.mark.parametrize("sweep", [COARSE, FINE], ids=lambda sweep: sweep.kind)
@@ -129,7 +151,7 @@ def test_references_are_fetched_once(monkeypatch: pytest.MonkeyPatch):
             assert sharing.record["references"]
         assert (len(log_ins), rig.opened) == (once, opened)
         elsewhere = KeptInMemory()
-        CaptureJournal(elsewhere).refer(CaptureJournal(kept).references)
+        CaptureJournal(elsewhere).refer(CaptureJournal(kept).references[None])
         source.keeping(elsewhere).references(FINE)
         assert (len(log_ins), rig.opened) == (2 * once, opened + 1)
         assert elsewhere.files.keys() == kept.files.keys()

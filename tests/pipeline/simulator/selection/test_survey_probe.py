@@ -208,6 +208,27 @@ def test_a_survey_has_a_probe_for_each_binning() -> None:
         probe_scene(scene, RIG, [coarse, SWEEP])
 
 
+def test_a_survey_has_a_probe_for_each_exposure() -> None:
+    """That of a rig which takes all lines so, but for the time and the lines of all."""
+    scene, coarse = mixed(4), replace(SWEEP, name="c", kind="coarse", lines=15, step=4, binning=4, exposure_ms=25.0)
+    fast = replace(SWEEP, name="f", exposure_ms=5.0)
+    probes = probe_survey(scene, RIG, [coarse, SWEEP, fast])
+    assert [(one.binning, one.sweeps) for one in probes] == [(1, (fast,)), (1, (SWEEP,)), (4, (coarse,))]
+    for exposure_ms, sweep, found in ((5.0, fast, probes[0]), (25.0, coarse, probes[2])):
+        told = replace(RIG, camera=replace(RIG.camera, exposure_ms=exposure_ms))
+        alone = probe_scene(scene, told, [replace(sweep, exposure_ms=None)])
+        for name in ("level", "span", "slope", "curvature", "spread", "white_e"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(alone, name))
+        assert (found.brightest_e, found.darkest_e) == (alone.brightest_e, alone.darkest_e)
+    usual = [one.usual_e for one in probes]
+    np.testing.assert_allclose(usual[1], 20 * usual[0], rtol=1e-12)
+    dim, whole = ({one.name: one for one in list_options(probe, RIG, EFFECTS)} for probe in (probes[0], probes[1]))
+    assert dim["lag"].off.error > 0
+    assert dim["dark-current"].off.why != whole["dark-current"].off.why  # of 5 ms, and of 100
+    with pytest.raises(SettingsError, match="one exposure"):
+        probe_scene(scene, RIG, [SWEEP, fast])
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_number_that_is_not_finite_is_refused_with_its_place(bad: float) -> None:
     """A scene with NaN or infinity is refused, and the message says where."""

@@ -1,0 +1,43 @@
+"""A coarse pass of its own exposure: what it costs, what is stored, and what it leaves for the fine pass."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from flows.settings.load import load_settings
+from pipeline.errors import SettingsError
+
+
+def _cubes(archive: Path) -> dict[str, xr.Dataset]:
+    return {path.stem: xr.open_zarr(path, consolidated=False) for path in archive.glob("**/capture/**/*.zarr")}
+
+
+def test_a_faster_coarse_pass_leaves_its_seconds_to_the_fine_one(survey_png: Any, tmp_path: Path) -> None:
+    """Cubes say which exposure a line had; the budget is the same, and the fine pass gets what the coarse one saves."""
+    usual = survey_png(tmp_path / "usual", budget="0.6").receipt
+    fast = survey_png(tmp_path / "fast", budget="0.6", coarse_exposure_ms="25").receipt
+    cubes = _cubes(tmp_path / "fast")
+    coarse = [cube for name, cube in cubes.items() if name.startswith("coarse")]
+    assert {value for cube in coarse for value in cube["exposure_ms"].values.tolist()} == {25.0}
+    assert {len(set(np.diff(cube["time"].values).round(6).tolist())) for cube in coarse} == {1}
+    fine = [cube for name, cube in cubes.items() if name.startswith("fine")]
+    assert {value for cube in fine for value in cube["exposure_ms"].values.tolist()} == {100.0}
+    passes = [receipt["plan"]["orientation"]["taken"] for receipt in (usual, fast)]
+    spared_s = (sum(cube.sizes["line"] for cube in coarse) + 2 * len(coarse)) * 0.075  # lines, and frames to settle
+    assert passes[0]["coarse_s"] - passes[1]["coarse_s"] == pytest.approx(spared_s)
+    assert passes[1]["fine_s"] > passes[0]["fine_s"] + spared_s / 2
+    seconds = [receipt["savings"]["capture_s"] for receipt in (usual, fast)]
+    assert seconds[0]["full"] == seconds[1]["full"]
+    assert all(one["done"] <= 0.6 * one["full"] for one in seconds)
+
+
+@pytest.mark.parametrize("given", ["0", "-3", "nan", "1e9", "fast"])
+def test_an_exposure_that_no_camera_has_is_refused(given: str) -> None:
+    """One message names the setting, what came and the limits."""
+    with pytest.raises(SettingsError, match=r"--coarse-exposure-ms must be a number from 0\.5 to 10000 ms, got"):
+        load_settings(None, {"coarse_exposure_ms": given})
