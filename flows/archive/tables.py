@@ -158,6 +158,7 @@ def show_repair(content: dict[str, Any], console: Console) -> None:
 
 def _table(title: str, *columns: str, left: int = 3) -> Table:
     table = Table(
+        pad_edge=False,
         title=escape(title),
         title_justify="left",
         title_style="bold",

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import Phase, example, given, settings
 from hypothesis import strategies as st
 
 from pipeline.geometry.camera import LineCamera
@@ -87,7 +87,7 @@ ASKED = st.builds(
 )
 
 
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=4, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))  # a case takes seconds
 @given(ASKED)
 @example(Asked())
 @example(Asked(pattern="columns", binning=14, noiseless=True))
