@@ -30,6 +30,7 @@ survey: $(BIN)/.ok
 survey-rig: $(BIN)/.ok
 	OMP_NUM_THREADS=1 $(BIN)/python tests/soak survey-rig
 
+# Laws draw the same cases each time; PYTEST_ARGS="-n 2 --hypothesis-profile=anew" draws others.
 # Tests start hundreds of processes: bytecode is kept between them, also where the environment says otherwise.
 test: $(BIN)/.ok
 	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q $(PYTEST_ARGS)
