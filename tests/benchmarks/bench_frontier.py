@@ -119,8 +119,10 @@ def _survey(seed: int, budget: float, coarse_ms: float) -> tuple[float, float]:
             "size": f"{SHAPE[0]}x{SHAPE[1]}",
             "seed": str(seed),
             "budget": str(budget),
+            "coarse_exposure_ms": str(coarse_ms),
+            "engine": "plain",
+            "controls": False,
             "out": out,
         }
-        more = {"out": out, "coarse_exposure_ms": str(coarse_ms), "engine": "plain", "controls": False}
-        receipt = run_survey(load_settings(None, given | more), Console(quiet=True)).receipt
+        receipt = run_survey(load_settings(None, given), Console(quiet=True)).receipt
     return receipt["savings"]["capture_s"]["done"], 100 * receipt["accuracy"]["miou_of_shown_classes"]

@@ -66,10 +66,10 @@ class SceneRaster:
         if level == 1:
             return self.drawn()[0]
         with self._lock:
-            once = self._thinned.setdefault(level, Once(lambda: self._halved(level // 2)))
+            once = self._thinned.setdefault(level, Once(lambda: self._half_of(level // 2)))
         return once()
 
-    def _halved(self, level: int) -> NDArray[np.float32]:
+    def _half_of(self, level: int) -> NDArray[np.float32]:
         before = 0 if level == 1 else THINNED_MARGIN
         return _halved(_halved(self.thinned(level), 0, before), 1, before)
 

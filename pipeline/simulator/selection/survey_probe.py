@@ -74,8 +74,7 @@ def probe_scene(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Uni
 
     Where to look is found on the scene's own pixels, so that the maxima hold for the whole image. Raises SceneError:
     the scene holds a number that is not finite; SettingsError: no line to take, or sweeps of several binnings or
-    exposures;
-    PoseError: a sweep is out of the mirror's reach.
+    exposures; PoseError: a sweep is out of the mirror's reach.
     """
     taken = _taken(sweeps)
     binnings = {sweep.binning for sweep in taken}
