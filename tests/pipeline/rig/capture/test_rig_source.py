@@ -44,9 +44,10 @@ def test_sweeps_have_exposures_of_their_own():
     own, kept = replace(COARSE, exposure_ms=25.0), KeptInMemory()
     with small_rig() as rig:
         source = rig.source(kept)
-        for sweep in (own, FINE):
+        with source.session():  # as one visit: the camera is told anew between sweeps
+            given = {sweep: list(source.lines(sweep)) for sweep in (own, FINE)}
+        for sweep, found in given.items():
             expected = list(small_source().lines(sweep))
-            found = list(source.lines(sweep))
             np.testing.assert_array_equal([line.data for line in found], [line.data for line in expected])
             np.testing.assert_allclose([line.time_s for line in found], [line.time_s for line in expected], atol=1e-6)
             assert {line.exposure_ms for line in found} == {sweep.exposure_ms or CAMERA.exposure_ms}

@@ -226,16 +226,18 @@ def test_kernels_that_differ_misplace_more() -> None:
     boxless = {effect: way for effect, way in EXACT.items() if effect is not SLIT}
     for other in (without, boxless, {**EXACT, SMEAR: "folded"}, {**EXACT, DIFFRACTION: "one-width"}):
         assert misplaced_share(block, EXACT, other) == pytest.approx(same + NEGLIGIBLE)
+    apart = sweep_block(image_scene(np.ones((48, 64, 2)), RIG.camera, [300.0, 2500.0]), RIG, SWEEP, range(2))
+    assert misplaced_share(apart, EXACT, without) > same + 2 * NEGLIGIBLE  # few kernels stand for both, and say so
 
 
+@pytest.mark.parametrize("nm", [(450.0, 640.0, 980.0), (300.0, 1200.0, 2500.0)], ids=["near", "far apart"])
 @pytest.mark.parametrize("pattern", ["rows", "columns"])
-def test_two_ways_to_fold_the_same_light_differ_by_no_more(pattern: str) -> None:
+def test_two_ways_to_fold_the_same_light_differ_by_no_more(pattern: str, nm: tuple[float, ...]) -> None:
     """Light of 60 full wells that no keystone can change, along rows, or that no held position can, along columns."""
     y, x = np.mgrid[:48, :64]
     plane = (y if pattern == "rows" else x) // 2 % 2
     values = plane[..., None] * np.array([1.0, 0.7, 0.9])
-    nm = np.array([450.0, 640.0, 980.0])
-    scene = image_scene(values, RIG.camera, nm)
+    scene = image_scene(values, RIG.camera, np.array(nm))
     block = sweep_block(scene, RIG, SWEEP, range(12))
     unshifted = {effect: way for effect, way in EXACT.items() if effect is not KEYSTONE}
     other = unshifted if pattern == "rows" else {**EXACT, SMEAR: "folded"}
