@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from bench_tiles import alone
+from bench_tiles import CAMERA, alone, write_raw
 from measure import Row
-from paper_scale import CAMERA, write_raw
 
 from models.network.process import keep_freed_memory, use_one_thread
 from pipeline.geometry.grid import SceneGrid

@@ -15,9 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from measure import Row
+from measure import Row, peak_bytes
 from numpy.typing import NDArray
-from paper_scale import peak_bytes
 from rich.console import Console
 
 from flows.publish.survey_command import run_survey

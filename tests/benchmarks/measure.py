@@ -1,4 +1,4 @@
-"""How the benchmarks measure: processor time of calls in turn on one thread, and rows of one table."""
+"""How the benchmarks measure: processor time of calls in turn on one thread, memory, and rows of one table."""
 
 from __future__ import annotations
 
@@ -72,6 +72,12 @@ def time_in_turn(calls: Mapping[str, Callable[[], object]], rounds: int = 5) -> 
 def ratio(clocks: Mapping[str, Clock], of: str, to: str) -> float:
     """Median over the rounds of one call's processor time over another's: what a loaded machine leaves unchanged."""
     return statistics.median(a / b for a, b in zip(clocks[of].cpu_s, clocks[to].cpu_s, strict=True) if b > 0)
+
+
+def peak_bytes() -> int:
+    """Highest resident memory of this process; ``getrusage`` would count what it was started from as well."""
+    lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) * 1024
 
 
 def aligned(cells: Sequence[Sequence[str]], most: Sequence[int]) -> str:
