@@ -44,6 +44,8 @@ DISTRIBUTIONS = {
 FILE_MODULES = {"pathlib", "shutil", "tempfile", "glob", "io", "fileinput"}
 READS = {"open", "read_text", "read_bytes", "getenv", "load_dotenv", "read_csv", "loadtxt", "load_file"}
 MOST_FILES = 25  # in a folder
+MOST_LINES = 8  # of what is clear without a docstring
+Documented = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
 IN_FUNCTIONS = {  # file -> packages that a function of it imports, and why no file's head does
     "flows/publish/survey_command.py": ("PIL", "for Prefect's pages alone"),
     "flows/survey/prefect_engine.py": ("prefect", "that it cannot be imported is told, and the survey runs plain"),
@@ -90,6 +92,15 @@ def at_import(tree: ast.Module) -> Iterator[ast.AST]:
 def called_name(node: ast.Call) -> str:
     """The last part of what is called."""
     return node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+
+
+def public(node: ast.Module | ast.ClassDef, of: str = "") -> Iterator[tuple[str, Documented]]:
+    """Functions and classes that a file shows, and the methods that those classes show, by their names."""
+    for inner in node.body:
+        if isinstance(inner, Documented) and not inner.name.startswith("_"):
+            yield of + inner.name, inner
+            if isinstance(inner, ast.ClassDef):
+                yield from public(inner, f"{of}{inner.name}.")
 
 
 def module_name(path: Path) -> str:
@@ -190,6 +201,17 @@ def test_class_names_are_unique() -> None:
     assert {name: count for name, count in names.items() if count > 1} == {}
 
 
+def test_what_is_public_says_what_it_does() -> None:
+    """A public function, method or class of more lines than are read at a glance has a docstring."""
+    silent = [
+        f"{path}:{node.lineno} {name}"
+        for path, tree in source().items()
+        for name, node in public(tree)
+        if (node.end_lineno or node.lineno) - node.lineno >= MOST_LINES and not ast.get_docstring(node)
+    ]
+    assert silent == []
+
+
 def test_packages_are_those_of_this_folder() -> None:
     """An import takes the rooms of this project, not packages of the same name from elsewhere."""
     for room in ROOMS:
@@ -216,3 +238,9 @@ def test_walk_finds_what_it_looks_for() -> None:
     )
     assert list(imported(tree)) == ["os", "zarr"]
     assert sorted(called_name(node) for node in at_import(tree) if isinstance(node, ast.Call)) == ["getenv", "open"]
+
+
+def test_walk_finds_what_is_public() -> None:
+    """Methods of a class that is shown are seen, and nothing whose name begins with an underscore."""
+    methods = ast.parse("class A:\n    def b(self): ...\n    def _c(self): ...\nclass _D:\n    def e(self): ...\n")
+    assert [name for name, _ in public(methods)] == ["A", "A.b"]

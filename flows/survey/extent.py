@@ -69,6 +69,10 @@ class Extent:
         return replace(self, fine_lines=lines, fine_runs=ceil(lines / run_lines))
 
     def work(self, unit: Unit) -> float:
+        """Give how much of a unit of work a survey of this size has; 0 of the fine pass where nothing of it is known.
+
+        Pixels are px of the field, values px times bands, operations multiply-adds of the network.
+        """
         height, width = self.grid.coarse_shape
         coarse, fine = self.coarse_lines * self.camera.samples, (self.fine_lines or 0) * self.camera.samples
         match unit:

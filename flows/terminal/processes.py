@@ -218,6 +218,7 @@ class KeptProcess:
         self.keep_up()
 
     def stop(self) -> None:
+        """End it where it runs: in good order for as long as the patience lasts, then at once."""
         if self._process is not None and self.runs():
             self._process.terminate()
             try:

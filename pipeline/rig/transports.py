@@ -81,6 +81,11 @@ class SerialTransport:
             ) from error
 
     def write(self, data: bytes, deadline: float) -> None:
+        """Send all bytes within the time that a port takes at most, whatever is left until the deadline.
+
+        DeadlinePassed: no time was left, or the port took too long, and then some may have gone.
+        DeviceGone: the port is not there any more.
+        """
         if self._clock.now() >= deadline:
             raise DeadlinePassed(f"no time was left to send {len(data)} bytes to {self.port}; give a longer deadline")
         try:
@@ -93,6 +98,10 @@ class SerialTransport:
             raise self._gone(error) from error
 
     def read(self, at_most: int, deadline: float) -> bytes:
+        """Wait for a first byte until the deadline, and give what is there, ``at_most`` at most; none where none came.
+
+        DeviceGone: the port is not there any more.
+        """
         try:
             while self._clock.now() < deadline:
                 first: bytes = self._serial.read(1)
@@ -104,6 +113,7 @@ class SerialTransport:
             raise self._gone(error) from error
 
     def drain(self) -> bytes:
+        """Give what is there already, without waiting, and no more than some buffers: a port may never fall silent."""
         drained = b""
         try:
             while len(drained) < _MOST_DRAINED and (there := self._serial.in_waiting):
@@ -158,6 +168,11 @@ class SocketTransport:
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def write(self, data: bytes, deadline: float) -> None:
+        """Send all bytes before the deadline.
+
+        DeadlinePassed: no time was left, or the other end did not take them, and then some may have gone.
+        DeviceGone: the connection is lost.
+        """
         left = deadline - self._clock.now()
         if left <= 0:
             raise DeadlinePassed(f"no time was left to send {len(data)} bytes to {self.port}; give a longer deadline")
@@ -170,6 +185,10 @@ class SocketTransport:
             raise self._gone(str(error)) from error
 
     def read(self, at_most: int, deadline: float) -> bytes:
+        """Wait for bytes until the deadline, and give what is there, ``at_most`` at most; none where none came.
+
+        DeviceGone: the connection is lost, or the other end closed it.
+        """
         left = deadline - self._clock.now()
         if left <= 0:
             return b""
@@ -186,6 +205,10 @@ class SocketTransport:
         return data
 
     def drain(self) -> bytes:
+        """Give what is there already, without waiting, and no more than some buffers: a sender may never fall silent.
+
+        DeviceGone: the connection is lost, or the other end closed it.
+        """
         drained = b""
         self._socket.setblocking(False)
         try:

@@ -95,6 +95,10 @@ class Wind(Displacement):
     cost_ns = MappingProxyType({"exact": 0.9})
 
     def displaced(self, block: SweepBlock, along_px: Floats, scan_px: Floats, variant: str) -> tuple[Floats, Floats]:
+        """Give the crop's sway at scene points (line, sample): along the line and the scan. [px]
+
+        A plane wave A sin(2 pi (f t - way / gust) + phase), its way and its motion along the wind's heading.
+        """
         sway, air = sway_px(block.rig), block.rig.air
         if sway == 0 or air.distance_m is None:
             return np.zeros_like(along_px), np.zeros_like(scan_px)
@@ -168,6 +172,7 @@ class Parallax(Displacement):
         return share * (along_px - sweep.strip_px), share * (scan_px - block.scan_px[:, None])
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
+        """Bound by the slope times the greatest displacement: at a line's ends, at the nearest or farthest surface."""
         share = greatest_share(rig.air)
         if share == 0 or not probe.sweeps:
             return Bound(0.0, "all of the scene is at one distance")

@@ -209,6 +209,7 @@ class Keystone(Blur):
         return Moments(shift, np.zeros_like(shift))
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
+        """Bound by the slope along the line times each band's shift, never more than the span."""
         shift = np.abs(keystone_shift(rig, probe.wavelength_nm))
         change = np.minimum(probe.slope[0] * shift, probe.span)
         if not shift.any():

@@ -83,6 +83,10 @@ class Absorption(Gain):
         return GainRange.of(passed, nm, uneven=float(passed.max(initial=0.0) - passed.min(initial=1.0)))
 
     def gain(self, block: SweepBlock, variant: str) -> Light:
+        """Give the share that passes, (line, sample, band), or (1, 1, band) where one distance stands for all.
+
+        Every sample's is read off a table over the logarithm of the distance, by straight lines.
+        """
         rig, reach = block.rig, reach_m(block.rig)
         if reach is None:
             return np.ones((1, 1, 1), np.float32)
@@ -149,6 +153,10 @@ class PathRadiance(LightChange):
         return Bound(worst, f"air {verb} {most} and adds its own, over {spoken_reach(reach)}")
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
+        """Give what passes between the nearest and the farthest sample, and the greatest light that air adds. [e-]
+
+        Added light is the airlight's share of the white panel's, where that is known, times what the daylight grows by.
+        """
         reach, nm = reach_m(rig), np.asarray(probe.wavelength_nm, np.float64)
         if reach is None:
             return GainRange.between(1.0, 1.0, len(nm))
@@ -168,6 +176,7 @@ class PathRadiance(LightChange):
         )
 
     def change(self, light: Light, block: SweepBlock, variant: str) -> Light:
+        """Give light (line, sample, band) [e-] with what air takes of it and adds; changed in place."""
         reach = reach_m(block.rig)
         if reach is None:
             return light

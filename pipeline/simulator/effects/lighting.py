@@ -121,6 +121,7 @@ class Cloud(Gain):
         return GainRange.between(1 - share, 1.0, len(probe.wavelength_nm), uneven=share)
 
     def gain(self, block: SweepBlock, variant: str) -> Light:
+        """Give 1 less what the shadow takes at each sample's place and time, (line, sample, 1); (1, 1, 1) if clear."""
         sky = block.rig.sky
         if sky.cloud_share == 0:
             return np.ones((1, 1, 1), np.float32)
@@ -156,6 +157,7 @@ class Brdf(Gain):
     cost_ns = MappingProxyType({"angles": 0.2})
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
+        """Bound by level times the greatest change: the slope at the largest angle, the hot spot at the least phase."""
         slope, hot = rig.sky.brdf_per_rad, rig.sky.hot_spot
         if slope == 0 and hot == 0:
             return Bound(0.0, "the scene reflects alike in all directions")
@@ -175,6 +177,7 @@ class Brdf(Gain):
         return GainRange.between(least, greatest, bands, uneven=greatest - least)
 
     def gain(self, block: SweepBlock, variant: str) -> Light:
+        """Give 1 + b a + h exp(-phase / 2 deg) of each sample's direction, (line, sample, 1), 0 where that is below."""
         sky = block.rig.sky
         if sky.brdf_per_rad == 0 and sky.hot_spot == 0:
             return np.ones((1, 1, 1), np.float32)

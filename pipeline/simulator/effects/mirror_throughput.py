@@ -65,6 +65,10 @@ class Vignetting(Gain):
     cost_ns = MappingProxyType({HELD: 0.2, MIDDLE: 0.2})
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
+        """Bound by level times the factor furthest from 1; that of the middle position by what the factor bends.
+
+        It is at the ends of the sweeps: the factor never turns round in between.
+        """
         if variant == MIDDLE:
             most = max((sweep.step for sweep in probe.sweeps), default=1)
             bend = MOST_BEND / 2 * rig.camera.ifov_rad**2 * (most**2 - 1) / 12
@@ -114,6 +118,10 @@ class Polarisation(Gain):
     cost_ns = MappingProxyType({EXACT: 0.2})
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
+        """Bound by level times the factor furthest from 1 in each band, over all incidences that the sweeps have.
+
+        Factors are taken at some incidences, and what a chord between two of them may miss is added.
+        """
         incidence = _incidence(sweep_ends(probe, rig.camera))
         if rig.mirror.coating == "ideal" or not incidence.size:
             return Bound(0.0, "the mirror reflects everything" if incidence.size else "no line is taken")

@@ -179,6 +179,7 @@ class Smile(LightChange):
         return Bound(steep * shift + min(bent, steep * shift * 2 * part * (1 - part)), why)
 
     def change(self, light: Light, block: SweepBlock, variant: str) -> Light:
+        """Give light (line, sample, band) [e-] at the wavelengths that each sample sees; as it is without a smile."""
         camera, smile = block.rig.camera, block.rig.optics.smile_nm
         if smile == 0 or light.shape[-1] < 2:
             return light
