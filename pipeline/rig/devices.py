@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Protocol, Self
 
@@ -34,8 +35,8 @@ class SystemClock:
 SYSTEM_CLOCK = SystemClock()
 
 
-class Closing:
-    """A context that ends with :meth:`close`."""
+class Closing(ABC):
+    """A context that ends with :meth:`close`; one that does not say how it closes cannot be made."""
 
     def __enter__(self) -> Self:
         return self
@@ -43,9 +44,9 @@ class Closing:
     def __exit__(self, *error: object) -> None:
         self.close()
 
+    @abstractmethod
     def close(self) -> None:
         """Let go of what is held."""
-        raise NotImplementedError
 
 
 class ManualClock:
