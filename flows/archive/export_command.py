@@ -19,8 +19,8 @@ from flows.terminal.progress import print_json
 from pipeline.errors import ArchiveError, PipelineError
 from storage.archive.staging import take_lock
 from storage.archive.whole_files import remove_leftovers
-from storage.arrays.class_maps import load_bands, open_image
 from storage.arrays.cubes import open_raw_cube
+from storage.arrays.ground_maps import load_bands, open_image
 from storage.arrays.layout import SHARD_ROWS
 from storage.export.image_files import EnviFile, need_rasterio, write_cog, write_envi
 from storage.export.stac_items import (

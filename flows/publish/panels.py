@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from flows.publish.receipt_table import area_words
 from pipeline.geometry.grid import UNLABELLED
-from storage.arrays.class_maps import GroundMap
+from storage.arrays.ground_maps import GroundMap
 from storage.arrays.quicklooks import stretch
 
 GROUND_IN, GROUND_DPI, GROUND_MOST_PX = 9.0, 130, 1200

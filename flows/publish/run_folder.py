@@ -40,8 +40,9 @@ from storage.archive.keys import StageRef
 from storage.archive.records import StageRecord, read_run
 from storage.archive.run_folders import RunDraft
 from storage.archive.whole_files import to_json
-from storage.arrays.class_maps import load_class_map, load_ground_map, open_image
+from storage.arrays.class_maps import load_class_map
 from storage.arrays.cubes import RawCube
+from storage.arrays.ground_maps import load_ground_map, open_image
 from storage.arrays.mosaics import load_attention, open_patches
 from storage.arrays.quicklooks import choose_bands
 

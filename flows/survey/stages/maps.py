@@ -17,14 +17,8 @@ from pipeline.ground.map_grid import GroundGrid, classes_at, ground_grid, image_
 from pipeline.ground.view import GroundView
 from storage.archive.keys import StageRef, array_digest
 from storage.archive.manifests import read_table, write_table
-from storage.arrays.class_maps import (
-    BLOCK,
-    ClassNames,
-    GroundMapWriter,
-    clear_classes,
-    create_class_map,
-    load_class_map,
-)
+from storage.arrays.class_maps import ClassNames, clear_classes, create_class_map, load_class_map
+from storage.arrays.ground_maps import BLOCK, GroundMapWriter
 from storage.arrays.layout import SHARD_ROWS, open_group, read_array, read_bands
 from storage.arrays.mosaics import open_patches
 from storage.arrays.quicklooks import choose_bands, develop, stretch

@@ -20,7 +20,8 @@ from pipeline.ground.map_grid import GroundGrid
 from pipeline.ground.view import RigPose, pixel_places
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
-from storage.arrays.class_maps import ClassMap, load_ground_map, write_class_map
+from storage.arrays.class_maps import ClassMap, write_class_map
+from storage.arrays.ground_maps import load_ground_map
 from storage.arrays.layout import AngularGrid
 from storage.arrays.mosaics import MosaicWriter
 

@@ -14,19 +14,21 @@ from pyproj import CRS
 from pipeline.errors import ChunkError, IncompleteStoreError, PoseError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.class_maps import (
-    BLOCK,
-    ON_THE_MAP,
     ClassMap,
     ClassNames,
-    GroundMapWriter,
     clear_classes,
     create_class_map,
     load_class_map,
+    write_class_map,
+    write_class_tile,
+)
+from storage.arrays.ground_maps import (
+    BLOCK,
+    ON_THE_MAP,
+    GroundMapWriter,
     load_geobox,
     load_ground_map,
     map_attributes,
-    write_class_map,
-    write_class_tile,
     write_map_coordinates,
 )
 from storage.arrays.layout import SHARD_COLUMNS, SHARD_ROWS, AngularGrid, create_group, write_image

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.scan import Ends
 from pipeline.rig.devices import ManualClock
-from pipeline.rig.emulator import mirror_state
+from pipeline.rig.emulator import mirror_motion
 from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.emulator.mirror_state import MOST_STEPS, AxisMotion, MirrorUnit, Stiffness, VectorPlayer
+from pipeline.rig.emulator.mirror_motion import MOST_STEPS, AxisMotion, Stiffness, VectorPlayer
+from pipeline.rig.emulator.mirror_state import MirrorUnit
 from pipeline.rig.mirror.pro_mode import (
     ErrorCode,
     Frame,
@@ -89,7 +90,7 @@ def test_the_bound_on_what_is_left_is_one() -> None:
 
 def test_an_old_past_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
     """The memory of an axis is bounded; what it still knows is unchanged."""
-    monkeypatch.setattr(mirror_state, "KEPT_STEPS", 100)
+    monkeypatch.setattr(mirror_motion, "KEPT_STEPS", 100)
     axis, short = AxisMotion(STIFF), AxisMotion(STIFF)
     for number in range(1000):
         axis.command(number * 0.01, number % 2)
