@@ -26,7 +26,12 @@ from pipeline.simulator.effects.probe import Unit, stored_mean, unit_at
 from pipeline.simulator.effects.registry import BY_NAME
 from pipeline.simulator.render import dark_frame, expected_light, read_out
 from pipeline.simulator.selection.choice import UNIT_WORDS
-from pipeline.simulator.selection.verification import contrast_about, misplaced_electrons, misplaced_share
+from pipeline.simulator.selection.verification import (
+    contrast_about,
+    misplaced_electrons,
+    misplaced_in_tails,
+    misplaced_share,
+)
 from pipeline.simulator.simulated import BLOCK_LINES, SimulatedSource, sweep_starts
 from storage.archive.keys import StageRef
 from storage.arrays.quicklooks import choose_bands
@@ -229,10 +234,13 @@ class _Ways:
             sums.place = ViewPlace(sweep.name, lines[line], sample * sweep.binning, band)
         if change.max() > self.bound:  # what of it arithmetic may have made
             block = self.exact.block(sweep, lines)
-            share = misplaced_share(block, dict(self.exact.choice.effects), dict(self.chosen.choice.effects))
-            contrast = contrast_about(block, partial(expected_light, self.exact.scene))
+            ways = dict(self.exact.choice.effects), dict(self.chosen.choice.effects)
+            share, render = misplaced_share(block, *ways), partial(expected_light, self.exact.scene)
+            contrast = contrast_about(block, render)
             misplaced = misplaced_electrons(both.exact, stored_mean(contrast, sweep.binning), share)
             change -= misplaced / self._unit(both, sweep)
+            if change.max() > self.bound:
+                change -= stored_mean(misplaced_in_tails(block, *ways, render), sweep.binning) / self._unit(both, sweep)
         sums.unexplained = max(sums.unexplained, float(change.max()))
         apart = np.abs(both.chosen_raw.astype(np.int32) - both.alike_raw)
         sums.unequal += int(np.count_nonzero(apart))

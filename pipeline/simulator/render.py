@@ -36,7 +36,7 @@ from pipeline.simulator.effects.noise import (
     photon_counts,
     rounded_counts,
 )
-from pipeline.simulator.optics.kernel_fit import Moments, fold
+from pipeline.simulator.optics.kernel_fit import Footprint, Moments, fold
 from pipeline.simulator.optics.rays import RayViews, exact_views, middle_normal, straight_views
 from pipeline.simulator.optics.scene_light import Looker
 from pipeline.simulator.rig_model import Rig
@@ -44,6 +44,7 @@ from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 
 Floats = NDArray[np.float64]
 Light = NDArray[np.float32]
+_BEYOND_PX, _RINGS, _TURNS = 1000.0, 97, 16  # places at which tails of footprints are compared
 LOOKS = 17  # lines of a sweep and samples of a line that tell how far a footprint's shape varies
 
 
@@ -158,11 +159,30 @@ def _looker(
 
 def kernel_error(block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> float:
     """Give by how much of a wave's amplitude the kernels of a choice's footprint are wrong at most."""
-    choice, normal = Choice.of(chosen), middle_normal(block.sweep, block.rig.camera)
+    choice = Choice.of(chosen)
+    return _footprint(block, choice, folded_positions(block.sweep, choice.variant("smear"))).error
+
+
+def tails_apart(block: SweepBlock, chosen: Mapping[Any, str] | Choice, reach_px: float) -> Floats:
+    """Give the share of light, by size, that folding the held positions puts elsewhere beyond a reach, (band,).
+
+    Other kernels are fitted then to the same patterns, and where these have tails, so has what they are wrong by.
+    """
+    choice, held = Choice.of(chosen), block.sweep.step
+    alone, folded = (replace(_footprint(block, choice, count), held=held) for count in (1, held))
+    log_px, turn = np.linspace(math.log(reach_px), math.log(_BEYOND_PX), _RINGS), 2 * np.pi / _TURNS
+    radius, angle = np.repeat(np.exp(log_px), _TURNS), np.tile(np.arange(_TURNS) * turn, _RINGS)
+    along, scan = radius * np.cos(angle), radius * np.sin(angle)
+    apart = np.abs(alone.afar(along, scan) - folded.afar(along, scan))
+    area = radius**2 * (log_px[1] - log_px[0]) * turn
+    return np.asarray(area @ apart)
+
+
+def _footprint(block: SweepBlock, choice: Choice, held: int) -> Footprint:
+    normal = middle_normal(block.sweep, block.rig.camera)
     found = [one.moments(block.rig, block.wavelength_nm, way, normal) for one, way in choice.doing("moments")]
-    held = folded_positions(block.sweep, choice.variant("smear"))
     box = box_of(choice.variant("slit"), block.rig)
-    return fold(box, (1, 1), held, Moments.together(found, len(block.wavelength_nm))).error
+    return fold(box, (1, 1), held, Moments.together(found, len(block.wavelength_nm)))
 
 
 def views_all_over(rig: Rig, sweep: Sweep, *, exact: bool) -> RayViews:

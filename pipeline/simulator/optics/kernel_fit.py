@@ -256,6 +256,17 @@ class Footprint:
         """How much each kernel counts in each band, (kernel, band); of sum 1 in each."""
         return self.shares @ self.between
 
+    def afar(self, along: Floats, scan: Floats) -> Floats:
+        """Give the light at places (place,) some px beyond slit and pixel, (place, band). [1/px^2]
+
+        Box, held positions and pixels count by their variance: there they are small beside the Gaussians that reach.
+        """
+        own = np.array([self.box[1] ** 2, self.box[0] ** 2 + self.held**2 - 1]) / 12 + 1 / 6
+        wide, high = self.variance + own[:, None]
+        aside, ahead = along[:, None] - self.shift[0], scan[:, None] - self.shift[1]
+        light: Floats = np.exp(-(aside**2 / wide + ahead**2 / high) / 2) / (2 * np.pi * np.sqrt(wide * high))
+        return light @ self.mixing
+
     def windows(self) -> list[tuple[int, NDArray[np.intp]]]:
         """Give the levels, and numbers of kernels that look at pixels of that level through one window."""
         found = []

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from pipeline.errors import BoundError, ShapeError
 from pipeline.geometry.scan import Sweep, scene_to_sweep
 from pipeline.simulator.effects.effect import OFF, Effect, Light, SweepBlock
-from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR
+from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR, folded_positions
 from pipeline.simulator.effects.probe import stored_mean
 from pipeline.simulator.optics.kernel_fit import NEGLIGIBLE
 from pipeline.simulator.optics.tap_sums import TABULATED
-from pipeline.simulator.render import kernel_error
+from pipeline.simulator.render import kernel_error, tails_apart
 from pipeline.simulator.selection.choice import TOTAL, UNIT_WORDS, Decision
 from pipeline.simulator.selection.options import acts_on_light
 
@@ -28,7 +28,8 @@ VERIFIED_LINES = 3  # whole ones, for stray light comes from all of a line
 MOST_CANDIDATES = 40
 Render = Callable[[SweepBlock, Mapping[Effect, str]], Light]
 ROUNDING = 4e-6  # of the brightest light of some lines: float32 sums
-REACH_PX = 8  # of a footprint's weights, along the line and the scan
+REACH_PX = 8  # of a footprint's weights, along the line and the scan, but for the tails of diffraction
+TAILS_PX = 128  # of these: beyond, less is put elsewhere than by tables, in bands from 400 to 1000 nm
 _HALVES = ((0.0, 0.0), (0.5, 0.0), (0.0, 0.5), (0.5, 0.5))  # px along and scan
 MIDDLE_RAYS: Mapping[Effect, str] = {ROTATION: ROTATION.variants[0]}  # the scene itself, where lines really lie
 
@@ -183,6 +184,9 @@ def _greatest_change(
     rounding = np.zeros(change.shape)
     if not change.max() <= bound:
         rounding = misplaced_electrons(one.light, one.contrast, misplaced_share(one.block, exact, chosen)) / one.unit
+        if not (change - rounding).max() <= bound:
+            afar = misplaced_in_tails(one.block, exact, chosen, one.render)
+            rounding = rounding + stored_mean(afar, binning) / one.unit
     worst = np.unravel_index(int(np.argmax(change - rounding)), change.shape)  # the first NaN, if there is one
     line, number, band = worst
     block, summed = one.block, "" if binning == 1 else f" (of {binning} summed)"
@@ -212,26 +216,43 @@ def misplaced_share(block: SweepBlock, exact: Mapping[Effect, str], chosen: Mapp
     return 2 * TABULATED + sum(max(kernel_error(block, one), NEGLIGIBLE) for one in (exact, chosen)) / 2
 
 
+def misplaced_in_tails(
+    block: SweepBlock, exact: Mapping[Effect, str], chosen: Mapping[Effect, str], render: Render
+) -> Floats:
+    """Bound by how much the tails of kernels make two ways differ at each sample, (1, sample, band). [e-]
+
+    They do where one of the ways folds the held positions and the other does not. Light that is spread `REACH_PX` and
+    more counts by the range of the scene within `TAILS_PX`.
+    """
+    held = {folded_positions(block.sweep, _smear(ways)) for ways in (exact, chosen)}
+    if len(held) == 1:
+        return np.zeros((1, block.rig.camera.samples, len(block.wavelength_nm)))
+    return tails_apart(block, exact, REACH_PX) * contrast_about(block, render, TAILS_PX)
+
+
+def _smear(ways: Mapping[Effect, str]) -> str:
+    return next((way for one, way in ways.items() if one.name == SMEAR.name), OFF)
+
+
 def _folded(ways: Mapping[Effect, str]) -> dict[str, str]:
     blurs = {one.name: way for one, way in ways.items() if hasattr(one, "moments") or one.name == SMEAR.name}
     return blurs | {one.name: "box" for one in ways if one.name == SLIT.name}
 
 
-def contrast_about(block: SweepBlock, render: Render) -> Floats:
-    """Give the range of the scene's light within reach of each sample's footprint, (1, sample, band). [e-]
+def contrast_about(block: SweepBlock, render: Render, reach_px: int = REACH_PX) -> Floats:
+    """Give the range of the scene's light within a reach of each sample, (1, sample, band). [e-]
 
     The scene is looked at by middle rays, a px and half a px apart: pixels may lie between those of one look.
     """
     sweep = block.sweep
     held = replace(sweep, step=1, lines=sweep.lines * sweep.step)
-    ends = block.lines.start * sweep.step - REACH_PX, block.lines.stop * sweep.step + REACH_PX
+    ends = block.lines.start * sweep.step - reach_px, block.lines.stop * sweep.step + reach_px
     wide = replace(block, sweep=held, lines=range(max(ends[0], 0), min(ends[1], held.lines)))
     if not wide.lines:
         return np.zeros((1, block.rig.camera.samples, len(block.wavelength_nm)))
-    looks = [render(replace(wide, sweep=_beside(held, *way)), MIDDLE_RAYS) for way in _HALVES]
-    seen = np.concatenate(looks)
-    ends_e = seen.max(axis=0), -seen.min(axis=0)
-    most, least = (scipy.ndimage.maximum_filter1d(one, 2 * REACH_PX + 1, axis=0, mode="nearest") for one in ends_e)
+    looks = (render(replace(wide, sweep=_beside(held, *way)), MIDDLE_RAYS) for way in _HALVES)
+    ends_e = np.max([(seen.max(axis=0), -seen.min(axis=0)) for seen in looks], axis=0)
+    most, least = (scipy.ndimage.maximum_filter1d(one, 2 * reach_px + 1, axis=0, mode="nearest") for one in ends_e)
     return np.asarray((most + least).astype(np.float64)[None])
 
 

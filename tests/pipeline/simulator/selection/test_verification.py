@@ -16,7 +16,7 @@ from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
 from pipeline.simulator.effects.effect import Effect, Light, SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR
 from pipeline.simulator.optics.kernel_fit import NEGLIGIBLE
-from pipeline.simulator.render import expected_light
+from pipeline.simulator.render import expected_light, tails_apart
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.selection.choice import TOTAL, Decision, decide
 from pipeline.simulator.selection.verification import (
@@ -26,6 +26,7 @@ from pipeline.simulator.selection.verification import (
     candidate_blocks,
     contrast_about,
     misplaced_electrons,
+    misplaced_in_tails,
     misplaced_share,
     verify,
     worst_blocks,
@@ -245,6 +246,37 @@ def test_two_ways_to_fold_the_same_light_differ_by_no_more(pattern: str, nm: tup
     contrast = contrast_about(block, lambda block, chosen: expected_light(scene, block, chosen))
     bound = misplaced_electrons(full, contrast, misplaced_share(block, EXACT, other))
     assert (np.abs(light.astype(np.float64) - full) <= bound).all()
+
+
+@pytest.mark.parametrize("nm", [303.0, 550.0, 1000.0])
+def test_tails_of_folded_positions_differ_by_no_more(nm: float) -> None:
+    """Of a pixel of 60 full wells nothing lies within 8 px of a line, yet folding changes its tails there."""
+    values = np.zeros((48, 64, 1))
+    values[23, 30] = 1.0
+    scene = image_scene(values, RIG.camera, [nm])
+    block = sweep_block(scene, RIG, SWEEP, range(2))  # looks at rows 0 to 7
+    folded = {**EXACT, SMEAR: "folded"}
+
+    def render(block: SweepBlock, chosen: Any) -> Light:
+        return expected_light(scene, block, chosen)
+
+    full = render(block, EXACT)
+    change = np.abs(render(block, folded).astype(np.float64) - full)
+    assert contrast_about(block, render).max() == 0
+    near = misplaced_electrons(full, np.zeros(change.shape), misplaced_share(block, EXACT, folded))
+    assert (change > near).any()
+    assert (change <= near + misplaced_in_tails(block, EXACT, folded, render)).all()
+
+
+def test_tails_are_alike_where_held_positions_are() -> None:
+    """What a blur changes far off is its own doing, not arithmetic's; of visible bands folding changes 1e-3 at most."""
+    block = sweep_block(image_scene(np.ones((48, 64, 1)), RIG.camera, [550.0]), RIG, SWEEP, range(2))
+    without = {effect: way for effect, way in EXACT.items() if effect is not DIFFRACTION}
+    assert misplaced_in_tails(block, EXACT, without, render).max() == 0
+    shares = [tails_apart(block, EXACT, reach_px) for reach_px in (8, 32, 128)]
+    assert np.all(np.diff(np.concatenate(shares)) < 0)
+    assert 1e-5 < shares[0][0] < 1e-3
+    assert tails_apart(block, without, 8).max() < 1e-6
 
 
 def test_even_light_differs_by_float32_alone() -> None:
