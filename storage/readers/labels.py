@@ -24,7 +24,7 @@ from pipeline.errors import SceneError
 from pipeline.geometry.grid import UNLABELLED
 from storage.readers.array_files import variable_names
 from storage.readers.cube_sources import NEAR_INFRARED_NM, RGB_NM, Raster
-from storage.readers.raster_files import load_raster
+from storage.readers.raster_files import load_raster, split_variable
 from storage.readers.scene_toml import BandWavelengths, ClassValue, Colour
 
 MOST_FOUND_CLASSES = 64
@@ -206,6 +206,15 @@ class Layout:
     raster: Raster
     labels: Labels | None
     label_note: str
+
+
+def load_frame_or_raster(address: str | Path) -> tuple[Raster, Layout | None]:
+    """Read a frame of a public set, with its layout, or any other file that `load_raster` reads, (y, x, band).
+
+    Raises SceneError: there is no such file, it is damaged, or of a kind that is not read.
+    """
+    layout = find_layout(*split_variable(address))
+    return (load_raster(address, dims=3), None) if layout is None else (layout.raster, layout)
 
 
 def find_layout(path: Path, variable: str | None) -> Layout | None:

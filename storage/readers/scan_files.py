@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import zarr
@@ -29,21 +29,30 @@ from storage.arrays.quicklooks import LineThumbnail, write_quicklook
 from storage.readers.cube_sources import BLOCK_LINES, Bands, CubeSource, LineFacts, check_cube_source
 from storage.readers.envi_cubes import DATA_ENDINGS, find_envi_pair, open_envi_cube
 from storage.readers.headwall_folders import find_reference, open_envi_source, open_headwall_cube
-from storage.readers.labels import find_layout
+from storage.readers.labels import load_frame_or_raster
 from storage.readers.raster_files import SCENE_ENDINGS, TIFF_ENDINGS, load_raster, open_tiff_rows, split_variable
 from storage.readers.scene_toml import BandWavelengths, SceneSettings, find_scene_settings, settle_wavelengths
 from storage.readers.zarr_scenes import find_zarr_store, open_zarr_cube
 
+Reader = Literal["zarr", "headwall", "envi", "raster"]
 
-def is_scan(address: str | Path) -> bool:
-    """Whether an address is of a kind that comes in lines: a folder, a Zarr store, an ENVI header or its data file."""
+
+def reader_of(address: str | Path) -> Reader:
+    """Which reader takes an address, for scenes, cubes to ingest and reference frames alike.
+
+    A folder is a Zarr store or a Headwall camera's, an ENVI cube is named by its header or its data file: these come in
+    lines. Everything else, also what is not there, is for `load_raster`, which refuses what it does not know.
+    """
     path, _ = split_variable(address)
-    if path.is_dir() or path.suffix.lower() == ".hdr":
-        return True
+    if path.is_dir():
+        return "headwall" if find_zarr_store(path) is None else "zarr"
+    if path.suffix.lower() == ".hdr":
+        return "envi"
     if path.suffix.lower() in SCENE_ENDINGS or not path.is_file():
-        return False
+        return "raster"
     beside = {path.with_name(path.name + ".hdr").name.lower(), path.with_suffix(".hdr").name.lower()}
-    return path.suffix.lower() in DATA_ENDINGS or any(entry.name.lower() in beside for entry in path.parent.iterdir())
+    of_envi = path.suffix.lower() in DATA_ENDINGS or any(one.name.lower() in beside for one in path.parent.iterdir())
+    return "envi" if of_envi else "raster"
 
 
 def open_cube_source(
@@ -58,16 +67,16 @@ def open_cube_source(
     """
     path, variable = split_variable(address)
     stated, found = [("dark", dark), ("white", white)], list[tuple[str, Path | None]]()
-    store = find_zarr_store(path)
-    if store is not None:
-        source = open_zarr_cube(store, variable)
-    elif path.is_dir():
-        source = open_headwall_cube(path)
-        found = [(kind, find_reference(path, kind)) for kind, frame in stated if frame is None]
-    elif is_scan(path):
-        source = open_envi_source(path)
-    else:
-        source = _raster_source(address)
+    match reader_of(address):
+        case "zarr":
+            source = open_zarr_cube(path, variable)
+        case "headwall":
+            source = open_headwall_cube(path)
+            found = [(kind, find_reference(path, kind)) for kind, frame in stated if frame is None]
+        case "envi":
+            source = open_envi_source(path)
+        case "raster":
+            source = _raster_source(address)
     for kind, frame in (*found, *stated):
         if frame is not None:
             values, more = load_frame(frame)
@@ -98,13 +107,14 @@ def load_frame(address: str | Path) -> tuple[NDArray[np.float32], tuple[Path, ..
     Raises SceneError: the file cannot be read or holds no real numbers.
     """
     path, _ = split_variable(address)
-    if is_scan(path):
-        if path.is_dir():
+    match reader_of(address):
+        case "zarr" | "headwall":
             raise SceneError(f"{path} is a folder, expected a reference frame (ENVI or .npy); name the file")
-        files: tuple[Path, ...] = find_envi_pair(path)
-        values = open_envi_cube(path).values
-    else:
-        values, files = load_raster(address, dims=3).values, (path,)
+        case "envi":
+            files: tuple[Path, ...] = find_envi_pair(path)
+            values = open_envi_cube(path).values
+        case "raster":
+            values, files = load_raster(address, dims=3).values, (path,)
     if values.dtype.kind not in "uif":
         raise SceneError(f"{path} holds {values.dtype}, expected the real numbers of a reference frame")
     frame = values[None] if values.ndim == 2 else values
@@ -112,7 +122,7 @@ def load_frame(address: str | Path) -> tuple[NDArray[np.float32], tuple[Path, ..
 
 
 def _raster_source(address: str | Path) -> CubeSource:
-    path, variable = split_variable(address)
+    path, _ = split_variable(address)
     rows = open_tiff_rows(path) if path.suffix.lower() in TIFF_ENDINGS else None
     if rows is not None:
         return CubeSource(
@@ -126,8 +136,7 @@ def _raster_source(address: str | Path) -> CubeSource:
             nodata=rows.nodata,
             notes=rows.notes,
         )
-    layout = find_layout(path, variable)
-    raster = layout.raster if layout is not None else load_raster(address, dims=3)
+    raster, _ = load_frame_or_raster(address)
     values = raster.three_axes(path)
     native = values.dtype.newbyteorder("=")
     return CubeSource(

@@ -19,9 +19,9 @@ from pipeline.readings import MOST_STEPS, MOST_VALUE, beyond_range, find_beyond
 from pipeline.simulator.scenes.scene import BRIGHT_PERCENTILE
 from storage.archive.staging import file_hash
 from storage.readers.cube_sources import BLOCK_LINES, Raster, machine_bytes, scene_lines
-from storage.readers.labels import Labels, find_layout, load_labels
-from storage.readers.raster_files import load_raster, split_variable
-from storage.readers.scan_files import is_scan, known_bands, open_cube_source
+from storage.readers.labels import Labels, load_frame_or_raster, load_labels
+from storage.readers.raster_files import split_variable
+from storage.readers.scan_files import known_bands, open_cube_source, reader_of
 from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings, settle_wavelengths
 
 _LOOKED_AT = 1 << 20  # values, evenly spread, by which the range of a scene is told
@@ -67,8 +67,7 @@ def load_scene_file(
     used, or the labels do not fit. WavelengthError: wavelengths are missing, or their number, unit or range is wrong.
     """
     file, variable = split_variable(path)
-    layout = find_layout(file, variable)
-    raster = layout.raster if layout is not None else load_scan(path) if is_scan(path) else load_raster(path, dims=3)
+    raster, layout = load_frame_or_raster(path) if reader_of(path) == "raster" else (load_scan(path), None)
     settings = find_scene_settings(file)
     cube = raster.three_axes(file)
     chosen = _chosen_bands(bands, settings, cube.shape[2], file)

@@ -42,13 +42,14 @@ def find_zarr_store(path: Path) -> Path | None:
 
 
 def open_zarr_cube(path: Path, variable: str | None = None) -> CubeSource:
-    """Open one array of a store as a cube.
+    """Open one array of a store, or of the ``cube.zarr`` in a folder, as a cube.
 
     Of this project: raw cubes (with their references), ingested cubes, mosaics. Of anyone's: the only array with three
     axes of numbers, or the one named; wavelengths come from a coordinate of that name, or of the band axis with a unit.
     Raises SceneError: the store is damaged, holds no such array, has dims that are not known, a codec that is not
     allowed, or claims to hold far more than lies on the disk.
     """
+    path = find_zarr_store(path) or path
     with _named(path):
         check_store(path)
         node = zarr.open(path, mode="r", **open_options(path))
