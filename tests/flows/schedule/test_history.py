@@ -9,15 +9,8 @@ from typing import Any
 
 import pytest
 
-from flows.schedule.history import (
-    COLOURS,
-    FieldHistory,
-    line_chart,
-    read_histories,
-    render_history,
-    render_index,
-    way_to,
-)
+from flows.schedule.date_charts import COLOURS, line_chart
+from flows.schedule.history import FieldHistory, read_histories, render_history, render_index, way_to
 from storage.archive.archive import Archive
 from storage.archive.ledger import Ledger
 from storage.arrays.class_maps import load_class_map
