@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -36,16 +36,20 @@ WeightsMaker = Callable[..., Path]
 Survey = Callable[..., Published]
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # for what tests start; workers that share cores lose most of their time
 torch.set_num_threads(1)
-gc.disable()  # until tests are collected: what is imported and collected is many objects, of which none is garbage
 law_settings.register_profile("anew", deadline=None, max_examples=40)  # a loaded machine is no broken law
 law_settings.register_profile("settled", law_settings.get_profile("anew"), derandomize=True)  # a change alone breaks it
 law_settings.load_profile("settled")
 
 
-def pytest_collection_finish() -> None:
-    """What is there now stays to the end: no search for garbage looks through it again."""
-    gc.freeze()
-    gc.enable()
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """What is imported and collected is no garbage and stays to the end: no search looks through it, now or later."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def random_weights(wavelength_nm: tuple[float, ...], names: tuple[str, ...] = CLASSES, **sizes: Any) -> Weights:
