@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -38,6 +39,17 @@ torch.set_num_threads(1)
 law_settings.register_profile("anew", deadline=None, max_examples=40)  # a loaded machine is no broken law
 law_settings.register_profile("settled", law_settings.get_profile("anew"), derandomize=True)  # a change alone breaks it
 law_settings.load_profile("settled")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """What is imported and collected is no garbage and stays to the end: no search looks through it, now or later."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def random_weights(wavelength_nm: tuple[float, ...], names: tuple[str, ...] = CLASSES, **sizes: Any) -> Weights:

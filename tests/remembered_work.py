@@ -1,9 +1,9 @@
 """What takes most of a small survey's time and is the same for the same question, remembered.
 
-Only what is pure is kept: the look at the scene that a choice of effects rests on, and the changes that were measured.
-Of pictures one of each kind is drawn, and stands for all of that kind. Decision, stores, receipt and run are made each
-time. Tests that surveys repeat themselves put `WORKED_OUT` back; those that ask nothing of effects have no scene
-looked at: `without_effects`.
+Only what is pure is kept: the look at the scene that a choice of effects rests on, the choice, which each process
+remembers by itself, and the changes that were measured. Of pictures one of each kind is drawn, and stands for all of
+that kind. Stores, receipt and run are made each time. Tests that surveys repeat themselves put `WORKED_OUT` back; those
+that ask nothing of effects have no scene looked at: `without_effects`.
 """
 
 from __future__ import annotations
@@ -30,12 +30,11 @@ from pipeline.planning.coverage import coarse_sweeps
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import raster_from_values
 
-PURE = {effect_choice: ("probe_survey", "_verified"), run_folder: ("draw_quicklook",)}
+PURE = {effect_choice: ("probe_survey", "decide", "_verified"), run_folder: ("draw_quicklook",)}
 WORKED_OUT: dict[str, tuple[ModuleType, Any]] = {
     name: (module, getattr(module, name)) for module, names in PURE.items() for name in names
 }
-DECIDE = effect_choice.decide
-REMEMBERING: dict[str, tuple[ModuleType, Any]] = {"decide": (effect_choice, DECIDE)}
+REMEMBERING: dict[str, tuple[ModuleType, Any]] = {}
 
 
 def remember(folder: Path, put: Callable[[object, str, Any], None] = setattr) -> None:
@@ -55,6 +54,14 @@ def remember(folder: Path, put: Callable[[object, str, Any], None] = setattr) ->
     def probed(scene: Any, *given: Any) -> Any:
         return known((scene.key, given), lambda: WORKED_OUT["probe_survey"][1](scene, *given))
 
+    decisions: dict[bytes, Any] = {}
+
+    def decided(probes: Any, rig: Any, effects: Any, *given: Any) -> Any:
+        question = pickle.dumps((probes, rig, given))
+        if question not in decisions:
+            decisions[question] = WORKED_OUT["decide"][1](probes, rig, effects, *given)
+        return decisions[question]
+
     def verified(run: Any, decision: Any, probes: Any) -> Any:
         told = run.settings
         question = run.scene.key, run.planned, told.simulated_rig, told.seed, told.cost, told.effects, told.tol
@@ -72,7 +79,8 @@ def remember(folder: Path, put: Callable[[object, str, Any], None] = setattr) ->
         if not fresh:  # as often as a picture that is drawn: tests count what is written
             path.write_bytes(picture)
 
-    for name, remembering in {"probe_survey": probed, "_verified": verified, "draw_quicklook": drawn}.items():
+    each = {"probe_survey": probed, "decide": decided, "_verified": verified, "draw_quicklook": drawn}
+    for name, remembering in each.items():
         REMEMBERING[name] = (WORKED_OUT[name][0], remembering)
         put(WORKED_OUT[name][0], name, remembering)
 
@@ -91,7 +99,9 @@ def without_effects() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(effect_choice, "probe_survey", lambda scene, rig, planned, unit: _any_probes(unit))
         patch.setattr(
-            effect_choice, "decide", lambda *told: DECIDE(*told[:-1], "none" if told[-1] == "auto" else told[-1])
+            effect_choice,
+            "decide",
+            lambda *told: REMEMBERING["decide"][1](*told[:-1], "none" if told[-1] == "auto" else told[-1]),
         )
         patch.setattr(effect_choice, "_verified", lambda *given: {})
         yield

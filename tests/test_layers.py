@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import gc
 import importlib
 import re
 import sys
@@ -12,6 +13,8 @@ from collections.abc import Iterator
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 ROOMS = ("pipeline", "models", "storage", "flows")
@@ -53,6 +56,16 @@ IN_FUNCTIONS = {  # file -> packages that a function of it imports, and why no f
     "storage/parallel/cluster_work.py": ("dask", "half a second, for crews of processes alone"),
     "storage/remote/object_stores.py": ("obstore", "an extra: that it is missing is told"),
 }
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _trees_are_no_garbage() -> Iterator[None]:
+    """They are half a million nodes: no search looks through them, neither now nor, for they go, in the tests after."""
+    gc.disable()
+    yield
+    source.cache_clear()
+    nodes.cache_clear()
+    gc.enable()
 
 
 @cache

@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from tests.conftest import Survey, WeightsMaker, patchy_scene
+from tests.remembered_work import without_effects
 
 SETTINGS = (
     'name = "{name}"\nscene = "field.png"\nlabels = "labels.png"\nweights = "mine.safetensors"\nbudget = 0.8\n{camera}'
@@ -46,8 +47,9 @@ def surveyed(
         told = SETTINGS.format(name="south" if name == "south" else "north", camera=CAMERA)
         (folder / f"{name}.toml").write_text(told)
     (folder / "camera.toml").write_text(CAMERA)
-    for given in ({"budget": "0.6"}, {"accuracy": False}):
-        survey_png(folder / "archive", name="north", **{"camera.samples": 320}, **given)
+    with without_effects():
+        for given in ({"budget": "0.6"}, {"accuracy": False}):
+            survey_png(folder / "archive", name="north", **{"camera.samples": 320}, **given)
     return folder
 
 

@@ -10,8 +10,10 @@ import pytest
 
 from tests.docs.pages import DOCS, LINKED, PAGES, ROOT, Block, anchors_of, blocks_of, links_of, named_code
 from tests.docs.running import Reader
+from tests.remembered_work import with_effects, without_effects
 
 WITH_BLOCKS = [page for page in PAGES if blocks_of(page)]
+OF_EFFECTS = {DOCS / "simulator.md"}  # pages that show which effects are chosen; what others survey is chosen for them
 README_LINES = 150
 PATH = re.compile(
     r"(?:pipeline|models|storage|flows|tests|docs|\.ci)(?:/[\w.-]+)*/?|[\w-]+\.(?:md|toml|yaml|txt)|Makefile"
@@ -30,7 +32,7 @@ def test_every_block_runs(page: Path, place: Path, request: pytest.FixtureReques
     blocks = blocks_of(page)
     bucket = request.getfixturevalue("bucket") if any(one.mark == "bucket" for one in blocks) else None
     reader = Reader(place, bucket)
-    with reader.left:
+    with reader.left, with_effects() if page in OF_EFFECTS else without_effects():
         for block in blocks:
             reader.follow(block)
 

@@ -58,8 +58,11 @@ def same_moment(subject: Subject, out: Path, clock: dict[str, Any]) -> list[str]
 def made_anew(subject: Subject, out: Path, clock: dict[str, Any]) -> list[str]:
     """Stores that a run names go and are made again by a clock that is behind: verify does not doubt them."""
     ahead = clock["shift_s"] > 0  # then it is set right in between
-    given = {"fault": "wrong_clock", **clock}
-    wrong = wrong_after_rerun(subject, out, subject.nursery.run(words(out), **(given if ahead else {})), runs=1)
+    given, wrong = {"fault": "wrong_clock", **clock}, list[str]()
+    if ahead:
+        wrong += wrong_after_rerun(subject, out, subject.nursery.run(words(out), **given), runs=1)
+    else:
+        subject.surveyed(out)
     _date_files(out)
     archive = Archive.open(out)
     first = archive.runs()
@@ -74,7 +77,8 @@ def made_anew(subject: Subject, out: Path, clock: dict[str, Any]) -> list[str]:
 
 def cleared_up(subject: Subject, out: Path, clock: dict[str, Any]) -> list[str]:
     """gc after a survey that began by the right clock, went on by a wrong one and was killed before its end."""
-    wrong = [] if subject.nursery.run(words(out)).code == 0 else ["the survey failed"]
+    subject.surveyed(out)
+    wrong: list[str] = []
     shutil.rmtree(out / "runs")  # killed before it named anything
     archive = Archive.open(out)
     later = {

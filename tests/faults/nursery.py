@@ -6,6 +6,7 @@ kept, and where an error comes from: a fault that is not met where it was meant 
 
 from __future__ import annotations
 
+import gc
 import importlib
 import json
 import os
@@ -149,6 +150,7 @@ def serve(choices: Path) -> None:
     ):
         importlib.import_module(name)
     importlib.import_module("tests.remembered_work").remember(choices)
+    gc.freeze()  # else each child looks through all of it for what may go, and copies it from its parent by that
     for line in sys.stdin:
         request = json.loads(line)
         if "wait" in request:

@@ -21,6 +21,7 @@ SURVEY = (
     "survey camera.toml --scene scene.png --labels labels.png --weights weights.safetensors --engine plain "
     "--no-controls --budget 0.95 --effects shot"
 )
+UNDISTURBED = "undisturbed"
 Stored = dict[str, dict[str, str]]  # address of a store -> SHA-256 of each of its files
 
 
@@ -41,6 +42,10 @@ class Subject:
         """Where archives and scratch files go."""
         return self.nursery.folder
 
+    def surveyed(self, out: Path) -> None:
+        """Leave there what the undisturbed survey left."""
+        shutil.copytree(self.folder / UNDISTURBED, out)
+
 
 def words(out: Path, *more: str) -> list[str]:
     """The survey's command into an archive; flags given later win."""
@@ -55,7 +60,7 @@ def prepare(nursery: Nursery) -> Subject:
     Image.fromarray(labels).save(folder / "labels.png")
     save_weights(random_weights(RGB_NM), folder / "weights.safetensors")
     (folder / "camera.toml").write_text(SETTINGS)
-    counted, out, log = folder / "counted", folder / "undisturbed", folder / "counted.calls"
+    counted, out, log = folder / "counted", folder / UNDISTURBED, folder / "counted.calls"
     first = nursery.run(words(counted), "refuse", root=str(counted), at=0, number=0, log=str(log))
     ended = nursery.run(words(out))  # the first alone works out which effects there are
     for one in (first, ended):

@@ -21,7 +21,7 @@ from tests.faults import (
 )
 from tests.faults.cube_files import FORMATS
 from tests.faults.fault_table import Row, markdown_table, plain_table
-from tests.faults.small_survey import Subject, stored, words
+from tests.faults.small_survey import Subject, stored
 
 
 def test_disk_full_under_spool_manifest_and_run(subject: Subject) -> None:
@@ -133,7 +133,7 @@ def test_mutated_files_end_well() -> None:
 def test_a_fault_that_is_not_survived_is_seen(subject: Subject) -> None:
     """The judges find damage: a store of other bytes, one that is lost, and an error without advice."""
     out = subject.folder / "damaged"
-    subject.nursery.run(words(out))
+    subject.surveyed(out)
     before = stored(out)
     first = next(
         path for path in sorted((out / "stages" / "segment").rglob("*")) if path.is_file() and path.suffix == ""

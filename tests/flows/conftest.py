@@ -24,6 +24,7 @@ from storage.archive.archive import Archive
 from storage.remote.opening import verify_archive
 from tests.conftest import Survey
 from tests.flows.small_fields import write_field
+from tests.remembered_work import without_effects
 
 CommandLine = Callable[..., "Ended"]
 FEW_BANDS = ",".join(map(str, range(4, 270, 9)))  # of the farm: the fewest that reach all the shipped weights' columns
@@ -174,8 +175,9 @@ def served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Pat
 def two_budgets(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey) -> Path:
     """An archive of two surveys of one scene with different budgets, 0.8 and 0.7; not to be changed."""
     folder = tmp_path_factory.mktemp("two_budgets") / "archive"
-    for budget in ("0.8", "0.7"):
-        survey_png(folder, budget=budget)
+    with without_effects():
+        for budget in ("0.8", "0.7"):
+            survey_png(folder, budget=budget)
     return folder
 
 

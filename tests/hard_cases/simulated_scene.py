@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from typing import Any
 
@@ -58,13 +60,20 @@ def block_of(scene: RasterScene, rig: Rig, lines: range = range(0, 30, 5), sweep
     return sweep_block(scene, rig, sweep, lines)
 
 
+@contextmanager
+def looking_at_less() -> Iterator[None]:
+    """Probes look at no more of a scene than small sweeps see of it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(survey_probe, "MOST_SAMPLES", 3000)  # of a sweep's 2000 or so, some seen twice
+        patch.setattr(survey_probe, "FINEST_SAMPLES", 300)
+        yield
+
+
 def probed(scene: RasterScene, rig: Rig, sweep: Sweep = SWEEP) -> Probe:
     """What the decision sees of a sweep, looked at once however many tolerances or tests ask."""
     asked = scene.planes.tobytes(), scene.planes.shape, scene.electrons.tobytes(), rig, sweep
     if asked not in PROBES:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(survey_probe, "MOST_SAMPLES", 3000)  # of a sweep's 1920, some seen twice
-            patch.setattr(survey_probe, "FINEST_SAMPLES", 300)
+        with looking_at_less():
             PROBES[asked] = survey_probe.probe_scene(scene, rig, [sweep])
     return PROBES[asked]
 

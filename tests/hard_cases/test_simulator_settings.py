@@ -26,7 +26,7 @@ from pipeline.simulator.selection.choice import TOTAL, decide
 from pipeline.simulator.selection.survey_probe import probe_survey
 from pipeline.simulator.selection.verification import candidate_blocks, verify, worst_blocks
 from pipeline.simulator.simulated import sweep_block
-from tests.hard_cases.simulated_scene import scene_of
+from tests.hard_cases.simulated_scene import looking_at_less, scene_of
 
 LOOK: dict[Effect, str] = {ROTATION: ROTATION.variants[0], SLIT: SLIT.variants[-1]}
 SHAPE = (40, 64)
@@ -102,7 +102,8 @@ def test_every_permitted_setting_is_decided_and_verified(asked: Asked) -> None:
         Sweep("coarse-0", "coarse", "x", 0.0, -20.0, SHAPE[0] // 4, 4, asked.binning),
         Sweep("full-0", "fine", "x", 0.0, -20.0, SHAPE[0]),
     )
-    probes = probe_survey(scene, rig, sweeps, asked.unit)
+    with looking_at_less():
+        probes = probe_survey(scene, rig, sweeps, asked.unit)
     decision = decide(probes, rig, EFFECTS, asked.tolerance)
 
     def units(light: Light, binning: int) -> Light:

@@ -26,6 +26,8 @@ from storage.archive.lineage import Catalogue
 from tests.conftest import Survey
 from tests.storage.small_archive import flip, small_survey
 
+pytestmark = pytest.mark.usefixtures("no_effects")
+
 QUIET = Console(quiet=True)
 
 

@@ -24,6 +24,8 @@ from tests.conftest import Survey, WeightsMaker
 from tests.flows.conftest import turned
 from tests.storage.small_archive import flip
 
+pytestmark = pytest.mark.usefixtures("no_effects")
+
 POSE = {"lon_deg": 9.5, "lat_deg": 52.1, "heading_deg": 25.0, "tilt_deg": 50.0, "height_m": 14.0}
 
 
@@ -87,7 +89,6 @@ def test_two_budgets_are_told_apart_either_way(
     }
 
 
-@pytest.mark.usefixtures("no_effects")
 def test_new_weights_and_hectares_are_told(
     survey_png: Survey, make_weights: WeightsMaker, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -102,7 +103,6 @@ def test_new_weights_and_hectares_are_told(
     assert "ha in B" in capsys.readouterr().out
 
 
-@pytest.mark.usefixtures("no_effects")
 def test_runs_of_different_fields_are_refused(survey_png: Survey, scene_files: Path, tmp_path: Path) -> None:
     """Also by `previous`, which looks for the same field."""
     other = turned(scene_files / "scene.png", tmp_path / "turned.png")

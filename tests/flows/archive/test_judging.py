@@ -25,6 +25,8 @@ from tests.conftest import RGB_NM, random_weights
 from tests.flows.conftest import CommandLine, act_instead, be_version, problems, turned
 from tests.storage.small_archive import flip
 
+pytestmark = pytest.mark.usefixtures("no_effects")
+
 QUIET = Console(quiet=True)
 Refuse = Callable[[Path, Path, pytest.MonkeyPatch], None]
 

@@ -21,6 +21,8 @@ from pipeline.simulator.simulated import SimulatedSource
 from storage.archive.archive import Archive
 from tests.flows.conftest import be_version, python
 
+pytestmark = pytest.mark.usefixtures("no_effects")
+
 WAITS = {"locate": "capture_coarse", "rectify": "locate", "attend": "rectify", "capture_fine": "attend"}
 ON_REQUEST = ["register_coarse", "register_fine", "ground"]
 
@@ -50,7 +52,6 @@ def _tree(root: Path) -> dict[str, tuple[int, int]]:
 @pytest.mark.parametrize(
     "changes", [{}, {"kernel": "nearest"}, {"budget": 0.7}, {"policy": "sobel"}, {"seed": 5}], ids=str
 )
-@pytest.mark.usefixtures("no_effects")
 def test_the_survey_does_what_the_plan_said(
     settings: Settings, archive: Path, survey_png: Any, changes: dict[str, Any]
 ) -> None:

@@ -30,6 +30,8 @@ from tests.flows.conftest import be_version, turned
 from tests.remembered_work import without_effects
 from tests.storage.small_archive import flip
 
+pytestmark = pytest.mark.usefixtures("no_effects")
+
 QUIET = Console(quiet=True)
 
 
@@ -295,7 +297,6 @@ def test_fields_are_told_apart_by_what_they_asked_for_and_are_called(surveyed: P
     assert [one.run for one in generations.newest_runs(Catalogue.read(tmp_path))] == [runs[n] for n in (0, 1, 3, 4)]
 
 
-@pytest.mark.usefixtures("no_effects")
 def test_fields_of_one_file_name_are_told_apart(
     tmp_path: Path, survey_png: Survey, scene_files: Path, monkeypatch: pytest.MonkeyPatch, reprocess: Reprocess
 ) -> None:
@@ -309,7 +310,6 @@ def test_fields_of_one_file_name_are_told_apart(
     assert reprocess.states(tmp_path / "archive") == [("scene", "skipped")] * 2
 
 
-@pytest.mark.usefixtures("no_effects")
 def test_an_older_farm_law_is_not_current(
     tmp_path: Path,
     survey_png: Survey,

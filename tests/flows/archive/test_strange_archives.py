@@ -25,6 +25,8 @@ from tests.flows.conftest import CommandLine
 from tests.storage.archive.test_no_files import CASES, Case, put
 from tests.storage.small_archive import Small, flip, small_survey
 
+pytestmark = pytest.mark.usefixtures("no_effects")
+
 
 def _stored_as(archive: Archive, like: StageRef, params: dict[str, Any], inputs: Sequence[str]) -> StageRef:
     """A store of the second round: with the arrays of another, and the facts that the second round's had."""

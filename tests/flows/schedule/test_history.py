@@ -16,6 +16,8 @@ from storage.archive.ledger import Ledger
 from storage.arrays.class_maps import load_class_map
 from tests.flows.conftest import Page
 
+pytestmark = pytest.mark.usefixtures("no_effects")
+
 BAD = '<script>alert("1")</script>&'
 
 

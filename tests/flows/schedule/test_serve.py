@@ -32,6 +32,8 @@ from storage.archive.ledger import Ledger
 from storage.remote.opening import verify_archive
 from tests.flows.schedule.schedule_days import NOON, HandClock, field_schedule
 
+pytestmark = pytest.mark.usefixtures("no_effects")
+
 EVERY = parse_timetable(None, "20m", "UTC")
 
 

@@ -21,6 +21,8 @@ from storage.archive.ledger import Ledger
 from storage.archive.staging import take_lock
 from tests.flows.schedule.schedule_days import NOON, HandClock
 
+pytestmark = pytest.mark.usefixtures("no_effects")
+
 
 @pytest.fixture
 def on_server(prefect_home: Path) -> Iterator[Path]:

@@ -12,6 +12,8 @@ import xarray as xr
 from flows.settings.load import load_settings
 from pipeline.errors import SettingsError
 
+pytestmark = pytest.mark.usefixtures("no_effects")
+
 
 def _cubes(archive: Path) -> dict[str, xr.Dataset]:
     return {path.stem: xr.open_zarr(path, consolidated=False) for path in archive.glob("**/capture/**/*.zarr")}

@@ -22,6 +22,9 @@ from storage.remote.object_archive import ObjectArchive
 from storage.remote.object_stores import Objects
 from tests.conftest import Survey
 from tests.flows.conftest import FEW_BANDS, CommandLine
+from tests.remembered_work import with_effects
+
+pytestmark = pytest.mark.usefixtures("no_effects")
 
 SMALL = ("--size", "96x64", "--bands", FEW_BANDS, "--no-controls", "--engine", "plain")
 CACHED = {"cached", "skipped"}
@@ -47,7 +50,8 @@ def test_a_rerun_makes_nothing_and_moves_next_to_nothing(
     opened: list[Objects] = []
     start = Objects.__init__
     monkeypatch.setattr(Objects, "__init__", lambda self, *given: (start(self, *given), opened.append(self))[0])
-    first = survey_png(bucket)
+    with with_effects():  # as the survey beside it has them
+        first = survey_png(bucket)
     stored = sum(open_archive(bucket).stored_bytes(ref) for ref in open_archive(bucket).refs())
     beside = map_of(open_archive(tmp_path / "folder"), surveyed_png(tmp_path / "folder"))
     np.testing.assert_array_equal(map_of(open_archive(bucket), first), beside)
@@ -67,7 +71,6 @@ def test_a_rerun_makes_nothing_and_moves_next_to_nothing(
     np.testing.assert_array_equal(map_of(open_archive(bucket), elsewhere), beside)
 
 
-@pytest.mark.usefixtures("no_effects")
 def test_verbs_read_an_archive_in_a_bucket(
     bucket: str, command_line: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

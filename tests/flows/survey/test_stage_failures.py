@@ -31,6 +31,8 @@ from storage.archive.ledger import Ledger
 from storage.arrays.class_maps import load_class_map
 from tests.flows.conftest import Ended, problems
 
+pytestmark = pytest.mark.usefixtures("no_effects")
+
 CAPTURES = ("capture_coarse", "capture_fine")
 NO_REPLY = "no reply from the camera after 2 s; is it on?"
 FULL_DISK = "cannot write to the archive: no space left; make room"

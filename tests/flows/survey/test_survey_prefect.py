@@ -20,6 +20,9 @@ from flows.terminal.processes import Terminated
 from pipeline.errors import RigError
 from storage.archive.archive import Archive
 from tests.flows.conftest import CommandLine, act_instead, problems
+from tests.remembered_work import with_effects
+
+pytestmark = pytest.mark.usefixtures("no_effects")
 
 
 @pytest.fixture
@@ -52,7 +55,8 @@ def test_prefect_makes_the_stores_that_plain_makes(
 ) -> None:
     """Every stage is a task that takes and gives addresses and keys only; keys and figures are those of plain."""
     console = io.StringIO()
-    flow = survey_png(tmp_path / "flow", Console(file=console), engine="prefect").receipt
+    with with_effects():  # as the other has them
+        flow = survey_png(tmp_path / "flow", Console(file=console), engine="prefect").receipt
     plain = surveyed_png(tmp_path / "plain").receipt
     assert "going on with --engine plain" not in console.getvalue()
     assert [stage["key"] for stage in flow["stages"]] == [stage["key"] for stage in plain["stages"]]
