@@ -71,6 +71,7 @@ def train(
     mlp_ratio: int = 3,
     crop: int | None = None,
     batch: int = 4,
+    darkest_ms: float = 100.0,
     labels: str | None = None,
     bands: str | None = None,
     wavelengths: str | None = None,
@@ -130,6 +131,9 @@ def train(
     batch
         Crops a step; half as many in the last 30 % of the run, where crops have twice the area if scenes are large
         enough.
+    darkest_ms
+        Shortest exposure that the weights are to read: crops are shown with exposures from here to 100 ms, and lines 1,
+        2 or 4 px apart; the file then has a record of plain scans, by which `survey --seconds` plans.
     labels
         For one scene: the file of its labels.
     bands
@@ -165,7 +169,9 @@ def train(
         tokens={"dim": dim, "layers": layers, "heads": heads, "mlp_ratio": mlp_ratio},
         init=init,
         choices=choices,
-        settings=TrainingSettings(steps=steps, minutes=minutes, seed=seed, crop=size, batch=batch),
+        settings=TrainingSettings(
+            steps=steps, minutes=minutes, seed=seed, crop=size, batch=batch, darkest_ms=darkest_ms
+        ),
     )
     record = run_train(request, stderr)
     if as_json:

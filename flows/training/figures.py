@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import warnings
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from models.evaluation.metrics import agreement, confusion
+from models.evaluation.metrics import (
+    agreement,
+    calibration_error,
+    confidence_counts,
+    confusion,
+    iou_per_class,
+    mean_iou,
+)
 from models.evaluation.placement import CONTROL_SHARE, RANDOM_DRAWS, Controls, Counts, agreement_of_draws, run_controls
 from models.network.segmenter import Segmenter
 from models.network.spectral import patches_of
 from models.policies.policies import score_seats
 from models.reading.control_maps import draw_with_control
-from models.reading.inference import Glance, glance_of_columns
+from models.reading.inference import Glance, glance_of_columns, segment
 from models.training.examples import Example
+from models.training.looks import REFERENCE_MS, Looks
 from models.weights.files import AnyWeights, Weights
-from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.planning.selection import frame_seats
 
 Show = Callable[[str], None]
@@ -62,6 +71,73 @@ def validate(weights: AnyWeights, examples: Iterable[Example], seed: int, show: 
         "all": agreement(whole.every),
         **whole.as_dict(),
     }
+
+
+SCAN_EXPOSURES = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # of the reference, down to the darkest that was trained
+
+
+def judge_scans(
+    weights: Weights,
+    examples: Sequence[Example],
+    looks: Looks,
+    seed: int,
+    show: Callable[[str, float], None] = lambda scan, done: None,
+) -> dict[str, Any] | None:
+    """What maps of plain scans that are read whole score on each scene, by step and exposure; None without a scene.
+
+    ``miou`` and the IoU of each class are tables (step, exposure) of the scenes' means, ``spread`` the standard
+    deviation of their mIoU, ``calibration_error`` that of all pixels together. A scan is shown by the law of noise that
+    training shows crops by.
+    """
+    known = [example for example in examples if example.noise is not None]
+    if not known:
+        return None
+    factor = weights.config.factor
+    steps = [step for step in looks.steps if factor % step == 0]
+    exposures = [share * REFERENCE_MS for share in SCAN_EXPOSURES if share * REFERENCE_MS >= looks.darkest_ms]
+    miou, spread, calibration = np.zeros((3, len(steps), len(exposures)))
+    of_classes = np.zeros((len(weights.class_names), len(steps), len(exposures)))
+    for i, step in enumerate(steps):
+        for j, exposure_ms in enumerate(exposures):
+            rng = np.random.default_rng([seed, 0x5CA, i, j])
+            judged = [_scanned(weights, one, looks, step, exposure_ms / REFERENCE_MS, rng) for one in known]
+            counts = [classes for classes, _ in judged]
+            calibration[i, j] = calibration_error(np.sum([sure for _, sure in judged], axis=0))
+            own = [mean_iou(one) for one in counts]
+            miou[i, j], spread[i, j] = np.nanmean(own), np.nanstd(own, ddof=1) if len(own) > 1 else np.nan
+            with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # a class that no scene has
+                of_classes[:, i, j] = np.nanmean([iou_per_class(one) for one in counts], axis=0)
+            done = (i * len(exposures) + j + 1) / miou.size
+            show(f"lines {step} px apart, {exposure_ms:g} ms: {100 * miou[i, j]:.1f}", done)
+    return {
+        "scenes": len(known),
+        "steps": steps,
+        "exposures_ms": exposures,
+        "miou": miou.tolist(),
+        "spread": spread.tolist() if len(known) > 1 else None,
+        "calibration_error": calibration.tolist(),
+        "per_class_iou": {
+            name: iou.tolist()
+            for name, iou in zip(weights.class_names, of_classes, strict=True)
+            if np.isfinite(iou).all()
+        },
+    }
+
+
+def _scanned(
+    weights: Weights, example: Example, looks: Looks, step: int, light: float, rng: np.random.Generator
+) -> tuple[Counts, NDArray[np.float64]]:
+    """Confusion counts of a scene whose plain scan is read whole, and its labelled pixels by their confidence."""
+    assert example.noise is not None
+    grid, _, labels = _parts(weights, example)
+    plain = example.fine.astype(np.float32)
+    fine, means = looks.scan(plain, example.noise, grid.factor, light=light, step=step, rng=rng)
+    valid = grid.valid_seats()
+    seen = glance_of_columns(weights, means, grid)
+    drawn = segment(weights, seen, patches_of(fine, grid.patch)[valid], valid)
+    told = (labels != UNLABELLED) & np.isfinite(drawn.confidence)
+    sure = confidence_counts(drawn.confidence[told], drawn.classes[told] == labels[told])
+    return confusion(labels, drawn.classes, weights.config.classes), sure
 
 
 def _parts(weights: AnyWeights, example: Example) -> tuple[SceneGrid, Patches, NDArray[np.uint8]]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.network.spectral import SpectralBasis, project
-from models.training.examples import Observation, observe
+from models.training.examples import Observation, noise_of, observe
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
@@ -78,6 +78,7 @@ def observe_scene(
         np.asarray(pad_by_reflection(_columns(source, coarse, grid, matrix), small), np.float32),
         labels,
         (grid.height, grid.width),
+        noise_of(scene, matrix, camera),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 import sys
 from collections.abc import Callable, Mapping
@@ -16,14 +17,16 @@ from rich.table import Table
 
 from flows.terminal.progress import StageProgress
 from flows.training.data import TrainingData, either_mask, open_training_data, pack_mask, trained_pixels
-from flows.training.figures import validate
+from flows.training.figures import judge_scans, validate
 from flows.training.look import observe_scene
+from models.network.segmenter import Segmenter
 from models.network.sizes import PRESETS, Positions, Preset, SegmenterConfig
 from models.network.spectral import SpectralBasis
 from models.training.examples import Observation, measured_normalisation, normalised
+from models.training.looks import REFERENCE_MS, Looks
 from models.training.start_weights import StartFile
 from models.training.train import Progress, TrainingSettings, train
-from models.weights.files import AnyWeights, save_weights, with_record
+from models.weights.files import AnyWeights, Weights, save_weights, with_record
 from models.weights.sealed_files import read_checkpoint
 from pipeline.errors import SceneError, SettingsError, ShapeError
 from pipeline.geometry.camera import LineCamera
@@ -81,7 +84,7 @@ def train_weights(request: TrainRequest, report: Report = lambda what, done, fig
     )
     refuse_seen(start, data)
     seen, about = _observe_all(request, data, data.train, "looking at scenes", report)
-    normalisation = measured_normalisation(seen)
+    normalisation = measured_normalisation(seen, math.sqrt(request.settings.darkest_ms * REFERENCE_MS))
     reached = np.ones(about.basis.columns, bool)
     examples = [normalised(observation, normalisation, reached) for observation in seen]
     config = _config(request, about)
@@ -98,13 +101,29 @@ def train_weights(request: TrainRequest, report: Report = lambda what, done, fig
     split = joined_split(
         own | {"pixels": dict(about.pixels)}, start
     )  # before validation scenes are looked at: what was trained on
+    looks = None
+    if request.settings.darkest_ms < REFERENCE_MS:
+        looks = Looks(normalisation, darkest_ms=request.settings.darkest_ms)
     model, summary = train(
-        config, examples, normalisation.gain_shift, request.settings, progress, start=state, checkpoint=checkpoint
+        config,
+        examples,
+        normalisation.gain_shift,
+        request.settings,
+        progress,
+        start=state,
+        looks=looks,
+        checkpoint=checkpoint,
     )
     weights = AnyWeights(model, about.basis, normalisation, about.names, about.colours)
     kept, _ = _observe_all(request, data, data.validation, "looking at validation scenes", report, about)
-    frames = (normalised(one, normalisation, reached) for one in kept)
+    frames = [normalised(one, normalisation, reached) for one in kept]
     figures = validate(weights, frames, request.settings.seed, lambda row: report("validating", 0.0, row))
+    scans = None
+    if looks is not None and isinstance(model, Segmenter):
+        two_scale = Weights(model, about.basis, normalisation, about.names, about.colours)
+        scans = judge_scans(
+            two_scale, frames, looks, request.settings.seed, lambda row, done: report("judging scans", done, row)
+        )
     record = {
         "command": request.command,
         "data": data.law,
@@ -113,6 +132,7 @@ def train_weights(request: TrainRequest, report: Report = lambda what, done, fig
         "camera": asdict(request.camera),
         "training": summary,
         "validation": figures,
+        **({} if scans is None else {"scans": scans}),
         **({} if begun is None else {"begun_from": begun.record}),
     }
     save_weights(with_record(weights, **record), request.out)
@@ -319,6 +339,11 @@ def _check_counts(request: TrainRequest) -> None:
     for name, number in {"--validation": request.validation, "--seed": settings.seed}.items():
         if number is not None and number < 0:
             raise SettingsError(f"{name} must be 0 or more, got {number}")
+    if not 0 < settings.darkest_ms <= REFERENCE_MS:
+        raise SettingsError(
+            f"--darkest-ms must be above 0 and at most {REFERENCE_MS:g}, the exposure that scenes are looked at with,"
+            f" got {settings.darkest_ms}"
+        )
     if request.positions == "paper" and request.preset not in ("two-scale", "paper"):
         raise SettingsError(
             f"--positions paper is not for --preset {request.preset}, which reads one scale; leave it out"

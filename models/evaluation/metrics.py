@@ -194,3 +194,26 @@ def boundary_iou(counts: NDArray[np.int64], labelled: NDArray[np.bool_]) -> NDAr
 def mean_boundary_iou(counts: NDArray[np.int64], labelled: NDArray[np.bool_]) -> float:
     """Mean over the classes that the labels have; NaN where there is none."""
     return _mean_of_known(boundary_iou(counts, labelled))
+
+
+CONFIDENCE_BINS = 20
+
+
+def confidence_counts(confidence: NDArray[np.floating], right: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Pixels by their confidence 0..1 in `CONFIDENCE_BINS` equal steps: (3, bin) how many, how many right, and the sum.
+
+    ``confidence`` and ``right`` are (pixel,). Counts of several maps add up.
+    """
+    place = np.clip((confidence * CONFIDENCE_BINS).astype(np.intp), 0, CONFIDENCE_BINS - 1)
+    weights = (None, right.astype(np.float64), confidence.astype(np.float64))
+    return np.stack([np.bincount(place, one, CONFIDENCE_BINS).astype(np.float64) for one in weights])
+
+
+def calibration_error(counts: NDArray[np.float64]) -> float:
+    """Expected calibration error of `confidence_counts`, 0..1: how far confidence lies beside the share that is right.
+
+    Mean over the bins by their pixels, of |share right - mean confidence|; NaN without a pixel. (Naeini et al. 2015)
+    """
+    pixels, right, confidence = counts
+    total = float(pixels.sum())
+    return float(np.abs(right - confidence).sum() / total) if total else float("nan")

@@ -138,15 +138,22 @@ class Normalisation:
     whitening: NDArray[np.float32]  # (column, column)
 
     @staticmethod
-    def measured(sample: NDArray[np.floating]) -> Normalisation:
-        """Measure on (pixel, column) values. Constant columns give 0, whatever the order of columns."""
+    def measured(sample: NDArray[np.floating], noise: NDArray[np.floating] | None = None) -> Normalisation:
+        """Measure on (pixel, column) values. Constant columns give 0, whatever the order of columns.
+
+        ``noise`` is the covariance (column, column) of what a shorter exposure than the sample's would add, in squares
+        of its values: directions that it hides are not made as large as the rest.
+        """
         exact = sample.astype(np.float64)
         centre = np.median(exact, axis=0)
         spread = 1.4826 * np.median(np.abs(exact - centre), axis=0)
         spread = np.maximum(spread, SPREAD_FLOOR * (float(np.median(spread)) or 1.0))
         scaled = np.clip((exact - centre) / spread, -10, 10)
         scaled -= scaled.mean(axis=0)
-        power, axes = np.linalg.eigh(scaled.T @ scaled / max(len(scaled), 1))
+        covariance = scaled.T @ scaled / max(len(scaled), 1)
+        if noise is not None:
+            covariance += noise / np.outer(spread, spread)
+        power, axes = np.linalg.eigh(covariance)
         gain = 1 / np.sqrt(np.maximum(power, VARIANCE_FLOOR * max(float(power[-1]), 1e-12)))
         whitening = (axes * gain) @ axes.T  # symmetric: no column changes its sign or its place
         return Normalisation(centre.astype(np.float32), spread.astype(np.float32), whitening.astype(np.float32))

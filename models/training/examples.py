@@ -13,6 +13,7 @@ from torch import Tensor
 
 from models.network.layers import cut
 from models.network.spectral import Normalisation, SpectralBasis
+from models.training.looks import REFERENCE_MS, ColumnNoise, Looks
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera, expose, footprint
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
@@ -31,6 +32,7 @@ class Example:
     coarse: NDArray[np.float32]  # (y / s, x / s, column) normalised
     labels: NDArray[np.uint8]  # (y, x), 255 unlabelled
     shape: tuple[int, int]  # of the scene before padding
+    noise: ColumnNoise | None = None
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,7 @@ class Observation:
     coarse: NDArray[np.float32]
     labels: NDArray[np.uint8]
     shape: tuple[int, int]
+    noise: ColumnNoise | None = None
 
 
 def observe(
@@ -71,7 +74,12 @@ def observe(
         electrons = electrons_of(scene, blurred, camera)
         fine[top : top + cell] = (expose(electrons, camera, step=1, rng=stream) * scale) @ matrix
         coarse[top // s : (top + cell) // s] = (expose(electrons, camera, step=s, rng=stream) * scale) @ matrix
-    return Observation(scene.name, fine, coarse, labels, (grid.height, grid.width))
+    return Observation(scene.name, fine, coarse, labels, (grid.height, grid.width), noise_of(scene, matrix, camera))
+
+
+def noise_of(scene: RasterScene, matrix: NDArray[np.float32], camera: LineCamera) -> ColumnNoise:
+    """What light and readings of a camera leave in the columns of a scene."""
+    return ColumnNoise.of_bands(matrix, scene.panel / scene.panel_electrons, camera.read_noise_e)
 
 
 def electrons_of(scene: RasterScene, planes: NDArray[np.float32], camera: LineCamera) -> NDArray[np.float32]:
@@ -82,17 +90,21 @@ def electrons_of(scene: RasterScene, planes: NDArray[np.float32], camera: LineCa
     return np.asarray(planes @ scene.electrons * exposure, np.float32)
 
 
-def measured_normalisation(observations: list[Observation]) -> Normalisation:
-    """Normalisation over the fine looks of all scenes (every third pixel of every third row)."""
-    return Normalisation.measured(
-        np.concatenate([seen.fine[::3, ::3].reshape(-1, seen.fine.shape[-1]) for seen in observations])
-    )
+def measured_normalisation(observations: list[Observation], exposure_ms: float = REFERENCE_MS) -> Normalisation:
+    """Normalisation over the fine looks of all scenes (every third pixel of every third row), for looks so exposed."""
+    sample = np.concatenate([seen.fine[::3, ::3].reshape(-1, seen.fine.shape[-1]) for seen in observations])
+    noises = [seen.noise for seen in observations if seen.noise is not None]
+    if exposure_ms >= REFERENCE_MS or not noises:
+        return Normalisation.measured(sample)
+    middle = np.median(sample, axis=0)
+    added = [noise.covariance(middle, exposure_ms / REFERENCE_MS) - noise.covariance(middle, 1.0) for noise in noises]
+    return Normalisation.measured(sample, np.mean(added, axis=0))
 
 
 def normalised(seen: Observation, normalisation: Normalisation, reached: NDArray[np.bool_]) -> Example:
     """Turn an observation into an example."""
     fine = np.clip(normalisation.apply(seen.fine, reached), -60000, 60000).astype(np.float16)
-    return Example(seen.name, fine, normalisation.apply(seen.coarse, reached), seen.labels, seen.shape)
+    return Example(seen.name, fine, normalisation.apply(seen.coarse, reached), seen.labels, seen.shape, seen.noise)
 
 
 @dataclass(frozen=True)
@@ -109,13 +121,21 @@ class CropSampler:
     """Draws random crops: place, flips, transposition, brightness and noise all come from the given generator."""
 
     def __init__(
-        self, examples: list[Example], config_patch: int, factor: int, crop: int, *, noise: float = 0.0
+        self,
+        examples: list[Example],
+        config_patch: int,
+        factor: int,
+        crop: int,
+        *,
+        noise: float = 0.0,
+        looks: Looks | None = None,
     ) -> None:
-        """``noise`` is the most that is added, in spreads of the normalised columns."""
+        """``noise`` is the most that is added, in spreads of the normalised columns; with ``looks`` they say it."""
         cell = config_patch * factor
         smallest = min(min(example.labels.shape) for example in examples)
         self.size = max(cell, min(crop, smallest) // cell * cell)
         self.examples, self.patch, self.factor, self.noise = examples, config_patch, factor, noise
+        self.looks = looks
         areas = np.array([np.count_nonzero(example.labels != UNLABELLED) for example in examples], np.float64)
         if not areas.any():
             raise SceneError(f"none of {len(examples)} scenes has a labelled pixel; training needs some")
@@ -141,6 +161,10 @@ class CropSampler:
         coarse = turn(example.coarse[y // s : (y + size) // s, x // s : (x + size) // s]).astype(np.float32) * gain
         fine = turn(example.fine[y : y + size, x : x + size]).astype(np.float32) * gain
         shift = (gain - 1) * gain_shift
+        if self.looks is not None and example.noise is not None:
+            fine, coarse = self.looks.draw(fine + shift, coarse + shift, example.noise, s, rng)
+            channels = [np.ascontiguousarray(image.transpose(2, 0, 1)) for image in (coarse, fine)]
+            return channels[0], channels[1], np.ascontiguousarray(turn(labels)).astype(np.int64)
         channels_first = [np.ascontiguousarray((image + shift).transpose(2, 0, 1)) for image in (coarse, fine)]
         if rng.random() < NOISY:  # a coarse pixel gathers s times the light of a fine one, in as many readings
             noise = rng.uniform(0, self.noise)

@@ -43,6 +43,7 @@ START_FROM = (  # in words
     "a vision transformer of timm or DeiT, a Segmenter checkpoint with its variant.yml, or weights that `spectralzoom"
     " train` made"
 )
+SAME_SPREAD = 0.1  # columns of the same data differ by no more, as a share
 LICENCES = ("licence", "license")
 CLASS_HEADS = ("coarse_classes", "fine_classes", "scorer")  # the scorer reads probabilities of classes
 _BLOCK = "encoder.blocks.*."
@@ -73,10 +74,13 @@ def column_change(
     return np.asarray(np.linalg.solve(new.whitening.astype(np.float64), whitened), np.float64)
 
 
-def for_columns(state: Mapping[str, Tensor], change: NDArray[np.float64]) -> tuple[dict[str, Tensor], dict[str, str]]:
+def for_columns(
+    state: Mapping[str, Tensor], change: NDArray[np.float64], *, same_data: bool = False
+) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Bring the first kernels to the new columns, with how; nothing where these mean the same.
 
-    No kernel grows: what hardly varied in the old data and was made large there may vary much in the new.
+    No kernel grows, but for the same data: what hardly varied in the old and was made large there may vary much in the
+    new.
     """
     fitted, how = dict(state), dict[str, str]()
     if change.shape[0] == change.shape[1] and np.allclose(change, np.eye(len(change)), atol=1e-5):
@@ -87,7 +91,8 @@ def for_columns(state: Mapping[str, Tensor], change: NDArray[np.float64]) -> tup
             continue
         mixed = torch.einsum("ocyx,jc->ojyx", kernel.double(), torch.from_numpy(change))
         before, after = (one.flatten(1).norm(dim=1).clamp(min=1e-12) for one in (kernel.double(), mixed))
-        fitted[name] = (mixed * (before / after).clamp(max=1.0)[:, None, None, None]).to(kernel.dtype)
+        smaller = torch.ones_like(after) if same_data else (before / after).clamp(max=1.0)
+        fitted[name] = (mixed * smaller[:, None, None, None]).to(kernel.dtype)
         how[name] = f"{kernel.shape[1]} to {change.shape[0]} spectral columns by wavelength"
     return fitted, how
 
@@ -212,7 +217,9 @@ class StartFile:
                 raise WeightsError(
                     f"the weights to begin from lack the tensor {error}; train or copy them again"
                 ) from None
-            state, changed = for_columns(state, column_change(self.described.basis, own, basis, normalisation))
+            alike = self.described.basis == basis and np.allclose(own.spread, normalisation.spread, rtol=SAME_SPREAD)
+            change = column_change(self.described.basis, own, basis, normalisation)
+            state, changed = for_columns(state, change, same_data=alike)
         else:
             state, changed = with_patch_kernels(state, config, mixed_channels(normalisation, rgb_response(basis)))
         with torch.random.fork_rng(devices=[]):

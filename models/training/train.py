@@ -20,6 +20,7 @@ from models.network.controls import Network, build_network
 from models.network.process import keep_freed_memory
 from models.network.sizes import SegmenterConfig
 from models.training.examples import Batch, CropSampler, Example
+from models.training.looks import REFERENCE_MS, Looks
 from models.training.objective import PHASES, batch_loss, class_weights, phase_at
 from models.weights.sealed_files import load_checkpoint, save_checkpoint
 from pipeline.errors import PipelineError, WeightsError
@@ -42,6 +43,7 @@ class TrainingSettings:
     average: float = 0.998  # decay of the averaged weights
     noise: float = 0.3  # most that crops of shorter exposures get [spreads of the columns]
     weight_cap: float = 5.0
+    darkest_ms: float = REFERENCE_MS  # shortest exposure that crops are shown by
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,7 @@ class Trainer:
         gain_shift: NDArray[np.float32],
         settings: TrainingSettings,
         start: Mapping[str, Tensor] | None = None,
+        looks: Looks | None = None,
     ) -> None:
         self.settings, self.gain_shift = settings, gain_shift
         self.rng = np.random.default_rng([settings.seed, 0x7EA])
@@ -102,7 +105,9 @@ class Trainer:
         self.samplers = {}
         for larger in {phase.larger for phase in PHASES}:
             crop = round(settings.crop * math.sqrt(larger))
-            self.samplers[larger] = CropSampler(examples, config.patch, config.factor, crop, noise=settings.noise)
+            self.samplers[larger] = CropSampler(
+                examples, config.patch, config.factor, crop, noise=settings.noise, looks=looks
+            )
         self.weight = class_weights(examples, config.classes, settings.weight_cap)
         self.course = Course()
         self.batch: Batch | None = None  # of the last step
@@ -212,6 +217,7 @@ def train(
     report: Callable[[Progress], None] = lambda progress: None,
     *,
     start: Mapping[str, Tensor] | None = None,
+    looks: Looks | None = None,
     checkpoint: Path | None = None,
     keep_every_s: float = KEEP_EVERY_S,
 ) -> tuple[Network, dict[str, float | int]]:
@@ -227,7 +233,7 @@ def train(
     beside the checkpoint. WeightsError : a tensor of ``start`` that the network has no place for.
     """
     keep_freed_memory()
-    trainer = Trainer(config, examples, gain_shift, settings, start)
+    trainer = Trainer(config, examples, gain_shift, settings, start, looks)
     identity = run_identity(config, examples, settings, start)
     if checkpoint is not None:
         trainer.go_on(checkpoint, identity)

@@ -287,3 +287,35 @@ def test_masks_of_what_was_seen_add_up(earlier: Path, monkeypatch: pytest.Monkey
     assert set(joined["pixels"]) == {"A", "C"}
     assert joined["train"] == own["train"]
     assert zlib.decompress(base64.b64decode(joined["pixels"]["C"])) == np.packbits(other).tobytes()
+
+
+def test_weights_for_short_exposures_have_a_record_of_plain_scans(folder: Path, out: Path):
+    """mIoU by step and exposure from the darkest up, in the file too; without it, and of a control, there is none."""
+    settings = replace(SETTINGS, darkest_ms=6.0)
+    record = train_weights(_request(folder, out, validation=2, settings=settings))
+    scans = describe_weights(out).record["scans"]
+    assert scans == record["scans"]
+    assert (scans["steps"], scans["exposures_ms"], scans["scenes"]) == ([1, 2], [100.0, 50.0, 25.0, 12.0, 6.0], 2)
+    tables = [scans["miou"], *scans["per_class_iou"].values()]
+    assert all(np.shape(table) == (2, 5) and np.min(table) >= 0 and np.max(table) <= 1 for table in tables)
+    assert np.shape(scans["spread"]) == (2, 5)
+    assert "scans" not in train_weights(_request(folder, out, validation=2))
+    assert "scans" not in train_weights(_request(folder, out, validation=0, settings=settings))
+    dense = _request(folder, out, validation=2, settings=settings, preset="dense")
+    assert "scans" not in train_weights(dense)
+
+
+def test_whitening_knows_the_noise_of_short_exposures(folder: Path, out: Path):
+    """Weights that are to read short exposures make less of directions that noise would hide."""
+    sizes = []
+    for darkest_ms in (100.0, 3.0):
+        train_weights(_request(folder, out, validation=0, settings=replace(SETTINGS, darkest_ms=darkest_ms)))
+        sizes.append(np.linalg.norm(load_any_weights(out).normalisation.whitening, 2))
+    assert sizes[1] < sizes[0]
+
+
+@pytest.mark.parametrize("darkest_ms", [0.0, -1.0, 200.0, float("nan")])
+def test_exposures_that_no_look_has_are_refused(folder: Path, out: Path, darkest_ms: float):
+    """Above the exposure that scenes are looked at with, or none at all: one message with the limits."""
+    with pytest.raises(SettingsError, match=r"--darkest-ms must be above 0 and at most 100"):
+        run_train(_request(folder, out, settings=replace(SETTINGS, darkest_ms=darkest_ms)), Console(quiet=True))

@@ -16,6 +16,8 @@ from models.evaluation.metrics import (
     boundary_counts,
     boundary_iou,
     boundary_px,
+    calibration_error,
+    confidence_counts,
     confusion,
     false_pixels,
     frequency_weighted_iou,
@@ -301,3 +303,15 @@ def test_maps_of_other_sizes_are_refused():
     """The message names both sizes."""
     with pytest.raises(ShapeError, match=r"labels are \(2, 3\), the class map is \(3, 2\)"):
         boundary_counts(np.zeros((2, 3), int), np.zeros((3, 2), int), 2)
+
+
+def test_calibration_error_is_how_far_confidence_lies_beside_what_is_right():
+    """Sure and right, sure and wrong, unsure by halves; counts of two maps add up, and no pixel has no error."""
+    nine = np.full(10, 0.9)
+    right = np.arange(10) < 9
+    assert calibration_error(confidence_counts(nine, right)) == pytest.approx(0, abs=1e-12)
+    assert calibration_error(confidence_counts(nine, ~right)) == pytest.approx(0.8)
+    assert calibration_error(confidence_counts(np.array([0.0, 1.0]), np.array([False, True]))) == 0
+    both = confidence_counts(nine, ~right) + confidence_counts(np.full(30, 0.5), np.arange(30) < 15)
+    assert calibration_error(both) == pytest.approx(0.8 * 10 / 40)
+    assert np.isnan(calibration_error(confidence_counts(np.empty(0), np.empty(0, bool))))

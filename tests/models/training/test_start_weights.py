@@ -296,3 +296,19 @@ def test_a_change_of_wavelengths_keeps_what_is_alike_everywhere():
     plain = Normalisation(np.zeros(2, np.float32), np.ones(2, np.float32), np.eye(2, dtype=np.float32))
     assert np.ones(2) @ column_change(BASIS, PLAIN, small, plain) == pytest.approx(np.ones(4), abs=1e-6)
     assert np.ones(4) @ column_change(small, plain, BASIS, PLAIN) == pytest.approx(np.ones(2), abs=1e-6)
+
+
+def test_kernels_for_the_same_data_say_what_they_said(tmp_path: Path, tiny):
+    """Where whitening alone differs, by noise that it knows of, first kernels see what they saw, however large."""
+    weights = tiny(3)
+    file = _kept(weights, tmp_path / "w.safetensors")
+    old = weights.normalisation
+    new = replace(old, whitening=(0.1 * np.eye(4) + 0.02).astype(np.float32))
+    start = file.begin(weights.config, weights.basis, new, weights.class_names)
+    pixels = np.random.default_rng(1).normal(size=(50, 4)).astype(np.float32)
+    kernel = "fine_stem.enter.weight"
+    before, after = (
+        torch.einsum("pc,ocyx->poyx", torch.from_numpy(one.apply(pixels, np.ones(4, np.bool_))), state[kernel])
+        for one, state in ((old, weights.segmenter.state_dict()), (new, start.state))
+    )
+    np.testing.assert_allclose(after.numpy(), before.numpy(), rtol=1e-3, atol=1e-4)
