@@ -4,6 +4,7 @@ PY ?= python3
 VENV ?= .venv
 ARCHIVE ?= archive
 SCENE ?= farm
+SECONDS ?= 25
 PYTEST_ARGS ?= -n 2 --dist worksteal
 BENCH ?=
 BIN := $(VENV)/bin
@@ -24,7 +25,7 @@ $(BIN)/.ok: pyproject.toml constraints.txt
 	touch $@
 
 survey: $(BIN)/.ok
-	$(BIN)/spectralzoom survey --scene $(SCENE) --out $(ARCHIVE)
+	$(BIN)/spectralzoom survey --scene $(SCENE) --seconds $(SECONDS) --out $(ARCHIVE)
 
 # A rig emulated behind a pty and sockets, a whole survey through it, and the simulated one beside it. About a minute.
 survey-rig: $(BIN)/.ok

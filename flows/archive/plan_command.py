@@ -19,12 +19,14 @@ from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
 from flows.survey.extent import PastCosts
 from flows.survey.run import SurveyRun, open_run
+from flows.survey.scan_choice import ScanChoice, as_told
 from flows.survey.stage import Stage, Wanted
 from flows.survey.survey import STAGES, judge, survey
-from flows.terminal.figures import format_bytes, format_seconds
+from flows.terminal.figures import format_bytes, format_points, format_seconds
 from flows.terminal.processes import DONE
 from flows.terminal.progress import put_out
 from pipeline.errors import IncompleteStoreError, PipelineError
+from pipeline.planning.plain_scans import scan_words
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef, plain, store_at
 from storage.archive.lineage import Catalogue, Change, changes_between
@@ -85,6 +87,7 @@ class Forecast:
 
     stages: list[StageForecast]
     refused: str | None = None
+    scans: ScanChoice = field(default_factory=ScanChoice)
 
 
 def forecast(settings: Settings) -> Forecast:
@@ -93,10 +96,11 @@ def forecast(settings: Settings) -> Forecast:
         archive = Archive(Path(empty), writes=False)  # where there is none yet
         if is_archive(settings.out):
             archive = open_archive(settings.out, create=False, write=False)
-        run = replace(open_run(replace(settings, out=empty), planning=True), settings=settings, archive=archive)
+        run = open_run(replace(settings, out=empty), planning=True)
+        run = replace(run, settings=replace(run.settings, out=settings.out), archive=archive)
         planner = Planner(run, Catalogue.read(archive.root))
         judge(planner, survey(planner))
-    return Forecast(planner.rows, run.refused)
+    return Forecast(planner.rows, run.refused, run.scans)
 
 
 @dataclass
@@ -172,6 +176,8 @@ def _shown(value: object) -> str:
     return ", ".join("none" if part is None else str(part) for part in parts) or "none"
 
 
+MOST_SCANS = 8  # of the frontier that are shown
+MARKS = {"taken": "this survey", "reference": "nearly as good as any"}
 MOST_LETTERS = 250  # of a reason
 COLOURS = {"cached": "green", "to run": "bold", "blocked": "yellow", "skipped": "dim"}
 
@@ -189,6 +195,19 @@ def plan_content(settings: Settings) -> dict[str, Any]:
         "seconds": _sum(ahead, "seconds"),
         "bytes": _sum(ahead, "size"),
         "refused": found.refused,
+        "scans": scans_content(found.scans),
+    }
+
+
+def scans_content(scans: ScanChoice) -> dict[str, Any]:
+    """Plain scans of this field by the weights' record: the best for their seconds, and what is or would be taken."""
+    best = scans.frontier
+    last = max(len(best) - 1, 1)
+    shown = sorted({round(number * last / (MOST_SCANS - 1)) for number in range(MOST_SCANS)}) if best else []
+    return {
+        "taken": as_told(scans.chosen),
+        "reference": as_told(scans.reference),
+        "frontier": [as_told(best[number]) for number in shown if number < len(best)],
     }
 
 
@@ -217,8 +236,28 @@ def show_plan(content: dict[str, Any], console: Console) -> None:
         )
     console.print(table)
     console.print(escape(_sentence(content)), soft_wrap=True)
+    if content["scans"]["frontier"]:
+        _show_scans(content["scans"], console)
     if content["refused"] is not None:
         console.print(f"[yellow]refused here[/]: {escape(content['refused'])}", soft_wrap=True)
+
+
+def _show_scans(scans: dict[str, Any], console: Console) -> None:
+    """Print what plain scans of the field cost, and what the weights' record expects of them."""
+    title = "One plain scan of the field, by the weights' record"
+    table = Table(title=title, title_justify="left", header_style="dim", box=SIMPLE_HEAD, collapse_padding=True)
+    for name in ("scan", "", "seconds", "raw data", "mIoU, about"):
+        table.add_column(name, justify="left" if name in ("scan", "") else "right", no_wrap=True)
+    rows = {scan["seconds"]: scan for scan in scans["frontier"]}
+    marks = {name: scans[name] for name in ("taken", "reference") if scans[name] is not None}
+    rows |= {scan["seconds"]: scan for scan in marks.values()}
+    for seconds, scan in sorted(rows.items()):
+        said = ", ".join(MARKS[name] for name, one in marks.items() if one == scan)
+        spread = "" if scan["expected_spread"] is None else f" ± {format_points(scan['expected_spread'])}"
+        expected = f"{format_points(scan['expected_miou'])}{spread}"
+        figures = f"{seconds:.1f}", format_bytes(scan["bytes_raw"]), expected
+        table.add_row(scan_words(scan["step"], scan["exposure_ms"]), said, *figures)
+    console.print(table)
 
 
 def _sentence(content: dict[str, Any]) -> str:

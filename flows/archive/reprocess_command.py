@@ -284,7 +284,7 @@ def run_judge(
     if labels is not None:
         settings = replace(settings, labels=labels)
     there = "accuracy" in receipt and labels is None
-    if there and (receipt["accuracy"]["controls"] or not settings.controls):
+    if there and (receipt["accuracy"]["controls"] or settings.plain or not settings.controls):
         console.print(escape(f"{found.uri} has its accuracy already"), soft_wrap=True)
         return receipt
     use_one_thread()

@@ -42,9 +42,10 @@ class QuicklookData:
 
     survey: str
     seed: int
-    budget: float
-    policy: str
+    about: str  # how it was looked at
+    policy: str | None  # that chose the seats; None of a plain scan, which shows all of them
     raw: tuple[NDArray[np.generic], ...]  # sweeps as they came, calibrated, (line, sample, band) each, by strip
+    raw_lines: int  # captured in them; a large sweep shows every n-th
     rectified: NDArray[np.floating]  # (y, x, band), NaN where nothing was captured
     wavelength_nm: NDArray[np.floating]  # (band,) of raw and rectified
     score: NDArray[np.floating]  # (row, column) of the padded grid's seats; NaN or -inf without a score
@@ -83,7 +84,7 @@ def _compose(data: QuicklookData) -> Figure:
     legend_in = 0.45 + _LEGEND_ROW_IN * -(-(len(data.class_names) + 1) // legend_columns)
     page_height = _HEAD_IN + sum(tall + caption for tall, _ in rows) + legend_in
     figure = Figure(figsize=(page_width, page_height), dpi=_DPI)
-    about = [f"{width} × {height} px", f"budget {data.budget:g}", f"policy {data.policy}", f"seed {data.seed}"]  # noqa: RUF001
+    about = [f"{width} × {height} px", data.about, f"seed {data.seed}"]  # noqa: RUF001
     about += [data.note] if data.note else []
     title_y = 1 - 0.42 / page_height
     figure.text(_MARGIN_IN / page_width, title_y, data.survey, size=23, weight="bold", va="center")
@@ -130,8 +131,9 @@ def _draw_raw(axes: Axes, data: QuicklookData) -> None:
         left += one.shape[1] + gap
     _show(axes, image if data.along == "x" else image.swapaxes(0, 1))
     axes.set_aspect("auto")
-    lines, count = sum(sweep.shape[0] for sweep in data.raw), len(data.raw)
-    _caption(axes, "1  Raw lines", f"{count} coarse sweep{'s' if count != 1 else ''}, {lines} lines as they came")
+    count, kind = len(data.raw), "sweep" if data.policy is None else "coarse sweep"
+    words = f"{count} {kind}{'s' if count != 1 else ''}, {data.raw_lines} lines as they came"
+    _caption(axes, "1  Raw lines", words)
 
 
 def _draw_rectified(axes: Axes, data: QuicklookData) -> None:
@@ -151,7 +153,12 @@ def _colours(data: QuicklookData, image: NDArray[np.generic]) -> NDArray[np.floa
 
 
 def _draw_attention(axes: Axes, data: QuicklookData) -> None:
-    """Panel 2: the score of every seat over the field in grey, seats asked for and blocks captured outlined."""
+    """Panel 2: the score of every seat over the field in grey, seats asked for and blocks captured outlined.
+
+    Of a plain scan, which looked nowhere twice, the confidence of the map.
+    """
+    if data.policy is None:
+        return _draw_confidence(axes, data.confidence, "2  Confidence")
     height, width = data.class_map.shape
     rows, columns = data.score.shape
     axes.imshow(grey_of(data.rectified), cmap="gray", vmin=-0.4, vmax=1.4)
@@ -202,13 +209,20 @@ def _draw_truth(axes: Axes, data: QuicklookData) -> None:
         words = f"{100 * right:.1f} % of the labelled pixels agree" if labelled.any() else "no pixel is labelled"
         draw_scale(axes, data.truth.shape, data.pixel_mrad)
         return _caption(axes, "4  Truth", words)
-    if data.confidence is not None:
-        image = axes.imshow(data.confidence, cmap="viridis", vmin=0, vmax=1)
-        _frame(axes, data.confidence.shape)
-        _heat_key(axes, image, ("0", "1"))
-        return _caption(axes, "4  Confidence", "of the model in its own map (no labels given)")
+    if data.confidence is not None and data.policy is not None:
+        return _draw_confidence(axes, data.confidence, "4  Confidence", " (no labels given)")
     axes.axis("off")
     return _caption(axes, "4  Truth", "no labels were given")
+
+
+def _draw_confidence(axes: Axes, confidence: NDArray[np.floating] | None, title: str, why: str = "") -> None:
+    if confidence is None:
+        axes.axis("off")
+        return _caption(axes, title, "the map has none")
+    image = axes.imshow(confidence, cmap="viridis", vmin=0, vmax=1)
+    _frame(axes, confidence.shape)
+    _heat_key(axes, image, ("0", "1"))
+    return _caption(axes, title, f"of the model in its own map{why}")
 
 
 def _draw_legend(figure: Figure, data: QuicklookData, columns: int) -> None:

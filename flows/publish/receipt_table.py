@@ -14,6 +14,7 @@ from rich.table import Table
 from flows.publish.receipt import Accuracy, Receipt, Savings, is_pending
 from flows.survey.scores import SHOWN, SHOWN_WORDS, definitions_differ, false_class_words, worst_class_words
 from flows.terminal.figures import DASH, format_bytes, format_count, format_percent, format_points, format_seconds
+from pipeline.planning.plain_scans import scan_words
 from pipeline.simulator.selection.choice import UNIT_WORDS
 
 
@@ -22,7 +23,7 @@ def headline(receipt: Receipt, looked_twice: float | None = None) -> str:
 
     ``looked_twice`` is the share of the field that was captured in detail, 0..1; None leaves it out.
     """
-    capture = receipt["savings"]["capture_s"]
+    capture, plain = receipt["savings"]["capture_s"], receipt.get("plan", {}).get("kind") == "scan"
     if looked_twice == 0:
         twice = "The camera looked twice at nothing: no run of fine lines fits into the time left, or is worth it. "
     else:
@@ -36,13 +37,14 @@ def headline(receipt: Receipt, looked_twice: float | None = None) -> str:
     accuracy = receipt.get("accuracy")
     if accuracy is None:
         return f"{text} The map is not judged yet: its accuracy is added once it is." if is_pending(receipt) else text
-    every = accuracy["all"]["miou"]
+    every = None if plain else accuracy["all"]["miou"]
+    coarse = "" if plain else f"; the coarse look alone gives {format_points(accuracy['none']['miou'])}"
     detail = "" if every is None else f", detail everywhere {format_points(every)}"
     right = accuracy.get("overall_accuracy")
     pixels = "" if right is None else f" ({format_points(right)} % of its pixels are right)"
     return (
-        f"{text} The map scores {format_points(accuracy['miou'])} of 100 against the truth{pixels}; the coarse look "
-        f"alone gives {format_points(accuracy['none']['miou'])}{detail}. {worst_class_words(accuracy)}"
+        f"{text} The map scores {format_points(accuracy['miou'])} of 100 against the truth{pixels}{coarse}"
+        f"{detail}. {worst_class_words(accuracy)}"
     ).rstrip()
 
 
@@ -131,7 +133,7 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
     """The findings in words, for the terminal and the report."""
     words = []
     if plan := found.get("plan"):
-        if plan["kind"] == "full" and plan["reason"]:
+        if plan["kind"] in ("full", "scan") and plan["reason"]:
             words.append(_sentence(plan["reason"]))
         if plan["out_of_reach"]:
             words.append(f"{plan['out_of_reach']} places worth a second look lie beyond the mirror's range.")
@@ -143,6 +145,8 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
             )
         if plan["lines"]:
             words.append(_sentence(plan["orientation"]["sentence"]))
+    if scans := found.get("scans"):
+        words.append(_scans_words(scans))
     for name, one in found.get("pointing", {}).items():
         if isinstance(one, Mapping) and (told := _pointing_words(name, one)):
             words.append(told)
@@ -155,6 +159,30 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
         place = f"{ground['crs']}, {ground['resolution_m']:g} m a pixel"
         words.append(f"On the ground ({place}) the classes cover {', '.join(areas)}.")
     return words
+
+
+def _scans_words(scans: Mapping[str, Mapping[str, Any]]) -> str:
+    """What the weights' record expects of the plain scan that was taken, or would have of one in the same seconds."""
+
+    def told(scan: Mapping[str, Any]) -> str:
+        return f"{scan_words(scan['step'], scan['exposure_ms'])}, {scan['seconds']:.1f} s"
+
+    def points(scan: Mapping[str, Any]) -> str:
+        spread = scan.get("expected_spread")
+        return format_points(scan["expected_miou"]) + ("" if spread is None else f" ± {format_points(spread)}")
+
+    words, taken, best, reference = [], *(scans.get(name) for name in ("taken", "best_in_time", "reference"))
+    if taken is not None:
+        words.append(f"By the weights' record such a scan scores about {points(taken)}.")
+    elif best is not None:
+        words.append(
+            f"One plain scan in the same seconds ({told(best)}) scores about {points(best)} by the weights' record."
+        )
+    if reference is not None:
+        words.append(
+            f"The cheapest that is nearly as good as any ({told(reference)}) scores about {points(reference)}."
+        )
+    return " ".join(words)
 
 
 def _sentence(text: str) -> str:

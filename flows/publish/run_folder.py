@@ -22,6 +22,7 @@ from flows.publish.report import Picture, render_report
 from flows.settings.load import anchor_paths
 from flows.survey.extent import work_done, work_of_map
 from flows.survey.run import SurveyRun, now
+from flows.survey.scan_choice import as_told
 from flows.survey.stages.accuracy import load_accuracy
 from flows.survey.stages.attention import load_orientation, load_plan
 from flows.survey.stages.capture import captured
@@ -34,6 +35,7 @@ from pipeline.geometry.grid import UNLABELLED
 from pipeline.geometry.scan import Sweep
 from pipeline.planning.coverage import on_scene
 from pipeline.planning.fine_pass import FinePlan
+from pipeline.planning.plain_scans import scan_words
 from pipeline.planning.prices import SavingEntry, capture_savings
 from pipeline.rectify.calibration.calibrate import of_bands, reflectance
 from storage.archive.keys import StageRef
@@ -55,7 +57,7 @@ class Published:
 
     receipt: Receipt
     folder: Path
-    looked_twice: float  # share of the field's seats captured in detail
+    looked_twice: float | None  # None of a plain scan; share of the field's seats captured in detail
 
 
 def publish_run(runner: StageRunner, products: Products, started: str) -> Published:
@@ -96,7 +98,8 @@ def load_receipt(folder: Path) -> Receipt:
 
 
 def _publish(run: SurveyRun, draft: RunDraft, products: Products, plan: FinePlan, receipt: Receipt) -> Published:
-    looked_twice = float(seen_shares(run, products.of("cut_patches")).sum()) / len(run.grid.valid_seats())
+    seats = len(run.grid.valid_seats())
+    looked_twice = None if run.plan.plain else float(seen_shares(run, products.of("cut_patches")).sum()) / seats
     draw_quicklook(draft.folder / "quicklook.png", quicklook_data(run, products, plan, receipt))
     draft.write_file("receipt.json", to_json(receipt))
     picture = (draft.folder / "quicklook.png").read_bytes()
@@ -138,7 +141,7 @@ def make_receipt(runner: StageRunner, products: Products, plan: FinePlan, starte
         accuracy_is=accuracy_is,
         judged=None if accuracy is None else now(),
         simulation=simulation,
-        findings=find_out(run, products),
+        findings=find_out(run, products) | {"scans": scans_told(run, run.plan.coarse_s + plan.seconds)},
     )
 
 
@@ -185,9 +188,10 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
     return QuicklookData(
         survey=run.name,
         seed=run.settings.seed,
-        budget=run.settings.budget,
-        policy=run.settings.policy,
+        about=_asked_words(run),
+        policy=None if run.plan.plain else run.settings.policy,
         raw=tuple(_calibrated(run, cube, chosen) for cube in strips),
+        raw_lines=sum(cube.sweep.lines for cube in strips),
         rectified=_both_scales(run, products, chosen),
         wavelength_nm=run.scene.wavelength_nm[chosen],
         score=attention.score,
@@ -203,6 +207,13 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
         along=run.plan.along,
         note="   ·   ".join(notes),
     )
+
+
+def _asked_words(run: SurveyRun) -> str:
+    """How the field was looked at, in a few words."""
+    if run.plan.plain:
+        return scan_words(run.settings.scan_step or 1, run.settings.scan_exposure_ms or run.camera.exposure_ms)
+    return f"budget {run.settings.budget:g}   ·   policy {run.settings.policy}"
 
 
 def _calibrated(run: SurveyRun, cube: RawCube, bands: list[int]) -> NDArray[np.float32]:
@@ -242,6 +253,16 @@ def block_of(sweep: Sweep, run: SurveyRun) -> tuple[int, int, int, int]:
     x0, x1 = np.clip(np.rint(across), 0, size[0]).astype(int).tolist()
     y0, y1 = np.clip(np.rint(scan), 0, size[1]).astype(int).tolist()
     return (y0, y1, x0, x1) if sweep.along == "x" else (x0, x1, y0, y1)
+
+
+def scans_told(run: SurveyRun, seconds: float) -> dict[str, Any]:
+    """Plain scans by the weights' record: the one taken, the best in as many seconds, and the cheapest good one.
+
+    Empty where the weights have no record.
+    """
+    scans = run.scans
+    told = {"taken": scans.chosen, "best_in_time": scans.best_within(seconds), "reference": scans.reference}
+    return {name: as_told(scan) for name, scan in told.items() if scan is not None}
 
 
 def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:

@@ -15,7 +15,16 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 from pydantic import Field, PlainValidator, TypeAdapter, ValidationError
 
-from flows.settings.survey_settings import BUILT_IN_SCENES, PATHS, REPLACED, RIG_FIELD, MapChoice, Settings
+from flows.settings.survey_settings import (
+    BUILT_IN_SCENES,
+    OF_TWO_PASSES,
+    PATHS,
+    PLAIN,
+    REPLACED,
+    RIG_FIELD,
+    MapChoice,
+    Settings,
+)
 from flows.settings.values import parse_moment, parse_text, to_whole, unit_guess
 from models.network.sizes import TRAINED_VGG_FROM, VGG_FROM
 from pipeline.errors import BudgetError, PoseError, SettingsError
@@ -136,6 +145,8 @@ def load_settings(path: str | Path | None = None, flags: Mapping[str, object] | 
             inner = table.get(head, {})
             table[head or key] = {**inner, tail: value} if head and isinstance(inner, Mapping) else value
             origin[key] = "flag"
+    for wrong in _contradictions({key for key, value in table.items() if value is not None}, origin):
+        raise SettingsError(wrong)
     return parse_settings(table, origin)
 
 
@@ -218,6 +229,22 @@ def anchor_paths(table: dict[str, object], folder: Path) -> dict[str, object]:
         if isinstance(value, str) and value and value not in named and "://" not in value:
             anchored[key] = str(folder / Path(value).expanduser())
     return anchored
+
+
+def _contradictions(given: set[str], origin: Mapping[str, str]) -> Iterator[str]:
+    """Settings of a plain scan beside some of a survey in two passes, or those that choose it beside it itself."""
+    plain = [place_of(key, origin.get(key)) for key in PLAIN if key in given]
+    passes = [place_of(key, origin.get(key)) for key in OF_TWO_PASSES if key in given]
+    if plain and passes:
+        yield (
+            f"{plain[0]} asks for one plain scan of the field, and {passes[0]} is for a survey that looks twice; leave "
+            "one of them out"
+        )
+    by_hand = [place_of(key, origin.get(key)) for key in ("scan_step", "scan_exposure_ms") if key in given]
+    if by_hand and given & {"seconds", "bytes_raw", "goal"}:
+        yield f"{plain[0]} leaves the choice of the scan to the weights' record, {by_hand[0]} makes it: leave one out"
+    if "scan_exposure_ms" in given and "scan_step" not in given:
+        yield f"{by_hand[0]} is for a plain scan: give --scan-step too (1 for every line), or --coarse-exposure-ms"
 
 
 IN_NAT = ("gain", "entropy")  # policies whose scores are gains, or the most that these can be

@@ -15,7 +15,9 @@ from pydantic import PlainValidator
 from flows.settings.values import (
     Bands,
     Budget,
+    Bytes,
     Effects,
+    Goal,
     Memory,
     Name,
     SceneName,
@@ -40,7 +42,10 @@ BUILT_IN_SCENES = FARM_NAMES
 USUAL_SIZE = f"{FARM_SHAPE[1]}x{FARM_SHAPE[0]}"
 RIG_FIELD = "field"  # the scene of which only the rig knows more than size and bands
 OF_THE_MACHINE = ("scheduler", "workers")  # no byte depends on them; a cluster of that day need not be there today
+PLAIN = ("seconds", "bytes_raw", "goal", "scan_step")  # settings of which one asks for a plain scan
+OF_TWO_PASSES = ("budget", "coarse_exposure_ms", "policy", "threshold", "mask", "vgg")  # and of which none may
 PATHS = ("scene", "labels", "out", "mask", "vgg", "weights")
+INSTEAD = "leave it out for a survey in two passes"
 WORKERS = "one process or thread each; leave it out for one a core"
 EPSG = "the number after EPSG:, such as 32632"
 REPLACED = {  # keys of before
@@ -89,6 +94,29 @@ class Settings:
     out: str = stated("archive", "Archive: a folder, or s3://bucket/prefix")
     budget: Budget = stated(
         0.5, "Seconds of coarse and fine capture over those of the full scan, above 0 and at most 1"
+    )
+    seconds: float | None = stated(
+        None,
+        "One plain scan in the place of two passes: of those that end in so many of the camera's seconds, the one whose"
+        " map is likely to score most by the weights' record",
+        "s",
+        0.1,
+        1e6,
+        example=30.0,
+        why=INSTEAD,
+    )
+    bytes_raw: Bytes | None = stated(None, "The same with no more raw data than this", example="2GiB", why=INSTEAD)
+    goal: Goal | None = stated(
+        None,
+        "One plain scan: the cheapest whose map is likely to have this mIoU in percent, or IoU of classes: 92,weed=70",
+        example="92",
+        why=INSTEAD,
+    )
+    scan_step: int | None = stated(
+        None, "One plain scan with lines so far apart, chosen by hand", "px", 1, 8, example=2, why=INSTEAD
+    )
+    scan_exposure_ms: float | None = stated(
+        None, "Exposure of that scan's lines; by default the camera's", "ms", 0.5, 10_000, example=25.0, why=INSTEAD
     )
     coarse_exposure_ms: float | None = stated(
         None, "Exposure of a coarse line; by default the camera's", "ms", 0.5, 10_000, example=25.0
@@ -170,6 +198,11 @@ class Settings:
         "Where the rig stands: with it the map is also drawn on the ground, with hectares of each class.", None
     )
     map: MapChoice = table("What map to draw on the ground, for a survey with [pose].", MapChoice)
+
+    @property
+    def plain(self) -> bool:
+        """Whether the field is scanned once, whole, in the place of a coarse and a fine pass."""
+        return any(getattr(self, name) is not None for name in PLAIN)
 
     @property
     def crew(self) -> Crew:

@@ -14,6 +14,7 @@ from typing import Annotated
 from pydantic import ByteSize, PlainValidator, TypeAdapter, ValidationError
 
 from pipeline.errors import BudgetError, SettingsError
+from pipeline.planning.plain_scans import MIOU
 from pipeline.setting_fields import number_words
 from pipeline.simulator.effects.probe import Unit
 from pipeline.simulator.effects.registry import BY_NAME
@@ -75,12 +76,20 @@ def parse_budget(value: object) -> float:
     return number
 
 
-def parse_memory(value: object) -> int:
-    """Bytes, from a whole number or text such as 4GiB or 500 MB."""
+def parse_bytes(value: object) -> int:
+    """Bytes above 0, from a whole number or text such as 4GiB or 500 MB."""
     try:
         count = int(_BYTES.validate_python(value))
     except ValidationError:
-        raise ValueError(f"must be a number with a unit such as 4GiB or 800MB, got {value!r}") from None
+        count = 0
+    if count <= 0:
+        raise ValueError(f"must be a number with a unit such as 4GiB or 800MB, got {value!r}")
+    return count
+
+
+def parse_memory(value: object) -> int:
+    """Bytes that a process can do with, as `parse_bytes` reads them."""
+    count = parse_bytes(value)
     if count < LEAST_MEMORY:
         raise ValueError(f"must be at least {LEAST_MEMORY // 2**20}MiB, got {value!r} ({count} bytes)")
     return count
@@ -98,6 +107,30 @@ def parse_size(value: object) -> tuple[int, int]:
     if len(sides) != 2 or any(side is None or not 1 <= side <= 100_000 for side in sides):
         raise ValueError(f"must be WIDTHxHEIGHT in px, such as 1280x1024, got {value!r}")
     return int(sides[0] or 0), int(sides[1] or 0)
+
+
+def parse_goals(value: object) -> dict[str, float]:
+    """Least mIoU of a map, or IoU of a class, 0..1 by name: 92, weed=70, or both with commas, in percent."""
+    goals: dict[str, float] = {}
+    for item in _items(value):
+        name, _, text = str(item).rpartition("=")
+        percent = _to_float(text if isinstance(item, str) else item)
+        if percent is None or not 0 < percent <= 100 or (name := name.strip() or MIOU) in goals:
+            raise ValueError(
+                "must be the least mIoU of the map in percent, above 0 and at most 100, or that of classes, each once: "
+                f"92, weed=70 or 92,weed=70; got {value!r}"
+            )
+        goals[name] = percent / 100
+    if not goals:
+        raise ValueError(f"must be the least mIoU of the map in percent, such as 92, or weed=70; got {value!r}")
+    return goals
+
+
+def parse_goal(value: object) -> str:
+    """Goals as one text; see `parse_goals`."""
+    return ",".join(
+        f"{100 * least:g}" if name == MIOU else f"{name}={100 * least:g}" for name, least in parse_goals(value).items()
+    )
 
 
 def parse_effects(value: object) -> str:
@@ -212,6 +245,8 @@ def parse_scene(value: object) -> str:
 Name = Annotated[str, PlainValidator(parse_name)]
 SceneName = Annotated[str, PlainValidator(parse_scene)]
 Budget = Annotated[float, PlainValidator(parse_budget)]
+Goal = Annotated[str, PlainValidator(parse_goal)]
+Bytes = Annotated[int, PlainValidator(parse_bytes)]
 Memory = Annotated[int, PlainValidator(parse_memory)]
 Scheduler = Annotated[str, PlainValidator(parse_scheduler)]
 Size = Annotated[tuple[int, int], PlainValidator(parse_size)]

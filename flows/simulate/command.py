@@ -15,7 +15,8 @@ from rich.markup import escape
 from flows.publish.receipt_table import print_effects
 from flows.settings.survey_settings import Settings
 from flows.simulate.effect_comparison import Comparison, compare_with_everything
-from flows.survey.run import CaptureRun, lay_out_sweeps, make_source
+from flows.survey.capture_plan import lay_out_sweeps
+from flows.survey.run import CaptureRun, make_source
 from flows.survey.scene import SimulatedField, farm_refusal, open_scene
 from flows.survey.stage import Stage, Wanted
 from flows.survey.stages.capture import capture_coarse, sweeps_wanted

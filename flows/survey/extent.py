@@ -43,6 +43,7 @@ class Extent:
     coarse_lines: int
     fine_lines: int | None = None
     fine_runs: int | None = None
+    plain: bool = False  # the coarse lines are those of a plain scan, which shows everything
 
     @property
     def run_lines(self) -> float:
@@ -100,11 +101,13 @@ class Extent:
     @property
     def _fine_pixels(self) -> int:
         """Pixels of the field under the fine lines: a line longer than the field shows no more of it."""
+        if self.plain:
+            return self.grid.height * self.grid.width
         across = self.grid.width if self.along == "x" else self.grid.height
         return (self.fine_lines or 0) * min(self.camera.samples, across)
 
     def _map_operations(self) -> float:
-        if self.fine_lines is None:
+        if self.fine_lines is None and not self.plain:
             return 0.0
         pixels = self.grid.height * self.grid.width
         total = 0
@@ -123,6 +126,8 @@ def work_done(run: SurveyRun, seats: NDArray[np.integer]) -> MultiplyAdds:
     """
     policy, regions = run.settings.policy, plan_regions(run.grid, SHARD)
     drawn = work_of_map(run, seats)
+    if run.plan.plain:  # where everything is seen nothing is scored
+        return drawn
     looks = 2 if policy in SEEING_POLICIES and policy not in NETWORK_POLICIES else 1
     scored = [whole_field(run.grid)] if policy in IMAGE_POLICIES else regions
     score = sum(_of_region(run, region, 0, policy).score for region in scored)
@@ -163,6 +168,7 @@ class PastCosts:
             run.plan.along,
             len(run.scene.wavelength_nm),
             sum(sweep.lines for sweep in run.plan.coarse),
+            plain=run.plan.plain,
         )
         self._fine_lines: int | None = None
 
@@ -200,10 +206,10 @@ class PastCosts:
         """
         records = [store for store in self.stored(stage) if store.cost is not None]
         if stage == "evaluate":  # controls are many times the work of judging a map alone
-            records = [store for store in records if store.params.get("controls") == self._run.settings.controls]
+            records = [store for store in records if store.params.get("controls") == self._run.controls]
         if not records:
             return None, None, "no such store has a record of what it took"
-        unit = CONTROLS_UNIT if stage == "evaluate" and self._run.settings.controls else STAGES[stage].unit
+        unit = CONTROLS_UNIT if stage == "evaluate" and self._run.controls else STAGES[stage].unit
         known = self._known(sorted(records, key=lambda store: not self.of_scene(store)), unit)
         if not known:
             return None, None, f"{records[0].ref.uri} does not tell how much work it was"
@@ -235,7 +241,7 @@ class PastCosts:
 
     def _extent_like(self, then: Extent) -> Extent:
         """This run, with the fine pass's lines as planned, else as many as its seconds buy in runs as long as then."""
-        if self._fine_lines is not None:
+        if self._fine_lines is not None and not self._extent.plain:
             return replace(self._extent, fine_lines=self._fine_lines)
         plan = self._run.plan
         most = sum(sweep.lines for sweep in plan.full)
@@ -267,6 +273,7 @@ class PastCosts:
             coarse_lines=_lines(coarse),
             fine_lines=None if fine is None else _lines(fine),
             fine_runs=None if fine is None else len(fine),
+            plain=any(sweep["binning"] == 1 for sweep in coarse),
         )
 
     def _below(self, store: Store) -> list[Store]:

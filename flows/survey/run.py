@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
+from flows.survey.capture_plan import CapturePlan, plan_capture
+from flows.survey.scan_choice import ScanChoice, choose_plain_scan
 from flows.survey.scene import (
     FieldSource,
     check_labels,
@@ -37,15 +39,12 @@ from models.weights.files import (
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import Axis, Sweep
+from pipeline.geometry.scan import Sweep
 from pipeline.ground.map_grid import ground_grid
 from pipeline.ground.view import GroundView
 from pipeline.lazy import Once
-from pipeline.planning.coverage import cheapest_full, coarse_sweeps, with_margin
-from pipeline.planning.prices import check_budget
 from pipeline.rectify.placed import PixelGrid, place
 from pipeline.rectify.region import plan_tiles
-from pipeline.rectify.registration.overlaps import LEAST_OVERLAP_PX
 from pipeline.simulator.effects.pointing import PointingErrors
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
@@ -57,73 +56,13 @@ from storage.readers.raster_files import load_raster
 from storage.remote.opening import open_archive
 
 
-@dataclass(frozen=True)
-class CapturePlan:
-    """What every survey of this field has in common: orientation, coarse and full sweeps, and their seconds."""
-
-    along: Axis
-    coarse: list[Sweep]
-    full: list[Sweep]
-    coarse_s: float
-    full_s: float
-    fine_s: float  # left by the budget for the fine pass
-    overlap_px: float  # of neighbouring coarse strips, at least
-    margin_px: float  # by which sweeps begin earlier and end later
-
-
-def plan_capture(settings: Settings, grid: SceneGrid) -> CapturePlan:
-    """Lay out coarse and full sweeps; where the mirror may look beside the plan, with overlaps and margins.
-
-    Either pass overlaps by what its own registration needs. Its map lies as the sweep that is held does, which another
-    may lie beside by twice the mirror's error: so much earlier sweeps begin, and later they end. Raises SettingsError:
-    the mirror may be so far off that overlaps take whole lines; BudgetError: the budget does not pay for the coarse
-    pass; PoseError: the field is beyond the mirror's range.
-    """
-    camera, cost = settings.camera, settings.cost
-    along, coarse, full = lay_out_sweeps(settings, grid)
-    full_s, coarse_s = cost.seconds(full, camera), cost.seconds(coarse, camera)
-    fine_s = check_budget(settings.budget, coarse_s, full_s)
-    overlap = _overlap(settings, grid.factor)
-    return CapturePlan(along, coarse, full, coarse_s, full_s, fine_s, overlap, 2 * settings.pointing_px)
-
-
-def lay_out_sweeps(settings: Settings, grid: SceneGrid) -> tuple[Axis, list[Sweep], list[Sweep]]:
-    """Give the axis that lines lie along, the coarse sweeps, and those of the full scan.
-
-    Raises SettingsError: the mirror may be so far off that overlaps take whole lines; PoseError: the field is beyond
-    the mirror's range.
-    """
-    camera, cost, apart = settings.camera, settings.cost, 2 * settings.pointing_px
-    coarse_overlap = _overlap(settings, grid.factor)
-    along, full, _ = cheapest_full(grid, camera, cost, overlap_px=_overlap(settings, 1))
-    exposure_ms = settings.coarse_exposure_ms
-    looks = coarse_sweeps(grid, camera, along, overlap_px=coarse_overlap, exposure_ms=exposure_ms)
-    return along, with_margin(looks, camera, apart), with_margin(full, camera, apart)
-
-
-def _overlap(settings: Settings, step: int) -> float:
-    """What neighbouring sweeps of a pass have to share, so that 64 of its pixels are left when they lie apart [px]."""
-    off, samples = settings.pointing_px, settings.camera.samples
-    if not off:
-        return 0.0
-    rest, line = LEAST_OVERLAP_PX * step, samples // step * step
-    overlap = 2 * off + rest
-    if overlap >= line:
-        raise SettingsError(
-            f"--pointing-px {off:g}: sweeps would have to overlap by {overlap:g} px (twice that, and "
-            f"{LEAST_OVERLAP_PX:.0f} pixels of {step} px), all of a line of {line} px; "
-            f"give less than {(line - rest) / 2:g}"
-        )
-    return overlap
-
-
 def check_memory(settings: Settings, source: SimulatedSource, grid: SceneGrid, plan: CapturePlan) -> None:
     """Refuse memory for not one tile of the mosaic, before anything is captured (SettingsError, with the least)."""
-    pixels = PixelGrid.of_scene(grid, grid.factor)
+    pixels, finer = PixelGrid.of_scene(grid, grid.factor), PixelGrid.of_scene(grid, 1) if plan.plain else None
     placed = [place(_PlannedSweep(source, sweep), settings.camera) for sweep in plan.coarse]
     rows, columns = image_spec(("y", "x"), pixels.shape, "<f4").shard or pixels.shape
     tiles = plan_tiles(placed, settings.camera, pixels, (rows, columns))
-    work = MosaicWork(placed, settings.camera, pixels)
+    work = MosaicWork(placed, settings.camera, pixels, finer=finer)
     tile_budget(work, tiles, (rows, columns), memory=settings.memory, crew=replace(settings.crew, workers=1))
 
 
@@ -184,6 +123,7 @@ class SurveyRun(CaptureRun):
     weights_key: str
     grid: SceneGrid
     plan: CapturePlan
+    scans: ScanChoice
     notes: tuple[str, ...] = ()
     refused: str | None = None  # why this machine would refuse the survey; it is planned nevertheless
 
@@ -191,6 +131,11 @@ class SurveyRun(CaptureRun):
     def weights(self) -> Weights:
         """The weights, read when they are first asked for."""
         return self.load()
+
+    @property
+    def controls(self) -> bool:
+        """Whether other placements of seats are judged too; a plain scan places none."""
+        return self.settings.controls and not self.plan.plain
 
     @cached_property
     def labels(self) -> NDArray[np.uint8] | None:
@@ -233,6 +178,7 @@ def open_run(settings: Settings, *, planning: bool = False) -> SurveyRun:
         scene.light()
     label_notes = check_labels(scene, described)
     grid = SceneGrid(*scene.shape, described.config.patch, described.config.factor)
+    settings, scans = choose_plain_scan(settings, described, path, grid, len(scene.wavelength_nm))
     plan = plan_capture(settings, grid)
     band_notes = _check_bands(scene, described, path)
     if settings.mask is not None:
@@ -262,6 +208,7 @@ def open_run(settings: Settings, *, planning: bool = False) -> SurveyRun:
         weights_key=key,
         grid=grid,
         plan=plan,
+        scans=scans,
         notes=(*notes, *sealing, *band_notes, *vgg_notes, *label_notes),
         refused=refused,
     )

@@ -60,6 +60,30 @@ def coarse_sweeps(
     return [replace(sweep, exposure_ms=exposure_ms) for sweep in covering]
 
 
+def plain_sweeps(
+    grid: SceneGrid,
+    camera: LineCamera,
+    along: Axis,
+    *,
+    step: int,
+    exposure_ms: float | None = None,
+    overlap_px: float = 0,
+) -> list[Sweep]:
+    """Cover the whole scene with lines of ``step`` held positions that are not binned.
+
+    ``overlap_px`` is that of :func:`full_sweeps`, in px of the full resolution; ``exposure_ms`` the camera's own where
+    it is None.
+
+    Raises SettingsError: the overlap is negative or leaves nothing of a line.
+    Raises PoseError: the field is beyond the mirror's range.
+    """
+    covering = _cover(grid, camera, along, step=step, overlap_px=overlap_px)
+    return [
+        replace(sweep, name=f"scan-{number}", kind="coarse", binning=1, exposure_ms=exposure_ms)
+        for number, sweep in enumerate(covering)
+    ]
+
+
 def cheapest_full(
     grid: SceneGrid, camera: LineCamera, cost: CostModel, *, overlap_px: float = 0
 ) -> tuple[Axis, list[Sweep], float]:

@@ -97,15 +97,47 @@ def seat_pixels(grid: SceneGrid, seats: NDArray[np.integer]) -> tuple[NDArray[np
     inside = []
     places = []
     for axis, size in enumerate((grid.height, grid.width)):
-        first = grid.seat_origin(seats)[:, axis, None]
-        pixel = first + np.arange(p)
-        mirrored = 2 * (size - 1) - pixel
-        kept = np.where(pixel < size, pixel, np.where(mirrored >= first, mirrored, size - 1))
-        inside.append(pixel < size)
+        kept, there = _on_the_scene(grid.seat_origin(seats)[:, axis, None], p, size)
+        inside.append(there)
         places.append(kept - (size - 1) / 2)
     y = np.broadcast_to(places[0][:, :, None], (len(seats), p, p))
     x = np.broadcast_to(places[1][:, None, :], (len(seats), p, p))
     return np.stack([y, x], axis=-1), inside[0][:, :, None] & inside[1][:, None, :]
+
+
+def _on_the_scene(first: NDArray[np.integer], patch: int, size: int) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Pixels of seats along one axis that begin at ``first`` (seat, 1): numbers on the scene, and which are its own."""
+    pixel = first + np.arange(patch)
+    mirrored = 2 * (size - 1) - pixel
+    return np.where(pixel < size, pixel, np.where(mirrored >= first, mirrored, size - 1)), pixel < size
+
+
+def read_every_seat(
+    placed: Sequence[Placed],
+    camera: LineCamera,
+    grid: SceneGrid,
+    kernel: Kernel = "catmull-rom",
+    *,
+    cache: LineCache | None = None,
+) -> Iterator[tuple[Values, NDArray[np.bool_]]]:
+    """Rectify the whole scene into patches, a row of seats at a time, or a column where lines lie along y.
+
+    Yields what :func:`read_seats` gives for these seats, whose numbers ascend, or go down the columns; with tables of
+    the scene's pixels (:func:`place`) within their bound.
+    """
+    pixels, p, shape = PixelGrid.of_scene(grid, 1), grid.patch, (grid.height, grid.width)
+    firsts = [np.arange(0, size, p)[:, None] for size in shape]
+    axes = [_on_the_scene(first, p, size) for first, size in zip(firsts, shape, strict=True)]
+    down = 1 if placed[0].lines.sweep.along == "y" else 0  # the axis that lines follow each other along
+    for number in range(len(firsts[down])):
+        own = [slice(None), slice(None)]
+        own[down] = slice(number, number + 1)
+        (y, y_in), (x, x_in) = ((kept[part], there[part]) for (kept, there), part in zip(axes, own, strict=True))
+        rows, columns = (slice(int(kept.min()), int(kept.max()) + 1) for kept in (y, x))
+        values, coverage = mosaic_tile(placed, camera, pixels, rows, columns, kernel=kernel, cache=cache)
+        at = y[:, None, :, None] - rows.start, x[None, :, None, :] - columns.start
+        seen = (coverage[at] > 0) & y_in[:, None, :, None] & x_in[None, :, None, :]
+        yield values[at].reshape(-1, p, p, values.shape[-1]), seen.reshape(-1, p, p)
 
 
 def read_seats(

@@ -82,6 +82,7 @@ def sight_sweeps(cubes: Sequence[RawCube], registration: Path | None, camera: Li
 
 Tables = Mapping[str, Sequence[tuple[Track, TieTable]]]
 
+ROWS_OF_MEANS = 8  # of a mosaic whose pixels are means, rectified at once
 RESERVED_BYTES = 512 * 2**20  # a process before its first tile: interpreter, torch, zarr
 
 
@@ -93,6 +94,12 @@ class MosaicWork:
     camera: LineCamera
     grid: PixelGrid
     kernel: Kernel = "catmull-rom"
+    finer: PixelGrid | None = None  # whose pixels are rectified, and their means are the grid's
+
+    @property
+    def read(self) -> PixelGrid:
+        """The pixels that lines are rectified onto."""
+        return self.finer or self.grid
 
 
 @dataclass(frozen=True)
@@ -105,6 +112,7 @@ class MosaicRecipe:
     kernel: Kernel = "catmull-rom"
     lookup: Path | None = None  # tables of the sweeps; None looks lines up directly
     registration: Path | None = None  # record of the corrections
+    finer: PixelGrid | None = None
 
     @property
     def folders(self) -> list[Path]:
@@ -127,7 +135,7 @@ class MosaicRecipe:
         for one in self.sweeps():  # without tables where its lines lie too unevenly for one
             stored = tables.get(one.cube.sweep.name)
             placed.append(Placed(one.cube, tuple(stored), one.gain) if stored else one.placed(self.camera))
-        return MosaicWork(placed, self.camera, self.grid, self.kernel)
+        return MosaicWork(placed, self.camera, self.grid, self.kernel, self.finer)
 
 
 @dataclass(frozen=True)
@@ -203,7 +211,7 @@ def write_mosaic(
     if crew.shares_memory:
         made = OpenMosaic(opened, writer, LineCache(budget.cache), cut)
         run_blocks(
-            lambda tile: made.make(tile.rows, tile.columns, tile.reach),
+            lambda tile: made.make(tile.rows, tile.columns, None if opened.finer else tile.reach),
             tiles,
             Crew(workers=budget.workers),
             keep=False,
@@ -249,19 +257,55 @@ class OpenMosaic:
 
         @lru_cache(maxsize=2)  # tiles go down the columns; a method of this object would keep it alive
         def reach(start: int, stop: int) -> Reaches:
-            return column_reach(work.placed, work.camera, work.grid, slice(start, stop))
+            return column_reach(work.placed, work.camera, work.read, slice(start, stop))
 
         self._reach = reach
 
     def make(self, rows: slice, columns: slice, reach: Reaches | None = None) -> NDArray[np.float32] | None:
         """Make and write the tile there; what sweeps show of its columns is found once for all rows."""
-        work, reach = self._work, self._reach(columns.start, columns.stop) if reach is None else reach
-        values, coverage = mosaic_tile(
-            work.placed, work.camera, work.grid, rows, columns, kernel=work.kernel, cache=self._cache, reach=reach
-        )
+        values, coverage = self._means(rows, columns) if self._work.finer else self._tile(rows, columns, reach)
         part = None if self._cut is None else self._cut(rows, columns, values).copy()
         self._writer.write_tile(rows.start, columns.start, values, coverage)
         return part
+
+    def _tile(self, rows: slice, columns: slice, reach: Reaches | None) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+        """Rectify a part of the pixels that lines are read on."""
+        work, reach = self._work, self._reach(columns.start, columns.stop) if reach is None else reach
+        return mosaic_tile(
+            work.placed, work.camera, work.read, rows, columns, kernel=work.kernel, cache=self._cache, reach=reach
+        )
+
+    def _means(self, rows: slice, columns: slice) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+        """Means over the finer pixels that lines reached, a few rows at a time; how many sweeps saw one of them."""
+        fine, bands = self._work.read, len(self._work.placed[0].lines.references.panel)
+        times = self._work.grid.spacing_px // fine.spacing_px
+        wide = slice(columns.start * times, min(columns.stop * times, fine.shape[1]))
+        shape = rows.stop - rows.start, columns.stop - columns.start
+        values, coverage = np.empty((*shape, bands), np.float32), np.empty(shape, np.intp)
+        for first in range(rows.start, rows.stop, ROWS_OF_MEANS):
+            last = min(first + ROWS_OF_MEANS, rows.stop)
+            deep = slice(first * times, min(last * times, fine.shape[0]))
+            part = slice(first - rows.start, last - rows.start)
+            values[part], coverage[part] = block_means(*self._tile(deep, wide, None), times)
+        return values, coverage
+
+
+def block_means(
+    values: NDArray[np.float32], coverage: NDArray[np.intp], times: int
+) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
+    """Mean of every ``times`` x ``times`` pixels that are no NaN, (y, x, band), and the most sweeps that saw one.
+
+    Sides that ``times`` does not divide end in a smaller block. NaN where nothing of a block was seen.
+    """
+    beyond = [(0, -size % times) for size in coverage.shape]
+    values = np.pad(values, (*beyond, (0, 0)), constant_values=np.nan)
+    blocks = values.reshape(values.shape[0] // times, times, values.shape[1] // times, times, -1)
+    seen = np.isfinite(blocks)
+    count = seen.sum(axis=(1, 3), dtype=np.float32)
+    total = np.where(seen, blocks, np.float32(0)).sum(axis=(1, 3), dtype=np.float32)
+    means = np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0)
+    covered = np.pad(coverage, beyond).reshape(*blocks.shape[:4]).max(axis=(1, 3))
+    return means, covered
 
 
 def let_tiles_go() -> None:
@@ -286,6 +330,9 @@ def tile_budget(
     most = max(1, min(1 if crew.elsewhere else crew.count, len(tiles)))
     bands = len(work.placed[0].lines.references.panel) if work.placed else 1
     one = tile_bytes(tile_shape, bands)
+    if work.finer is not None:
+        times = work.grid.spacing_px // work.finer.spacing_px
+        one += tile_bytes((ROWS_OF_MEANS * times, tile_shape[1] * times), bands)
     budgets = (
         TileBudget(count, cache_bytes(work.placed, tiles, 1 if processes else count), one, processes)
         for count in range(most, 0, -1)

@@ -84,7 +84,7 @@ def evaluate(
         none = segment(run.weights, seen, empty, np.empty(0, np.int64))
         result["none"] = _figures(run, confusion(judged, none.classes, run.weights.config.classes))
         result |= {"all": {"miou": None, "per_class_iou": {}}, "gap_closed": None, "controls": {}}
-        if run.settings.controls:
+        if run.controls:
             source = source_with(_sure_source(run, off), effects)
             result |= _controls(replace(run, simulated=source), seen, patches, judged, result)
         (path / RECORD).write_text(to_json(result), encoding="utf-8")  # no NaN, which JSON does not know
@@ -92,7 +92,7 @@ def evaluate(
     params = {
         "weights": run.weights_key,
         "labels": array_digest(labels),
-        "controls": run.settings.controls,
+        "controls": run.controls,
         "kernel": run.settings.kernel,
         **run.source_key(),
     }

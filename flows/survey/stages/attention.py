@@ -14,9 +14,10 @@ from flows.survey.run import SurveyRun
 from flows.survey.stage import Product, Wanted, stage
 from models.policies.policies import IMAGE_POLICIES, SEEDED_POLICIES, SEEING_POLICIES, score_seats
 from models.reading.inference import Glance
-from pipeline.geometry.scan import Sweep
+from pipeline.geometry.scan import Sweep, exposing
 from pipeline.planning.fine_pass import FinePlan, plan_fine
 from pipeline.planning.orientation import compare_orientations, find_rows
+from pipeline.planning.plain_scans import scan_words
 from storage.archive.keys import StageRef, array_digest
 from storage.archive.manifests import read_table, write_table
 from storage.arrays.mosaics import Attention, load_attention, mosaic_brightness, write_attention
@@ -31,17 +32,21 @@ def attend(run: SurveyRun, mosaic: StageRef) -> Wanted:
 
     def build(path: Path) -> None:
         work = FieldWork.of(run)
-        scores = _scores(run, work, mosaic)
-        plan = plan_fine(
-            run.grid,
-            run.camera,
-            settings.cost,
-            run.plan.along,
-            scores,
-            budget_s=run.plan.fine_s,
-            margin_px=run.plan.margin_px,
-            full=run.plan.full,
-            threshold=settings.threshold,
+        scores = np.zeros(int(np.prod(run.grid.seat_shape))) if run.plan.plain else _scores(run, work, mosaic)
+        plan = (
+            _whole_field(run)
+            if run.plan.plain
+            else plan_fine(
+                run.grid,
+                run.camera,
+                settings.cost,
+                run.plan.along,
+                scores,
+                budget_s=run.plan.fine_s,
+                margin_px=run.plan.margin_px,
+                full=run.plan.full,
+                threshold=settings.threshold,
+            )
         )
         work.crew_for(plan.seats, len(run.scene.wavelength_nm))  # refuses what does not fit before the rig goes back
         rank = np.full(scores.shape, -1, np.int32)
@@ -67,8 +72,16 @@ def attend(run: SurveyRun, mosaic: StageRef) -> Wanted:
         **(region_params(run.grid) if settings.policy in SEEING_POLICIES else {}),
         **({} if run.vgg is None else {"vgg": run.vgg.key}),
         **({} if settings.threshold is None else {"threshold": settings.threshold}),
+        **({"plain": True} if run.plan.plain else {}),
     }
     return Wanted(build, params, [mosaic])
+
+
+def _whole_field(run: SurveyRun) -> FinePlan:
+    """The plan of a plain scan: every seat is seen, and there is nothing to go back for."""
+    sweep = run.plan.coarse[0]
+    words = scan_words(sweep.step, exposing(run.camera, sweep).exposure_ms)
+    return FinePlan([], run.grid.valid_seats(), 0.0, 0.0, "scan", f"the field was scanned once: {words}")
 
 
 def _scores(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ from flows.survey.stages.capture import captured
 from pipeline.errors import ShapeError
 from pipeline.rectify.line_cache import LineCache
 from pipeline.rectify.placed import PixelGrid, Placed
-from pipeline.rectify.region import read_seats
+from pipeline.rectify.region import read_every_seat, read_seats
 from pipeline.rectify.registration.alignment import SweepShift
 from pipeline.rectify.registration.illumination import overlap_light, solve_lights
 from pipeline.rectify.registration.overlaps import BroadSweep, broad_bands
@@ -166,7 +166,7 @@ CACHE_SHARE = 8  # raw lines kept for the next patches may take this part of the
 @stage("locate", "lookup", LOOKUP, of=("capture_coarse", "register_coarse"), unit="coarse pixels")
 def locate(run: SurveyRun, raw: StageRef, *registration: StageRef) -> Wanted:
     """Look up where each coarse pixel was seen: a table that every survey along the same path shares."""
-    grid = PixelGrid.of_scene(run.grid, run.grid.factor)
+    grid = PixelGrid.of_scene(run.grid, 1 if run.plan.plain else run.grid.factor)
     sweeps = sighted(run, raw, _only(registration))
     camera = {name: getattr(run.camera, name) for name in ("samples", "pitch_um", "focal_length_mm")}
     params = {
@@ -207,6 +207,7 @@ def rectify(run: SurveyRun, raw: StageRef, lookup: StageRef, *registration: Stag
             run.settings.kernel,
             lookup=lookup.path / "lookup.zarr",
             registration=record_of(_only(registration)),
+            finer=PixelGrid.of_scene(run.grid, 1) if run.plan.plain else None,
         )
         writer = MosaicWriter(
             path / "mosaic.zarr",
@@ -226,9 +227,22 @@ def rectify(run: SurveyRun, raw: StageRef, lookup: StageRef, *registration: Stag
     return Wanted(build, params, [raw, lookup, *registration])
 
 
-@stage("cut_patches", "fine patches", PATCHES, of=("attend", "capture_fine", "register_fine"), unit="patch values")
-def cut_patches(run: SurveyRun, attention: StageRef, raw: StageRef, *registration: StageRef) -> Wanted:
-    """Bring every chosen seat onto the scene grid, one patch a seat; NaN where a mirror off the plan did not look."""
+@stage(
+    "cut_patches",
+    "fine patches",
+    PATCHES,
+    of=("attend", "capture_coarse", "capture_fine", "register_coarse", "register_fine"),
+    unit="patch values",
+)
+def cut_patches(
+    run: SurveyRun, attention: StageRef, coarse: StageRef, fine: StageRef, *registrations: StageRef
+) -> Wanted:
+    """Bring every chosen seat onto the scene grid, one patch a seat; NaN where a mirror off the plan did not look.
+
+    Patches are of the fine sweeps, or of a plain scan.
+    """
+    raw = coarse if run.plan.plain else fine
+    registration = registrations[:1] if run.plan.plain else registrations[1:]
 
     def build(path: Path) -> None:
         seats = load_plan(attention).seats
@@ -244,8 +258,11 @@ def cut_patches(run: SurveyRun, attention: StageRef, raw: StageRef, *registratio
             fwhm_nm=run.scene.fwhm_nm,
             grid=run.angular_grid(),
         )
-        sweeps = [one.placed(run.camera) for one in sighted(run, raw, _only(registration))]
         cache = LineCache(run.settings.memory // CACHE_SHARE)
+        if run.plan.plain:
+            _cut_everything(run, sighted(run, raw, _only(registration)), writer, len(ordered), cache)
+            return
+        sweeps = [one.placed(run.camera) for one in sighted(run, raw, _only(registration))]
         for first in range(0, len(ordered), SEATS_AT_ONCE):
             seats = ordered[first : first + SEATS_AT_ONCE]
             writer.write(first, *read_seats(sweeps, run.camera, run.grid, seats, run.settings.kernel, cache=cache))
@@ -253,6 +270,22 @@ def cut_patches(run: SurveyRun, attention: StageRef, raw: StageRef, *registratio
 
     params = {"grid": asdict(run.grid), "kernel": run.settings.kernel}
     return Wanted(build, params, [attention, raw, *registration])
+
+
+def _cut_everything(
+    run: SurveyRun, sweeps: Sequence[Sighted], writer: PatchWriter, count: int, cache: LineCache
+) -> None:
+    """Cut every seat of a plain scan, by tables of its pixels: many times as fast as looking each of them up."""
+    placed = [one.placed(run.camera, PixelGrid.of_scene(run.grid, 1)) for one in sweeps]
+    waiting: list[tuple[NDArray[np.float32], NDArray[np.bool_]]] = []
+    done = 0
+    for band in read_every_seat(placed, run.camera, run.grid, run.settings.kernel, cache=cache):
+        waiting.append(band)
+        values, seen = (np.concatenate(parts) for parts in zip(*waiting, strict=True))
+        whole = len(values) if done + len(values) == count else len(values) // SEATS_AT_ONCE * SEATS_AT_ONCE
+        writer.write(done, values[:whole], seen[:whole])
+        waiting, done = [(values[whole:], seen[whole:])], done + whole
+        run.report(done / count)
 
 
 def seen_shares(run: SurveyRun, patches: StageRef) -> NDArray[np.float64]:

@@ -11,6 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
+from flows.publish import quicklook
 from flows.publish.panels import class_palette, class_rgb, draw_scale, grey_of, outline
 from flows.publish.quicklook import QuicklookData, _draw_attention, _draw_raw, draw_quicklook
 from storage.arrays.quicklooks import choose_bands, stretch
@@ -25,9 +26,10 @@ def make_data(height: int, width: int, bands: int = 5, *, patch: int = 16) -> Qu
     return QuicklookData(
         survey="a field $with_marks$ & <signs>",
         seed=1,
-        budget=0.5,
+        about="budget 0.5",
         policy="entropy",
         raw=(rng.integers(0, 4095, (max(1, height // 4), 10, bands)).astype(np.uint16),) * 2,
+        raw_lines=2 * max(1, height // 4),
         rectified=rng.random((height, width, bands), np.float32),
         wavelength_nm=np.linspace(450, 900, bands),
         score=rng.random((rows, columns)),
@@ -172,3 +174,17 @@ def test_sweeps_stand_apart_and_shorter_ones_are_filled_up():
     np.testing.assert_allclose(image[:, 40:42], 0.98)
     np.testing.assert_allclose(image[20:, 42:], 0.98)
     assert (image[:20, 42:] < 0.9).all()
+
+
+@pytest.mark.parametrize("confident", [True, False])
+def test_a_plain_scan_shows_how_sure_its_map_is(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, confident):
+    """In the place of where it looked twice, which it did not; all lines are counted, shown or not."""
+    words = []
+    monkeypatch.setattr(quicklook, "_caption", lambda axes, title, text: words.append((title, text)))
+    data = make_data(96, 128)
+    confidence = data.confidence if confident else None
+    draw_quicklook(tmp_path / "q.png", replace(data, policy=None, blocks=(), raw_lines=2098, confidence=confidence))
+    told = dict(words)
+    assert told["1  Raw lines"] == "2 sweeps, 2098 lines as they came"
+    assert told["2  Confidence"] == ("of the model in its own map" if confident else "the map has none")
+    assert "2  Where it looked twice" not in told

@@ -91,7 +91,7 @@ def test_a_large_field_is_counted_region_by_region() -> None:
 CONFIG, BANDS = SegmenterConfig(classes=4), 8
 
 
-def _run(side: int, policy: str) -> SurveyRun:
+def _run(side: int, policy: str, *, plain: bool = False) -> SurveyRun:
     """As much of a survey as is asked for its sizes."""
     made: Any = SimpleNamespace(
         grid=SceneGrid(side, side, 16, 4),
@@ -99,6 +99,7 @@ def _run(side: int, policy: str) -> SurveyRun:
         vgg=None,
         scene=SimpleNamespace(wavelength_nm=np.linspace(400, 1000, BANDS)),
         settings=SimpleNamespace(policy=policy),
+        plan=SimpleNamespace(plain=plain),
     )
     return cast("SurveyRun", made)
 
@@ -113,3 +114,18 @@ def test_a_policy_that_asks_the_glance_reads_the_coarse_look_once_more(policy: s
     done, closed = work_done(run, np.array([3, 8])), multiply_adds(CONFIG, run.grid, 2, BANDS, score=score)
     assert done.glance == looks * closed.glance
     assert (done.score, done.encode, done.decode) == (closed.score, closed.encode, closed.decode)
+
+
+def test_a_plain_scan_is_read_and_nothing_scored() -> None:
+    """What its map takes, whatever the policy of the settings is."""
+    run, seats = _run(256, "gain", plain=True), np.arange(256)
+    assert work_done(run, seats) == work_of_map(run, seats)
+    assert work_done(run, seats).score == 0
+
+
+def test_a_plain_scan_shows_every_pixel() -> None:
+    """Patches and map grow with the field, not with lines of a fine pass."""
+    scan = replace(SMALL, fine_lines=None, plain=True)
+    assert scan.work("patch values") == SMALL.grid.height * SMALL.grid.width * SMALL.bands
+    every = replace(SMALL, fine_lines=10**6)
+    assert scan.work("operations of the map") == every.work("operations of the map")

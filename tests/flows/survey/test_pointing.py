@@ -15,7 +15,7 @@ from rich.console import Console
 from flows.publish.receipt_table import sentences
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings, parse_settings
-from flows.survey.run import plan_capture
+from flows.survey.capture_plan import plan_capture
 from flows.survey.stages.maps import patch_columns
 from models.network.spectral import SpectralBasis
 from models.reading.inference import Glance

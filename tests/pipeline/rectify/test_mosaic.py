@@ -17,7 +17,7 @@ from pipeline.planning.coverage import full_sweeps
 from pipeline.rectify.line_cache import LineCache
 from pipeline.rectify.mosaic import MosaicPart, edge_distance, mosaic
 from pipeline.rectify.placed import place
-from pipeline.rectify.region import mosaic_rows, read_seats, seat_pixels
+from pipeline.rectify.region import mosaic_rows, read_every_seat, read_seats, seat_pixels
 from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import RasterScene, raster_from_values
@@ -168,6 +168,24 @@ def test_seats_are_windows_of_the_mosaic() -> None:
         np.testing.assert_array_equal(values, plain[part])
         np.testing.assert_array_equal(seen, valid[part])
     assert cache.reads == sum(-(-lines.sweep.lines // 64) for lines in sweeps)
+
+
+@pytest.mark.parametrize("along", ["x", "y"])
+@pytest.mark.parametrize("shape", [(150, 100), (83, 61)])
+def test_every_seat_at_once_is_each_by_itself(along: str, shape: tuple[int, int]) -> None:
+    """Rows of seats, or columns of them, hold what each seat holds, at the border of the scene too; bit for bit."""
+    grid = SceneGrid(*shape, 10, 2)
+    sweeps = full_sweeps(grid, CAMERA, along)  # type: ignore[arg-type]
+    short = [replace(sweep, lines=sweep.lines * 2 // 3) for sweep in sweeps]  # seats that nothing shows
+    placed = [place(lines, CAMERA) for lines in looked_at(smooth_scene(shape), short)]
+    seats = grid.valid_seats()
+    row, column = np.divmod(seats, grid.seat_shape[1])
+    ordered = seats[np.lexsort((column, row) if along == "x" else (row, column))]
+    values, seen = (np.concatenate(parts) for parts in zip(*read_every_seat(placed, CAMERA, grid), strict=True))
+    one_by_one, valid = read_seats(placed, CAMERA, grid, ordered)
+    np.testing.assert_array_equal(values, one_by_one)
+    np.testing.assert_array_equal(seen, valid)
+    assert not valid.all()
 
 
 def test_seats_beside_all_sweeps_are_empty() -> None:

@@ -7,7 +7,7 @@ import os
 import signal
 import weakref
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +28,7 @@ from storage.arrays.tile_work import (
     Thumbnail,
     ThumbnailCut,
     TileMaker,
+    block_means,
     tile_budget,
     write_mosaic,
 )
@@ -240,3 +241,35 @@ def test_every_process_counts_against_the_memory(tmp_path: Path, cubes: list[Raw
     writer = mosaic_at(tmp_path / "m.zarr")
     with pytest.raises(SettingsError, match=r"each of two processes 512 MiB; give at least --memory 1\d\d\d MiB"):
         write_mosaic(recipe_of(cubes), writer, memory=2**30, crew=processes)
+
+
+@pytest.mark.parametrize("shape", [(8, 12), (9, 13), (3, 2)])
+def test_block_means_are_those_of_what_was_seen(shape: tuple[int, int]) -> None:
+    """Mean over the pixels of a block that are no NaN, smaller blocks at the border; NaN where none was seen."""
+    rng = np.random.default_rng(4)
+    values = rng.normal(size=(*shape, 2)).astype(np.float32)
+    values[0, 0], values[: min(4, shape[0]), : min(4, shape[1]), 1] = np.nan, np.nan
+    coverage = rng.integers(0, 3, shape)
+    means, covered = block_means(values, coverage, 4)
+    for y in range(means.shape[0]):
+        for x in range(means.shape[1]):
+            block = values[4 * y : 4 * y + 4, 4 * x : 4 * x + 4]
+            for band in range(2):
+                seen = block[..., band][np.isfinite(block[..., band])]
+                expected = seen.mean() if seen.size else np.nan
+                np.testing.assert_allclose(means[y, x, band], expected, rtol=1e-5, atol=1e-6)
+            assert covered[y, x] == coverage[4 * y : 4 * y + 4, 4 * x : 4 * x + 4].max()
+
+
+@pytest.mark.parametrize("crew", [ONE, THREE, Crew("processes", 2)])
+def test_a_mosaic_of_means_is_the_mean_of_the_finer_one(cubes: list[RawCube], tmp_path: Path, crew: Crew) -> None:
+    """Whoever makes its tiles: 4 x 4 finer pixels a pixel, those that no line reached left out."""
+    fine, coarse = recipe_of(cubes), PixelGrid((-68.5, -418.5), 4, (35, 225))
+    made = []
+    for name, recipe in {"fine": fine, "means": replace(fine, grid=coarse, finer=GRID)}.items():
+        writer = MosaicWriter(tmp_path / f"{name}.zarr", recipe.grid.shape, BANDS)
+        write_mosaic(recipe, writer, memory=PLENTY, crew=crew)
+        made.append(load_mosaic(tmp_path / f"{name}.zarr"))
+    means, covered = block_means(made[0].values, made[0].coverage.astype(np.intp), 4)
+    np.testing.assert_allclose(made[1].values, means, rtol=5e-4, atol=1e-6)  # both are stored rounded
+    np.testing.assert_array_equal(made[1].coverage, covered)
