@@ -21,6 +21,7 @@ from rich.markup import escape
 from rich.table import Table
 
 import flows.tradeoff.farm
+import flows.tradeoff.plans
 import flows.tradeoff.rectify
 import flows.tradeoff.simulate  # noqa: F401 - each registers its entries
 from flows.publish.panels import INK, MUTED, save_png
@@ -114,6 +115,7 @@ def run_tradeoff(stage: str | None, out: Path, repeats: int, seed: int, console:
 _FRONT: Any = {"marker": "o", "color": "#0072B2", "markersize": 9, "label": "no other setting beats it"}
 _BEATEN: Any = {"marker": "o", "color": MUTED, "markersize": 9, "fillstyle": "none", "label": "beaten"}
 _LEVELS = ("#D55E00", "#A23B72")
+_FAMILIES = ("#0072B2", "#007A5A", "#8a6d00", "#D55E00", "#A23B72")
 _FLOOR = "#007A5A"
 _PAPER, _GRID = "#fbfaf7", "#e3e1d8"
 _ACROSS = 3  # panels in a row
@@ -156,6 +158,8 @@ def _draw_tradeoff(axes: Axes, result: Result) -> None:
     _draw_levels(axes, result, list(place.values()), floor)
     if floor is not None:
         _draw_memory_floor(axes, floor)
+    if result.families:
+        return _draw_families(axes, result, [(place[id(point)], point) for point in points])
     front = sorted((point for point in points if point.pareto), key=lambda point: point.price_s)
     for group, style, line in ((front, _FRONT, 1.4), ([p for p in points if not p.pareto], _BEATEN, 0)):
         x, y = ([place[id(point)][axis] for point in group] for axis in (0, 1))
@@ -172,8 +176,38 @@ def _draw_tradeoff(axes: Axes, result: Result) -> None:
             zorder=4,
             path_effects=[withStroke(linewidth=3, foreground=_PAPER)],
         )
+    return _finish(axes, result, "seconds by the cost model" if modelled else f"{unit} / {result.unit}")
+
+
+def _draw_families(axes: Axes, result: Result, placed: Sequence[tuple[tuple[float, float], Point]]) -> None:
+    """One line a family, with its name in a legend and its members' at their points."""
+    families: dict[str, list[tuple[tuple[float, float], Point]]] = {}
+    for place, point in placed:
+        families.setdefault(str(point.setting).rpartition(", ")[0], []).append((place, point))
+    for (name, members), colour in zip(families.items(), cycle(_FAMILIES), strict=False):
+        members.sort(key=lambda one: one[0])
+        axes.plot(*zip(*(at for at, _ in members), strict=True), color=colour, linewidth=1.4, label=name, zorder=2)
+        for (x, y), point in members:
+            fill = "full" if point.pareto else "none"
+            axes.plot(x, y, marker="o", color=colour, markersize=8, fillstyle=fill, zorder=3)
+            axes.annotate(
+                str(point.setting).rpartition(", ")[2],
+                (x, y),
+                (6, 5),
+                textcoords="offset points",
+                color=colour,
+                size=8.5,
+                zorder=4,
+                path_effects=[withStroke(linewidth=2.5, foreground=_PAPER)],
+            )
+    axes.legend(frameon=False, labelcolor="linecolor", fontsize=10)
+    return _finish(axes, result, "seconds by the cost model")
+
+
+def _finish(axes: Axes, result: Result, across: str) -> None:
+    """Title, names of the axes, and a quiet background."""
     axes.set_title(f"{result.stage}: {result.knob}", loc="left", weight="bold", color=INK, size=13)
-    axes.set_xlabel("seconds by the cost model" if modelled else f"{unit} / {result.unit}", color=INK)
+    axes.set_xlabel(across, color=INK)
     axes.set_ylabel(result.error, color=INK)
     axes.set_facecolor(_PAPER)
     axes.grid(visible=True, which="major", color=_GRID, linewidth=0.8)

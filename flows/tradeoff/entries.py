@@ -102,6 +102,7 @@ class Tradeoff(Generic[State, Output]):
     levels: Callable[[State], tuple[Level, ...]] | None = None
     moved_bytes: float | None = None
     beside: Mapping[str, Callable[[State, Setting, Output], float]] = field(default_factory=dict, hash=False)
+    families: bool = False  # settings are "FAMILY, MEMBER"; a family is drawn as one line
 
 
 @dataclass(frozen=True)
@@ -144,6 +145,7 @@ class Result:
     machine: Mapping[str, object]
     points: tuple[Point, ...]
     levels: tuple[Level, ...] = ()
+    families: bool = False
     memory_floor_ns: float | None = None  # for one unit: its bytes copied and nothing else
 
     def to_dict(self) -> dict[str, object]:
@@ -203,7 +205,7 @@ def measure_tradeoff(tradeoff: Tradeoff[State, Output], *, repeats: int = 5, see
     points = [_timed(point, own, judged[0], clocks[0]) for point, own in zip(judged, clocks, strict=True)]
     named = (tradeoff.stage, tradeoff.knob, tradeoff.error, tradeoff.unit, tradeoff.reference)
     levels = () if tradeoff.levels is None else tradeoff.levels(state)
-    return Result(*named, repeats, seed, machine, mark_pareto(points), levels, floor)
+    return Result(*named, repeats, seed, machine, mark_pareto(points), levels, tradeoff.families, floor)
 
 
 def _judge(tradeoff: Tradeoff[State, Output], state: State, setting: Setting) -> Point:

@@ -1,0 +1,130 @@
+"""The trade-off of the whole: what a map is worth against the camera's seconds, for plain scans and for two passes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.survey.run import shipped_weights
+from flows.survey.stages.accuracy import columns_of_all_seats
+from flows.tradeoff.entries import Setting, Tradeoff, register_all
+from models.evaluation.metrics import confusion, mean_iou
+from models.network.cost import multiply_adds
+from models.policies.policies import score_seats
+from models.reading.inference import DrawnMap, Glance, glance, glance_of_columns, segment
+from models.weights.files import Weights, load_weights
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import CostModel, Sweep
+from pipeline.planning.coverage import cheapest_full, coarse_sweeps, plain_sweeps
+from pipeline.planning.fine_pass import plan_fine
+from pipeline.planning.plain_scans import scan_words
+from pipeline.planning.prices import raw_bytes
+from pipeline.rectify.region import mosaic_rows
+from pipeline.simulator.rig_model import Rig
+from pipeline.simulator.scenes.farm.farm_scene import farm_scene
+from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
+
+SHAPE = (384, 512)
+SCANS = {scan_words(step, ms): (step, ms) for step in (1, 2, 4) for ms in (100.0, 50.0, 25.0, 12.0, 6.0)}
+BUDGETS = {f"two passes, budget {budget:g}": budget for budget in (0.8, 0.65, 0.5, 0.4)}
+MEMORY = 2**30  # bytes that rectifying may take
+Columns = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class PlannedLook:
+    """What a plan showed of the field: the coarse look, seats with their columns, and what it cost."""
+
+    seen: Glance
+    seats: NDArray[np.intp]
+    columns: Columns  # (seat, p, p, column)
+    seconds: float
+    bytes_raw: int
+
+
+@dataclass(frozen=True)
+class PlannedField:
+    """A farm that training never saw, by every plan."""
+
+    weights: Weights
+    labels: NDArray[np.uint8]
+    grid: SceneGrid
+    bands: int
+    looks: Mapping[Setting, PlannedLook]
+
+
+def plain_look(
+    weights: Weights, source: SimulatedSource, sweeps: list[Sweep], grid: SceneGrid, cost: CostModel
+) -> PlannedLook:
+    """A plain scan read whole; its coarse look are the means of its own pixels, on a field of whole cells."""
+    columns = columns_of_all_seats(source, sweeps, grid, weights, memory=MEMORY, kernel="catmull-rom")
+    down, across = grid.seat_shape
+    p, s, camera = grid.patch, grid.factor, source.camera
+    cells = columns.reshape(down, across, p // s, s, p // s, s, -1).mean(axis=(3, 5), dtype=np.float32)
+    small = cells.swapaxes(1, 2).reshape(down * p // s, across * p // s, -1)
+    seats, size = grid.valid_seats(), raw_bytes(sweeps, camera, len(source.wavelength_nm))
+    return PlannedLook(
+        glance_of_columns(weights, small, grid), seats, columns[seats], cost.seconds(sweeps, camera), size
+    )
+
+
+def _prepare(seed: int) -> PlannedField:
+    weights, camera, cost = load_weights(shipped_weights()), LineCamera(), CostModel()
+    scene = farm_scene(seed, SHAPE, camera=camera)
+    grid = SceneGrid(*SHAPE, weights.config.patch, weights.config.factor)
+    source, bands = SimulatedSource(scene, Rig(camera), seed), len(scene.wavelength_nm)
+    along, full, full_s = cheapest_full(grid, camera, cost)
+    looks: dict[Setting, PlannedLook] = {
+        words: plain_look(
+            weights, source, plain_sweeps(grid, camera, along, step=step, exposure_ms=exposure_ms), grid, cost
+        )
+        for words, (step, exposure_ms) in SCANS.items()
+    }
+    coarse, every = coarse_sweeps(grid, camera, along), looks[scan_words(1, camera.exposure_ms)]
+    rows = mosaic_rows([SimulatedSweep(source, sweep) for sweep in coarse], camera, grid, rows=64)
+    seen = glance(weights, np.concatenate([values for _, values, _ in rows]), scene.wavelength_nm, grid)
+    coarse_s, scores = cost.seconds(coarse, camera), score_seats("gain", seen)
+    for words, budget in BUDGETS.items():
+        plan = plan_fine(grid, camera, cost, along, scores, budget_s=budget * full_s - coarse_s, full=full)
+        columns = every.columns[np.searchsorted(every.seats, plan.seats)]
+        size = raw_bytes([*coarse, *plan.sweeps], camera, bands)
+        looks[words] = PlannedLook(seen, plan.seats, columns, coarse_s + plan.seconds, size)
+    return PlannedField(weights, np.asarray(scene.labels, np.uint8), grid, bands, looks)
+
+
+def _read(field: PlannedField, plan: Setting) -> DrawnMap:
+    look = field.looks[plan]
+    return segment(field.weights, look.seen, look.columns, look.seats)
+
+
+def _miss(field: PlannedField, _plan: Setting, drawn: DrawnMap) -> float:
+    return 1 - mean_iou(confusion(field.labels, drawn.classes, field.weights.config.classes))
+
+
+def _billion_operations(field: PlannedField, plan: Setting, _drawn: DrawnMap) -> float:
+    return multiply_adds(field.weights.config, field.grid, len(field.looks[plan].seats), field.bands).total / 1e9
+
+
+PLAN = Tradeoff(
+    stage="survey",
+    knob="plan",
+    error="1 - mIoU",
+    unit="scene px",
+    reference=f"labels of a farm of {SHAPE[1]} x {SHAPE[0]} px; two passes by policy gain",
+    settings=(*SCANS, *BUDGETS),
+    prepare=_prepare,
+    run=_read,
+    judge=_miss,
+    work=lambda field, _plan: float(field.labels.size),
+    families=True,
+    modelled_s=lambda field, plan, _drawn: field.looks[plan].seconds,
+    beside={
+        "MB raw": lambda field, plan, _drawn: field.looks[plan].bytes_raw / 1e6,
+        "billion multiply-adds": _billion_operations,
+    },
+)
+register_all(PLAN)
