@@ -28,7 +28,7 @@ from flows.survey.scene import open_scene
 from flows.survey.stages.effects import chosen_effects
 from pipeline.errors import PoseError, SettingsError
 from pipeline.geometry.mirror import STRAIGHT, Mounting
-from pipeline.geometry.scan import Sweep
+from pipeline.geometry.scan import Sweep, exposing
 from pipeline.rig.camera.camera_cubes import mean_frame
 from pipeline.rig.capture.capture_paths import REFERENCES
 from pipeline.rig.capture.capture_runner import RigDevices
@@ -122,7 +122,8 @@ def references_of_frames(patch: pytest.MonkeyPatch) -> None:
     def references(source: SimulatedSource, sweep: Sweep) -> References:
         if sweep.name == REFERENCES:  # what the frames are made of
             return exact(source, sweep)
-        frames = SceneView(source).references((source.camera.exposure_ms, source.camera.frame_ms), REFERENCE_FRAMES)
+        exposed = exposing(source.camera, sweep)
+        frames = SceneView(source).references((exposed.exposure_ms, exposed.frame_ms), REFERENCE_FRAMES)
         dark, white = (
             mean_frame(frames[name]).mean.reshape(-1, sweep.binning, len(source.wavelength_nm)).sum(axis=1)
             for name in ("darkReference", "whiteReference")
@@ -147,6 +148,22 @@ def test_every_line_is_the_simulated_one(tmp_path: Path, monkeypatch: pytest.Mon
     assert len({name.split()[0] for name in found}) == 2
     for name, rows in expected.items():
         np.testing.assert_array_equal(found[name], rows, err_msg=name)
+    np.testing.assert_array_equal(class_map_of(published, tmp_path / "rig"), class_map_of(simulated, tmp_path / "sim"))
+
+
+def test_a_plain_scan_by_the_rig_is_the_simulated_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every second line, of a quarter of the exposure: each line, with references so exposed, and the map."""
+    scan = {"budget": None, "scan_step": "2", "scan_exposure_ms": "25"}
+    with without_effects(), pytest.MonkeyPatch.context() as patch:
+        references_of_frames(patch)
+        simulated = run_survey(small_settings(tmp_path / "sim", **scan), QUIET)
+    effects = chosen_effects(next(ref for ref in Archive.open(tmp_path / "sim").refs("effects")))
+    settings = small_settings(tmp_path / "rig", source="rig", visit="first", **scan)
+    with emulated(settings, effects, monkeypatch):
+        published = run_survey(settings, QUIET)
+    expected, found = rows_of(tmp_path / "sim", simulated), rows_of(tmp_path / "rig", published)
+    assert list(found) == list(expected) == ["raw_coarse scan-0"]
+    np.testing.assert_array_equal(found["raw_coarse scan-0"], expected["raw_coarse scan-0"])
     np.testing.assert_array_equal(class_map_of(published, tmp_path / "rig"), class_map_of(simulated, tmp_path / "sim"))
 
 
