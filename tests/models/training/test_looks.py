@@ -75,7 +75,7 @@ def _flat(normalisation: Normalisation, value: float, shape: tuple[int, int]) ->
     return normalisation.apply(np.full((*shape, 12), value, np.float32), np.ones(12, bool))
 
 
-@pytest.mark.parametrize(("light", "step"), [(0.25, 1), (0.1, 1), (0.1, 2), (0.05, 4)])
+@pytest.mark.parametrize(("light", "step"), [(0.25, 1), (0.1, 1), (0.1, 2), (0.05, 4), (0.9, 2), (1.0, 4)])
 def test_a_scan_is_as_noisy_as_its_light_makes_it(light: float, step: int) -> None:
     """What is added to a line is the law's variance at its light less what its pixels already had at the reference.
 
@@ -113,3 +113,13 @@ def test_looks_drawn_have_the_shapes_of_the_crop_and_follow_their_seed() -> None
         one, other = (looks.draw(fine, coarse, _noise(), 4, np.random.default_rng(seed)) for _ in range(2))
         assert [part.shape for part in one] == [fine.shape, coarse.shape]
         assert all(np.array_equal(a, b) and np.isfinite(a).all() for a, b in zip(one, other, strict=True))
+
+
+def test_a_coarse_pass_is_read_as_often_as_it_has_samples() -> None:
+    """In the light of the reference nothing is added to a scan of every line, nor to a coarse pass of its own."""
+    _, normalisation = _looks()
+    looks = Looks(normalisation, darkest_ms=100.0, steps={1: 1.0}, own_coarse=1.0)
+    fine, coarse = _flat(normalisation, 0.3, (16, 16)), _flat(normalisation, 0.25, (4, 4))
+    plain, own = looks.draw(fine, coarse, _noise(), 4, np.random.default_rng(8))
+    np.testing.assert_allclose(plain, fine, atol=2e-3)
+    np.testing.assert_allclose(own, coarse, atol=2e-3)
