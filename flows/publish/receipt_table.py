@@ -30,9 +30,12 @@ def headline(receipt: Receipt, looked_twice: float | None = None) -> str:
         twice = (
             "" if looked_twice is None else f"The camera looked twice at {format_percent(looked_twice)} of the field. "
         )
+    everything = (
+        f"every line of {receipt['settings']['camera']['exposure_ms']:g} ms" if plain else "a scan of everything"
+    )
     text = (
         f"{twice}Capture took {format_seconds(capture['done'])} instead of {format_seconds(capture['full'])} "
-        f"for a scan of everything ({format_percent(capture['ratio'])})."
+        f"for {everything} ({format_percent(capture['ratio'])})."
     )
     accuracy = receipt.get("accuracy")
     if accuracy is None:
@@ -44,7 +47,7 @@ def headline(receipt: Receipt, looked_twice: float | None = None) -> str:
     pixels = "" if right is None else f" ({format_points(right)} % of its pixels are right)"
     return (
         f"{text} The map scores {format_points(accuracy['miou'])} of 100 against the truth{pixels}{coarse}"
-        f"{detail}. {worst_class_words(accuracy)}"
+        f"{detail}. {worst_class_words(accuracy, alone=plain)}"
     ).rstrip()
 
 

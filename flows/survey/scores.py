@@ -72,14 +72,17 @@ def worst_class(accuracy: Mapping[str, Any]) -> WorstClass | None:
     return WorstClass(name, none.get(name), known[name], every.get(name))
 
 
-def worst_class_words(accuracy: Mapping[str, Any]) -> str:
-    """The worst class in a sentence; empty where there is none."""
+def worst_class_words(accuracy: Mapping[str, Any], *, alone: bool = False) -> str:
+    """The worst class in a sentence, ``alone`` without what other looks give; empty where there is none."""
     worst = worst_class(accuracy)
     if worst is None:
         return ""
+    name = worst.name.replace("_", " ")
+    if alone:
+        return f"Its worst class is {name} with {format_points(worst.this)}."
     full = "" if worst.all is None else f", detail everywhere {format_points(worst.all)}"
     return (
-        f"Its worst class is {worst.name.replace('_', ' ')} with {format_points(worst.this)}: the coarse look alone "
+        f"Its worst class is {name} with {format_points(worst.this)}: the coarse look alone "
         f"gives {format_points(worst.none)}{full}."
     )
 

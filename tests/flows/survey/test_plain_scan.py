@@ -91,6 +91,8 @@ def test_receipt_and_pages_tell_a_scan(scanned: tuple[Path, Any]) -> None:
     assert taken["seconds"] == pytest.approx(receipt["savings"]["capture_s"]["done"])
     assert receipt["scans"]["best_in_time"]["expected_miou"] >= taken["expected_miou"] - 1e-3
     assert "looked twice" not in page
+    assert "for every line of 100 ms" in page
+    assert "the coarse look alone" not in page.partition("What it cost")[0]
     assert "The field was scanned once: every 2nd line, 25 ms." in page
     assert "such a scan scores about 91.0 ± 3.0" in page
 
