@@ -25,8 +25,6 @@ from pipeline.planning.plain_scans import (
     reference_scan,
 )
 
-ASKED = ("seconds", "bytes_raw", "goal")  # settings that leave the choice to the record
-
 
 @dataclass(frozen=True)
 class ScanChoice:
@@ -60,7 +58,8 @@ def choose_plain_scan(
 
     What was chosen once stands in the settings, and is kept when an archive is read again with other weights. Raises
     WeightsError: the choice is left to weights without a record of scans; BudgetError: no scan costs as little, or
-    reaches the goals; SettingsError: a goal of a class that the weights lack; PoseError: the field is beyond the
+    reaches the goals; SettingsError: a goal of a class that the weights lack, or a camera that exposes shorter than the
+    record knows; PoseError: the field is beyond the
     mirror's range.
     """
     content = weights.record.get("scans")
@@ -81,9 +80,14 @@ def choose_plain_scan(
     sweeps = {step: lay_out_sweeps(replace(settings, scan_step=step), grid)[1] for step in record.steps}
     scans = plain_scans(record, sweeps, camera, cost, bands, seconds=settings.seconds)
     chosen, exposure_ms = None, settings.scan_exposure_ms or camera.exposure_ms
-    if settings.scan_step in sweeps:
+    if settings.scan_step in sweeps and record.knows(exposure_ms):
         chosen = priced_scan(record, sweeps[settings.scan_step], camera, cost, bands, exposure_ms)
     elif settings.plain and settings.scan_step is None:
+        if not scans:
+            raise SettingsError(
+                f"camera.exposure_ms = {camera.exposure_ms:g}: the weights' record tells of exposures from "
+                f"{record.exposures_ms[0]:g} ms, so that it can choose no scan; take one by hand with --scan-step"
+            )
         chosen = choose_scan(scans, ScanLimits(settings.seconds, settings.bytes_raw, goals))
         settings = replace(settings, scan_step=chosen.step, scan_exposure_ms=chosen.exposure_ms)
     return settings, ScanChoice(tuple(scans), chosen)

@@ -22,7 +22,7 @@ from flows.training.look import observe_scene
 from models.network.segmenter import Segmenter
 from models.network.sizes import PRESETS, Positions, Preset, SegmenterConfig
 from models.network.spectral import SpectralBasis
-from models.training.examples import Observation, measured_normalisation, normalised
+from models.training.examples import Example, Observation, measured_normalisation, normalised
 from models.training.looks import REFERENCE_MS, Looks
 from models.training.start_weights import StartFile
 from models.training.train import Progress, TrainingSettings, train
@@ -117,13 +117,6 @@ def train_weights(request: TrainRequest, report: Report = lambda what, done, fig
     weights = AnyWeights(model, about.basis, normalisation, about.names, about.colours)
     kept, _ = _observe_all(request, data, data.validation, "looking at validation scenes", report, about)
     frames = [normalised(one, normalisation, reached) for one in kept]
-    figures = validate(weights, frames, request.settings.seed, lambda row: report("validating", 0.0, row))
-    scans = None
-    if looks is not None and isinstance(model, Segmenter):
-        two_scale = Weights(model, about.basis, normalisation, about.names, about.colours)
-        scans = judge_scans(
-            two_scale, frames, looks, request.settings.seed, lambda row, done: report("judging scans", done, row)
-        )
     record = {
         "command": request.command,
         "data": data.law,
@@ -131,13 +124,25 @@ def train_weights(request: TrainRequest, report: Report = lambda what, done, fig
         "settings": asdict(request.settings),
         "camera": asdict(request.camera),
         "training": summary,
-        "validation": figures,
-        **({} if scans is None else {"scans": scans}),
+        **_figures(weights, frames, looks, request.settings.seed, report),
         **({} if begun is None else {"begun_from": begun.record}),
     }
     save_weights(with_record(weights, **record), request.out)
     checkpoint.unlink(missing_ok=True)
     return record
+
+
+def _figures(
+    weights: AnyWeights, frames: list[Example], looks: Looks | None, seed: int, report: Report
+) -> dict[str, Any]:
+    """What the record says of scenes kept for validation; of plain scans too, where training saw such looks."""
+    figures = {"validation": validate(weights, frames, seed, lambda row: report("validating", 0.0, row))}
+    if looks is None or not isinstance(weights.network, Segmenter):
+        return figures
+    own = (weights.basis, weights.normalisation, weights.class_names, weights.class_colours)
+    two_scale = Weights(weights.network, *own)
+    scans = judge_scans(two_scale, frames, looks, seed, lambda row, done: report("judging scans", done, row))
+    return figures if scans is None else figures | {"scans": scans}
 
 
 def _check_places(out: Path, checkpoint: Path) -> None:

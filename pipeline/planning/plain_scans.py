@@ -72,6 +72,10 @@ class ScanRecord:
             None if content.get("spread") is None else np.asarray(content["spread"], np.float64)[:, order],
         )
 
+    def knows(self, exposure_ms: float) -> bool:
+        """Whether an exposure lies within the record."""
+        return self.exposures_ms[0] <= exposure_ms <= self.exposures_ms[-1]
+
     def expected(self, step: int, exposure_ms: float) -> dict[str, float]:
         """Scores of a scan of a step and exposure within the record."""
         return {name: self._between(table, step, exposure_ms) for name, table in self.scores.items()}

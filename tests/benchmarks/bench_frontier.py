@@ -23,22 +23,20 @@ from rich.console import Console
 
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
+from flows.tradeoff.plans import plain_look
 from flows.training.look import chosen_effects
 from models.evaluation.metrics import confusion, mean_iou
-from models.network.spectral import patches_of
-from models.reading.inference import glance_of_columns, segment
+from models.reading.inference import segment
 from models.weights.files import Weights, load_weights
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid, pad_by_reflection
-from pipeline.geometry.scan import CostModel, Sweep
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import CostModel
 from pipeline.planning.coverage import cheapest_full, plain_sweeps
 from pipeline.planning.plain_scans import MIOU, PlainScan, ScanLimits, ScanRecord, choose_scan, plain_scans, scan_words
-from pipeline.rectify.placed import PixelGrid, place
-from pipeline.rectify.region import column_reach, mosaic_tile
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.scene import RasterScene
-from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_starts
+from pipeline.simulator.simulated import SimulatedSource, sweep_starts
 
 SHAPE, SEEDS = (512, 640), (1, 2, 3)
 CAMERA, COST = LineCamera(), CostModel()
@@ -129,21 +127,9 @@ def _plain(seed: int, step: int, exposure_ms: float, shape: tuple[int, int]) -> 
     sweeps = plain_sweeps(grid, CAMERA, along, step=step, exposure_ms=exposure_ms)
     chosen = chosen_effects(scene, rig, sweeps)
     source = SimulatedSource(scene, rig, seed, chosen, clock=sweep_starts(sweeps, CAMERA, COST))
-    seen = _seen(weights, source, sweeps, grid)
-    small = seen.reshape(len(seen) // grid.factor, grid.factor, -1, grid.factor, seen.shape[-1]).mean(axis=(1, 3))
-    valid = grid.valid_seats()
-    drawn = segment(weights, glance_of_columns(weights, small, grid), patches_of(seen, grid.patch)[valid], valid)
-    return COST.seconds(sweeps, CAMERA), _judged(scene, drawn.classes, weights)
-
-
-def _seen(weights: Weights, source: SimulatedSource, sweeps: list[Sweep], grid: SceneGrid) -> NDArray[np.float32]:
-    """The rectified scan in the weights' columns, on the padded grid."""
-    pixels = PixelGrid.of_scene(grid, 1)
-    placed = [place(SimulatedSweep(source, sweep), CAMERA) for sweep in sweeps]
-    rows, columns = (slice(0, size) for size in pixels.shape)
-    reach = column_reach(placed, CAMERA, pixels, columns)
-    values, _ = mosaic_tile(placed, CAMERA, pixels, rows, columns, reach=reach)  # at once: every line is made once
-    return np.asarray(pad_by_reflection(weights.columns(values, source.wavelength_nm), grid.padded_shape), np.float32)
+    look = plain_look(weights, source, sweeps, grid, COST)
+    drawn = segment(weights, look.seen, look.columns, look.seats)
+    return look.seconds, _judged(scene, drawn.classes, weights)
 
 
 def _judged(scene: RasterScene, classes: NDArray[np.uint8], weights: Weights) -> float:

@@ -32,22 +32,7 @@ def attend(run: SurveyRun, mosaic: StageRef) -> Wanted:
 
     def build(path: Path) -> None:
         work = FieldWork.of(run)
-        scores = np.zeros(int(np.prod(run.grid.seat_shape))) if run.plan.plain else _scores(run, work, mosaic)
-        plan = (
-            _whole_field(run)
-            if run.plan.plain
-            else plan_fine(
-                run.grid,
-                run.camera,
-                settings.cost,
-                run.plan.along,
-                scores,
-                budget_s=run.plan.fine_s,
-                margin_px=run.plan.margin_px,
-                full=run.plan.full,
-                threshold=settings.threshold,
-            )
-        )
+        scores, plan = _whole_field(run) if run.plan.plain else _scored(run, work, mosaic)
         work.crew_for(plan.seats, len(run.scene.wavelength_nm))  # refuses what does not fit before the rig goes back
         rank = np.full(scores.shape, -1, np.int32)
         rank[plan.seats[np.argsort(-scores[plan.seats], kind="stable")]] = np.arange(len(plan.seats))
@@ -77,11 +62,29 @@ def attend(run: SurveyRun, mosaic: StageRef) -> Wanted:
     return Wanted(build, params, [mosaic])
 
 
-def _whole_field(run: SurveyRun) -> FinePlan:
-    """The plan of a plain scan: every seat is seen, and there is nothing to go back for."""
+def _scored(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> tuple[NDArray[np.float64], FinePlan]:
+    """Scores of the seats, and the runs of lines that show most of them in the time left."""
+    scores = _scores(run, work, mosaic)
+    plan = plan_fine(
+        run.grid,
+        run.camera,
+        run.settings.cost,
+        run.plan.along,
+        scores,
+        budget_s=run.plan.fine_s,
+        margin_px=run.plan.margin_px,
+        full=run.plan.full,
+        threshold=run.settings.threshold,
+    )
+    return scores, plan
+
+
+def _whole_field(run: SurveyRun) -> tuple[NDArray[np.float64], FinePlan]:
+    """No scores, and the plan of a plain scan: every seat is seen, and there is nothing to go back for."""
     sweep = run.plan.coarse[0]
     words = scan_words(sweep.step, exposing(run.camera, sweep).exposure_ms)
-    return FinePlan([], run.grid.valid_seats(), 0.0, 0.0, "scan", f"the field was scanned once: {words}")
+    plan = FinePlan([], run.grid.valid_seats(), 0.0, 0.0, "scan", f"the field was scanned once: {words}")
+    return np.zeros(int(np.prod(run.grid.seat_shape))), plan
 
 
 def _scores(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> NDArray[np.float64]:

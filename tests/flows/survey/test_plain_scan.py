@@ -190,6 +190,7 @@ def test_plan_shows_what_seconds_buy(scene_files: Path, recorded: Path, tmp_path
         ({"seconds": "nan"}, SettingsError, r"--seconds must be a number from 0\.1"),
         ({"seconds": "5", "budget": "0.5"}, SettingsError, r"--seconds asks for one plain scan .* --budget is for"),
         ({"seconds": "5", "scan_step": "2"}, SettingsError, r"--scan-step makes it: leave one out"),
+        ({"seconds": "5", "camera.exposure_ms": "5"}, SettingsError, r"tells of exposures from 6 ms.*--scan-step"),
         ({"scan_exposure_ms": "25"}, SettingsError, r"give --scan-step too"),
         ({"scan_step": "0"}, SettingsError, r"--scan-step must be a whole number from 1 to 8"),
     ],
@@ -201,6 +202,16 @@ def test_what_no_scan_can_do_is_refused_in_a_sentence(
     with pytest.raises(error, match=words):
         survey_png(tmp_path / "out", **{"budget": None, "weights": str(recorded)} | given)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("exposure_ms", "told"), [("6", True), ("5", False), ("100", True), ("101", False)])
+def test_nothing_is_expected_of_a_scan_beyond_the_record(
+    scene_files: Path, recorded: Path, tmp_path: Path, exposure_ms: str, told: bool
+) -> None:
+    """By hand any exposure may be taken; one beside those that were judged has no expectation."""
+    given = {"scene": str(scene_files / "scene.png"), "weights": str(recorded), "out": str(tmp_path)}
+    scan = {"scan_step": "2", "scan_exposure_ms": exposure_ms}
+    assert (plan_content(load_settings(None, given | scan))["scans"]["taken"] is not None) == told
 
 
 def test_weights_without_a_record_scan_by_hand_alone(survey_png: Survey, tmp_path: Path) -> None:
