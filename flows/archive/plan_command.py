@@ -96,8 +96,7 @@ def forecast(settings: Settings) -> Forecast:
         archive = Archive(Path(empty), writes=False)  # where there is none yet
         if is_archive(settings.out):
             archive = open_archive(settings.out, create=False, write=False)
-        run = open_run(replace(settings, out=empty), planning=True)
-        run = replace(run, settings=replace(run.settings, out=settings.out), archive=archive)
+        run = open_run(settings, planning=True, archive=archive)
         planner = Planner(run, Catalogue.read(archive.root))
         judge(planner, survey(planner))
     return Forecast(planner.rows, run.refused, run.scans)

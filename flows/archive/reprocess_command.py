@@ -26,6 +26,8 @@ from flows.archive.stale_runs import (
     is_current,
     is_whole,
     newest_runs,
+    renewals,
+    renewed_prior,
     would_remake,
 )
 from flows.cli.app import ArchiveName, AsJson, OutFolder, Scheduler, Switch, Workers, check_outside, stderr
@@ -139,6 +141,7 @@ def run_reprocess(
         },
         "fields": rows,
     }
+    renewed = renewals(catalogue)
     file = None
     if wanted and not request.dry_run:
         file = new_file(folder, f"reprocess-{content['started']}", ".json")
@@ -147,7 +150,9 @@ def run_reprocess(
         for number, generation in enumerate(wanted, 1):
             told = f"{number} of {len(wanted)}: {generation.field} ({generation.run.folder.name})"
             console.print(f"[bold]reprocess {escape(told)}[/]", soft_wrap=True)
-            rows.append(_again(catalogue, generation, request, console, survey or _survey))
+            rows.append(_again(catalogue, generation, request, console, survey or _survey, renewed))
+            if rows[-1]["new"] is not None:
+                renewed[generation.run.folder.name] = rows[-1]["new"]
             console.print(escape(_words(rows[-1])), soft_wrap=True)
             if file is not None:
                 write_whole(file, to_json(content))  # also of what was done before an interruption
@@ -199,8 +204,14 @@ def _moment(text: str) -> datetime:
 
 
 def _again(
-    catalogue: Catalogue, generation: Generation, request: ReprocessRequest, console: Console, survey: Survey
+    catalogue: Catalogue,
+    generation: Generation,
+    request: ReprocessRequest,
+    console: Console,
+    survey: Survey,
+    renewed: Mapping[str, str],
 ) -> dict[str, Any]:
+    """Survey one field again; ``renewed`` names the newest run of each visit that another may go on from."""
     run, begun = generation.run, time.perf_counter()
     row: dict[str, Any] = {
         "field": generation.field,
@@ -216,9 +227,11 @@ def _again(
     try:
         settings = asked_again(run, str(request.archive), request.weights)
         settings = replace(settings, scheduler=request.crew.scheduler, workers=request.crew.workers)
-        if is_current(catalogue, run, settings):
+        prior = renewed_prior(settings.prior, renewed)
+        if prior == settings.prior and is_current(catalogue, run, settings):
             same = {"state": "skipped", "message": "is as it would become"}
             return row | same | _scores(run.receipt, "after")
+        settings = replace(settings, prior=prior)
         if request.dry_run:
             return row | {"state": "would run"}
         folder = survey(settings, console)

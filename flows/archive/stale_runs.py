@@ -53,6 +53,22 @@ def newest_runs(catalogue: Catalogue) -> list[Generation]:
     return list(found.values())
 
 
+def renewals(catalogue: Catalogue) -> dict[str, str]:
+    """For every run that was made again the newest of the same look, by their names."""
+    looks: dict[str, list[str]] = {}
+    for run in catalogue.runs:
+        if run.settings:
+            looks.setdefault(canonical_json([called(run), _light_of(run)]), []).append(run.folder.name)
+    return {earlier: names[-1] for names in looks.values() for earlier in names[:-1]}
+
+
+def renewed_prior(prior: str, renewed: Mapping[str, str]) -> str:
+    """The newest run of the look that a survey goes on from."""
+    while prior in renewed:
+        prior = renewed[prior]
+    return prior
+
+
 def _light_of(run: Run) -> dict[str, Any]:
     """What the light of a run depends on, with the farm by its law: ``farm`` has not always meant the present one."""
     settings = {**run.settings, **_scene_of(run)}

@@ -101,6 +101,7 @@ class Receipt(TypedDict):
     effects_total: NotRequired[dict[str, Any]]  # sum of the bounds beside the tolerance, and seconds saved
     plan: NotRequired[dict[str, Any]]  # how the fine pass was laid out, and what the other orientation would cost
     scans: NotRequired[dict[str, dict[str, Any]]]  # plain ones by the weights' record, where there is one
+    memory: NotRequired[dict[str, Any]]  # what became of what was remembered, where the map goes on from an earlier run
     pointing: NotRequired[dict[str, Any]]  # only where the mirror may look beside the plan
     lines: NotRequired[dict[str, Any]]  # sweeps with lines lost, repeated, out of order, late or invalid
     ground: NotRequired[dict[str, Any]]  # only with a pose: grid and hectares
@@ -123,7 +124,7 @@ class Header:
 
 
 COSTS = ("lines", "samples", "bytes_raw", "bytes_stored", "capture_s", "tokens", "multiply_adds")
-FINDINGS = ("plan", "scans", "pointing", "lines", "ground", "pixels")
+FINDINGS = ("plan", "scans", "memory", "pointing", "lines", "ground", "pixels")
 _SAVING_FIELDS = ("done", "full", "ratio", "full_is")
 _SPLIT_FIELDS = ("glance", "score", "encode", "decode")
 _STAGE_FIELDS = ("name", "key", "state", "wall_s", "cpu_s", "peak_rss_bytes", "bytes_in", "bytes_out")

@@ -148,6 +148,8 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
             )
         if plan["lines"]:
             words.append(_sentence(plan["orientation"]["sentence"]))
+    if memory := found.get("memory"):
+        words.append(_memory_words(memory))
     if scans := found.get("scans"):
         words.append(_scans_words(scans))
     for name, one in found.get("pointing", {}).items():
@@ -162,6 +164,31 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
         place = f"{ground['crs']}, {ground['resolution_m']:g} m a pixel"
         words.append(f"On the ground ({place}) the classes cover {', '.join(areas)}.")
     return words
+
+
+MOST_CHANGES = 4  # told in words
+
+
+def _memory_words(memory: Mapping[str, Any]) -> str:
+    """What became of the memory that the map goes on from."""
+    since = f"{memory['run']}, {days_words(memory['days'])}"
+    alike = "nothing" if memory["agreement"] is None else format_percent(memory["agreement"])
+    if memory["put_aside"]:
+        return (
+            f"What {since}, left was put aside: today's look shows {alike} of the field as it is remembered, as of "
+            f"another field, or a rig that was moved."
+        )
+    share = format_percent(memory["changed_px"] / memory["compared_px"]) if memory["compared_px"] else "nothing"
+    most = [f"{old.replace('_', ' ')} to {new.replace('_', ' ')}" for _, old, new in memory["changes"][:MOST_CHANGES]]
+    what = f": {', '.join(most)}" if most else ""
+    return f"The map goes on from {since}: today's look agrees with {alike} of it, and {share} changed{what}."
+
+
+def days_words(days: float) -> str:
+    """How long ago a look was."""
+    if days < 1:
+        return f"{24 * days:.1f} hours earlier"
+    return f"{days:.1f} days earlier" if days < 10 else f"{days:.0f} days earlier"
 
 
 def _scans_words(scans: Mapping[str, Mapping[str, Any]]) -> str:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flows.publish.change_picture import change_pictures
 from flows.publish.panels import draw_ground
 from flows.publish.quicklook import QuicklookData, draw_quicklook
 from flows.publish.receipt import AccuracyIs, Header, Receipt, build_receipt, check_receipt, with_accuracy
@@ -27,7 +28,7 @@ from flows.survey.stages.accuracy import load_accuracy
 from flows.survey.stages.attention import load_orientation, load_plan
 from flows.survey.stages.capture import captured
 from flows.survey.stages.effects import load_manifest
-from flows.survey.stages.maps import STORE, strange_pixels
+from flows.survey.stages.maps import STORE, memory_told, strange_pixels
 from flows.survey.stages.placement import SEATS_AT_ONCE, line_facts, load_registration, seen_shares
 from flows.survey.survey import STAGES, Products, StageRunner
 from pipeline.errors import IncompleteStoreError
@@ -105,6 +106,7 @@ def _publish(run: SurveyRun, draft: RunDraft, products: Products, plan: FinePlan
     picture = (draft.folder / "quicklook.png").read_bytes()
     maps = (load_ground_map(ref.path / STORE) for ref in products.there(["ground"]))
     pictures = [Picture(draw_ground(drawn), "The map on the ground, north up.") for drawn in maps]
+    pictures += change_pictures(run.prior, products.of("draw_map"), receipt, run.grid.patch)
     page = render_report(receipt, picture, pictures, looked_twice=looked_twice)
     (draft.folder / "report.html").write_text(page, encoding="utf-8")
     rests_on = run.archive.manifest_hashes(products.there(products))
@@ -287,6 +289,8 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
             "spared_score": plan.wanted_worth - plan.worth,
         }
     found: dict[str, Any] = {"plan": told}
+    if (memory := memory_told(products.of("draw_map"))) is not None:
+        found["memory"] = memory
     passes = {"coarse": products.get("register_coarse"), "fine": products.get("register_fine")}
     pointing = {name: _pointing(ref) for name, ref in passes.items() if ref is not None}
     if "fine" in pointing:

@@ -50,7 +50,8 @@ class ServedField:
 
     def settings_of(self, due: datetime, timetable: Timetable) -> Settings:
         """What the survey of a due time is asked for: a visit of its own, a simulated farm as on that day."""
-        asked = replace(self.settings, name=self.name, visit=moment_words(due))
+        prior = "latest" if self.settings.prior == "auto" else self.settings.prior
+        asked = replace(self.settings, name=self.name, visit=moment_words(due), prior=prior)
         if asked.source == "sim" and asked.scene in FARM_NAMES and asked.day is None:
             asked = replace(asked, day=due.astimezone(timetable.zone).timetuple().tm_yday)
         return asked

@@ -126,6 +126,9 @@ def work_done(run: SurveyRun, seats: NDArray[np.integer]) -> MultiplyAdds:
     """
     policy, regions = run.settings.policy, plan_regions(run.grid, SHARD)
     drawn = work_of_map(run, seats)
+    if run.prior is not None and run.reader is not None:
+        recalled = run.reader.sizes.multiply_adds(run.grid.height * run.grid.width)
+        drawn = replace(drawn, decode=drawn.decode + recalled)
     if run.plan.plain:  # where everything is seen nothing is scored
         return drawn
     looks = 2 if policy in SEEING_POLICIES and policy not in NETWORK_POLICIES else 1

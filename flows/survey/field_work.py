@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, reduce
+from operator import add
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +16,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.survey.run import SurveyRun, weights_path
+from models.network.memory_reader import MemoryReader
 from models.network.sizes import saliency_bytes
 from models.policies.policies import IMAGE_POLICIES, NETWORK_POLICIES, score_seats
 from models.policies.vgg_file import VggFile
 from models.reading.inference import CoarseLook, Glance, look_coarsely, read_glance, segment
 from models.reading.regions import HALO_CELLS, REGION_PX, Region, most_bytes, plan_regions, whole_field
-from models.weights.files import Weights, content_key, load_weights
+from models.reading.remembered import (
+    Belief,
+    Comparison,
+    Looked,
+    Remembered,
+    changed_shares,
+    compare,
+    first_belief,
+    in_classes,
+    recall,
+)
+from models.weights.files import Weights, content_key, describe_weights, load_weights
+from models.weights.memory_files import load_memory, memory_key, memory_path
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.readings import beyond_range, readings_alone
+from storage.arrays.beliefs import BeliefStore, write_belief_tile
 from storage.arrays.class_maps import write_class_tile
 from storage.arrays.layout import SHARD_COLUMNS, SHARD_ROWS
 from storage.arrays.mosaics import PATCHES_A_SHARD, PatchStore, mosaic_strips, mosaic_wavelengths, open_patches
@@ -39,6 +54,19 @@ class WeightsFile:
 
     path: Path
     key: str
+
+    reader_key: str | None = None  # of the reader of memories beside them, where there is one
+
+    @lru_cache(maxsize=1)  # noqa: B019 - the record is a value
+    def load_reader(self) -> MemoryReader | None:
+        """Read what reads memories, once a process; None where the weights have none. WeightsError as `load`."""
+        if self.reader_key is None:
+            return None
+        path = memory_path(self.path)
+        found = load_memory(path, describe_weights(self.path))
+        if memory_key(path) != self.reader_key:
+            raise WeightsError(f"the reader of memories {path} has changed since the survey began; start it again")
+        return found.reader
 
     @lru_cache(maxsize=1)  # noqa: B019 - the record is a value
     def load(self) -> Weights:
@@ -78,20 +106,73 @@ class Drawing:
     weights: WeightsFile
     mosaic: Path
     patches: Path
-    out: Path
+    out: Path  # of the class map
+    belief: Path
+    light: float  # exposure of a line that is read in detail, as a share of the reference
+    step: int  # pixels from such a line to the next
+    memory: MemoryPart | None = None  # what is remembered of the field
 
-    def __call__(self, region: Region) -> Strange:
+    def __call__(self, region: Region) -> Drawn:
         """Read what was seen of the region coarsely and finely, and store the part of the map that is kept."""
         let_tiles_go()
         weights, store = self.weights.load(), open_patches(self.patches)
         seen = look_at(weights, self.mosaic, region)
         strange = np.zeros(region.grid.seat_shape, np.int64)
         seats, columns = seat_columns(weights, store, store.wavelength_nm, seen, region, strange=strange.ravel())
-        drawn = segment(weights, seen, columns, seats)
+        drawn = segment(weights, seen, columns, seats, every_class=True)
+        assert drawn.log_probability is not None
+        looked = self._looked(region, drawn.log_probability, seats, seen)
+        classes, confidence = drawn.classes, drawn.confidence
+        comparison, changed = None, None
+        if self.memory is None:
+            after = first_belief(looked)
+        else:
+            remembered = self.memory.of(region, weights)
+            after = recall(remembered, looked, self.weights.load_reader())
+            classes, confidence = after.classes()
+            comparison = compare(remembered, looked, after, region.kept_here)
+            changed = changed_shares(remembered, after, region.grid.patch)
         origin = region.kept.top, region.kept.left
-        write_class_tile(self.out, origin, region.crop(drawn.classes), region.crop(drawn.confidence))
+        write_class_tile(self.out, origin, region.crop(classes), region.crop(confidence))
+        write_belief_tile(self.belief, origin, region.crop(after.log_probability), region.crop(after.age_days))
         coarse = 0 if seen.strange is None else int(np.count_nonzero(region.crop_coarse(seen.strange)))
-        return coarse, int(region.crop_seats(strange).sum())
+        return Drawn((coarse, int(region.crop_seats(strange).sum())), comparison, changed)
+
+    def _looked(
+        self, region: Region, log_probability: NDArray[np.float32], seats: NDArray[np.int64], seen: CoarseLook
+    ) -> Looked:
+        grid = region.grid
+        detailed = np.zeros(grid.seat_shape, np.bool_)
+        detailed.ravel()[seats] = True
+        pixels = np.repeat(np.repeat(detailed, grid.patch, axis=0), grid.patch, axis=1)[: grid.height, : grid.width]
+        return Looked(log_probability, pixels, seen.columns, self.light, self.step)
+
+
+@dataclass(frozen=True)
+class MemoryPart:
+    """Where the memory of a field lies, and how it is to be read."""
+
+    belief: Path
+    mosaic: Path
+    days: float
+    classes: tuple[int, ...]  # see `flows.survey.memory.Prior`
+
+    def of(self, region: Region, weights: Weights) -> Remembered:
+        """Read what is remembered of a region, in the classes of the weights."""
+        values, age = BeliefStore(self.belief).read(region.read.rows, region.read.columns)
+        if self.classes != tuple(range(values.shape[-1])):
+            values = in_classes(values, self.classes)
+        coarse = look_at(weights, self.mosaic, region).columns
+        return Remembered(Belief(values, age), coarse, self.days)
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What a worker says of a region that it drew."""
+
+    strange: Strange
+    comparison: Comparison | None  # with what was remembered
+    changed: NDArray[np.float32] | None  # (seat_y, seat_x) of the region's scene
 
 
 def look_at(weights: Weights, mosaic: Path, region: Region) -> CoarseLook:
@@ -139,6 +220,15 @@ def seat_columns(
     return seats[:kept], columns[:kept]
 
 
+@dataclass(frozen=True)
+class DrawnField:
+    """What was found while a map was drawn."""
+
+    strange: Strange
+    comparison: Comparison | None  # with what was remembered; None of a field's first look
+    changed: NDArray[np.float32] | None  # (seat_y, seat_x) share of pixels with another class than remembered
+
+
 SHARD = (SHARD_ROWS, SHARD_COLUMNS)
 IMAGE_BYTES = 128  # a coarse pixel, of what a policy of the whole image holds at once beside the columns
 
@@ -161,7 +251,9 @@ class FieldWork:
     @staticmethod
     def of(run: SurveyRun) -> FieldWork:
         """Take from a survey what the regions of its field need."""
-        file = WeightsFile(weights_path(run.settings).resolve(), run.weights_key)
+        file = WeightsFile(
+            weights_path(run.settings).resolve(), run.weights_key, None if run.reader is None else run.reader.key
+        )
         return FieldWork(file, plan_regions(run.grid, SHARD), run.settings.crew, run.settings.memory, run.vgg)
 
     def score(self, policy: str, mosaic: Path, report: Callable[[float], None]) -> NDArray[np.float64]:
@@ -199,17 +291,28 @@ class FieldWork:
         (scores,) = run_blocks(work, [whole_field(grid)], crew, report=report, paths=[mosaic])
         return np.asarray(scores, np.float64)
 
-    def draw(self, mosaic: Path, patches: Path, out: Path, report: Callable[[float], None]) -> Strange:
-        """Draw the class map into the store that was created at ``out``; count pixels that were left out.
+    def draw(self, work: Drawing, report: Callable[[float], None]) -> DrawnField:
+        """Draw class map and belief into the stores that were created for them; count pixels that were left out.
 
         These are the coarse pixels, and the fine ones, with a value that the weights take for no reading. Raises
         SettingsError: not even one region at a time fits the memory.
         """
-        store = open_patches(patches)
+        store = open_patches(work.patches)
         crew = self.crew_for(store.seats, len(store.wavelength_nm))
-        paths = mosaic.resolve(), patches.resolve(), out.resolve()
-        parts = run_blocks(Drawing(self.weights, *paths), self.regions, crew, report=report, paths=paths)
-        return sum(coarse for coarse, _ in parts), sum(fine for _, fine in parts)
+        remembered = () if work.memory is None else (work.memory.belief, work.memory.mosaic)
+        paths = (work.mosaic, work.patches, work.out, work.belief, *remembered)
+        parts: list[Drawn] = run_blocks(work, self.regions, crew, report=report, paths=paths)
+        strange = sum(part.strange[0] for part in parts), sum(part.strange[1] for part in parts)
+        compared = [part.comparison for part in parts if part.comparison is not None]
+        changed = None
+        if compared:
+            changed = np.zeros(self.regions[0].field.seat_shape, np.float32)
+            for region, part in zip(self.regions, parts, strict=True):
+                assert part.changed is not None
+                whole = np.zeros(region.grid.seat_shape, np.float32)
+                whole[: part.changed.shape[0], : part.changed.shape[1]] = part.changed
+                changed[region.kept_seats.rows, region.kept_seats.columns] = region.crop_seats(whole)
+        return DrawnField(strange, reduce(add, compared) if compared else None, changed)
 
     def crew_for(self, seats: NDArray[np.integer], bands: int, *, beside: int = 0) -> Crew:
         """Give the crew, no larger than memory holds regions with their parts of these seats of the field.

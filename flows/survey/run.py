@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
 from flows.survey.capture_plan import CapturePlan, plan_capture
+from flows.survey.memory import NONE, Prior, find_prior
 from flows.survey.scan_choice import ScanChoice, choose_plain_scan
 from flows.survey.scene import (
     FieldSource,
@@ -36,6 +37,7 @@ from models.weights.files import (
     load_weights,
     unsealed_note,
 )
+from models.weights.memory_files import ReaderFile, describe_reader
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
@@ -124,6 +126,8 @@ class SurveyRun(CaptureRun):
     grid: SceneGrid
     plan: CapturePlan
     scans: ScanChoice
+    prior: Prior | None = None  # the run whose belief is gone on from
+    reader: ReaderFile | None = None  # the reader of memories beside the weights, where there is one
     notes: tuple[str, ...] = ()
     refused: str | None = None  # why this machine would refuse the survey; it is planned nevertheless
 
@@ -157,11 +161,12 @@ class SurveyRun(CaptureRun):
         return AngularGrid(self.camera.ifov_rad, self.scene.shape, factor)
 
 
-def open_run(settings: Settings, *, planning: bool = False) -> SurveyRun:
+def open_run(settings: Settings, *, planning: bool = False, archive: Archive | None = None) -> SurveyRun:
     """Open everything that a survey needs; the archive last, so that bad input leaves no trace of itself.
 
-    With ``planning`` a scene that this machine cannot hold is no error: ``refused`` of the run says so. Raises
-    PipelineError: the first thing that cannot be used; see `pipeline.errors` for the kinds.
+    With ``planning`` a scene that this machine cannot hold is no error: ``refused`` of the run says so. Without an
+    ``archive`` that of the settings is opened. Raises PipelineError: the first thing that cannot be used; see
+    `pipeline.errors` for the kinds.
     """
     settings = for_rig(settings)
     path = weights_path(settings)
@@ -189,16 +194,20 @@ def open_run(settings: Settings, *, planning: bool = False) -> SurveyRun:
     if vgg is not None and not planning:
         vgg.saliency(load())  # refuses one that does not go with the weights
         vgg_notes = (f"VGG19 from {vgg.path.name}: {vgg.report()}",)
+    reader = describe_reader(path, described)
     simulated, planned = make_source(scene, settings), (*plan.coarse, *plan.full)
     source = field_source(scene, settings, simulated, planned)
     check_memory(settings, simulated, grid, plan)
     if settings.pose is not None:  # one from which there is ground to map
         view = GroundView(settings.pose, settings.camera.ifov_rad)
         ground_grid(view, scene.shape, epsg=settings.map.epsg, resolution_m=settings.map.resolution_m)
-    key = content_key(path)
+    key, archive = content_key(path), open_archive(settings.out) if archive is None else archive
+    name = settings.name or Path(scene.name).stem
+    prior, prior_notes = find_prior(archive, settings, name, grid, described.class_names)
+    settings = replace(settings, prior=NONE if prior is None else prior.run)  # what is meant when it is asked for again
     return SurveyRun(
         settings=settings,
-        archive=open_archive(settings.out),
+        archive=archive,
         source=source,
         simulated=simulated,
         scene=scene,
@@ -209,7 +218,9 @@ def open_run(settings: Settings, *, planning: bool = False) -> SurveyRun:
         grid=grid,
         plan=plan,
         scans=scans,
-        notes=(*notes, *sealing, *band_notes, *vgg_notes, *label_notes),
+        prior=prior,
+        reader=reader,
+        notes=(*notes, *prior_notes, *sealing, *band_notes, *vgg_notes, *label_notes),
         refused=refused,
     )
 

@@ -76,11 +76,13 @@ class DrawnMap:
 
     classes: NDArray[np.uint8]  # (y, x), 255 where nothing can be said
     confidence: NDArray[np.float32]  # (y, x), NaN there
+    log_probability: NDArray[np.float32] | None = None  # (y, x, class) of all classes, where that is asked for
 
     def of_scene(self, grid: SceneGrid) -> DrawnMap:
         """Give what of the map of a padded grid lies on the scene."""
         scene = np.s_[: grid.height, : grid.width]
-        return DrawnMap(self.classes[scene].copy(), self.confidence[scene].copy())
+        every = None if self.log_probability is None else self.log_probability[scene].copy()
+        return DrawnMap(self.classes[scene].copy(), self.confidence[scene].copy(), every)
 
 
 def glance(
@@ -191,17 +193,19 @@ def segment(
     seats: NDArray[np.integer],
     *,
     precision: Precision = "float32",
+    every_class: bool = False,
 ) -> DrawnMap:
     """Draw the class map from the coarse look and the fine patches, of the scene's own size.
 
     ``patches`` (seat, p, p, column) are normalised columns of the fine pass. A dead pixel (see `dead_pixels`) counts as
     the mean of its patch; a patch of which more than half is dead counts as not captured. ``seats`` (seat,) are their
     numbers on the grid, each once; without one the map is the glance brought up to the fine grid. ``precision`` is that
-    of convolutions and matrix products; norms, softmax and the decision are float32.
+    of convolutions and matrix products; norms, softmax and the decision are float32. With ``every_class`` the map holds
+    the log-probabilities of all classes too.
 
     Raises ShapeError for a seat given twice or outside the grid, or patches of another shape.
     """
-    return segment_batch(weights, [seen], [patches], [seats], precision=precision)[0]
+    return segment_batch(weights, [seen], [patches], [seats], precision=precision, every_class=every_class)[0]
 
 
 def segment_batch(
@@ -211,6 +215,7 @@ def segment_batch(
     seats: Sequence[NDArray[np.integer]],
     *,
     precision: Precision = "float32",
+    every_class: bool = False,
 ) -> list[DrawnMap]:
     """Draw the maps of scenes of any sizes and numbers of seats together, as ``segment`` one by one, but faster."""
     scenes = []
@@ -220,16 +225,22 @@ def segment_batch(
         scenes.append((look, *captured(own, numbers)))
     with torch.inference_mode(), _computing_in(precision):
         counts = [_patches_in(look) + len(numbers) for look, _, numbers in scenes]
-        return [drawn for part in packs(counts) for drawn in _draw_pack(weights, scenes[part], precision)]
+        return [drawn for part in packs(counts) for drawn in _draw_pack(weights, scenes[part], precision, every_class)]
 
 
 def _draw_pack(
-    weights: Weights, pack: Sequence[tuple[CoarseLook, NDArray[np.floating], NDArray[np.int64]]], precision: Precision
+    weights: Weights,
+    pack: Sequence[tuple[CoarseLook, NDArray[np.floating], NDArray[np.int64]]],
+    precision: Precision,
+    every_class: bool,
 ) -> Iterator[DrawnMap]:
     """Maps of scenes that are read together."""
     looks = [look for look, _, _ in pack]
     readings = readings_of(weights, looks, precision=precision)
-    padded = [draw_coarse(reading.logits.float(), look.grid) for reading, look in zip(readings, looks, strict=True)]
+    padded = [
+        draw_coarse(reading.logits.float(), look.grid, every_class=every_class)
+        for reading, look in zip(readings, looks, strict=True)
+    ]
     places = (
         (drawn, place)
         for drawn, (look, _, seats) in zip(padded, pack, strict=True)
@@ -239,9 +250,12 @@ def _draw_pack(
     p = weights.config.patch
     for logits in weights.segmenter.eval().read_fine_packed(readings, *parts, [origin_of(look) for look in looks]):
         confidence, classes = (part.numpy() for part in decide(logits.float(), dim=1))
-        for sure, values, (drawn, (y, x)) in zip(confidence, classes, places, strict=False):
+        every = logits.float().log_softmax(dim=1).permute(0, 2, 3, 1).numpy() if every_class else confidence
+        for sure, values, own, (drawn, (y, x)) in zip(confidence, classes, every, places, strict=False):
             drawn.classes[y : y + p, x : x + p] = values
             drawn.confidence[y : y + p, x : x + p] = sure
+            if drawn.log_probability is not None:
+                drawn.log_probability[y : y + p, x : x + p] = own
     for drawn, look in zip(padded, looks, strict=True):
         yield drawn.of_scene(look.grid)
 
@@ -326,10 +340,11 @@ def origin_of(look: CoarseLook) -> Tensor | None:
     return torch.tensor([look.origin]) if any(look.origin) else None
 
 
-def draw_coarse(logits: Tensor, grid: SceneGrid) -> DrawnMap:
+def draw_coarse(logits: Tensor, grid: SceneGrid, *, every_class: bool = False) -> DrawnMap:
     """Bring coarse logits up to the padded fine grid and decide, in strips of rows."""
     y, x = grid.padded_shape
-    drawn = DrawnMap(np.empty((y, x), np.uint8), np.empty((y, x), np.float32))
+    every = np.empty((y, x, logits.shape[1]), np.float32) if every_class else None
+    drawn = DrawnMap(np.empty((y, x), np.uint8), np.empty((y, x), np.float32), every)
     cell = grid.patch
     padded = torch.nn.functional.pad(logits, (0, 0, 1, 1), mode="replicate")
     padded = padded.contiguous(memory_format=torch.channels_last)
@@ -340,6 +355,8 @@ def draw_coarse(logits: Tensor, grid: SceneGrid) -> DrawnMap:
         confidence, classes = decide(strip, dim=0)
         rows = slice(top * grid.factor, (top + cell) * grid.factor)
         drawn.classes[rows], drawn.confidence[rows] = classes.numpy(), confidence.numpy()
+        if drawn.log_probability is not None:
+            drawn.log_probability[rows] = strip.log_softmax(dim=0).permute(1, 2, 0).numpy()
     return drawn
 
 

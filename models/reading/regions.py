@@ -96,9 +96,14 @@ class Region:
 
     def crop(self, image: NDArray[Scalar]) -> NDArray[Scalar]:
         """Keep of a (y, x, ...) image of the scene what belongs to the region."""
+        rows, columns = self.kept_here
+        return image[rows, columns]
+
+    @property
+    def kept_here(self) -> tuple[slice, slice]:
+        """What belongs to the region, in rows and columns of what is read."""
         top, left = self.kept.top - self.read.top, self.kept.left - self.read.left
-        y, x = self.kept.shape
-        return image[top : top + y, left : left + x]
+        return slice(top, top + self.kept.shape[0]), slice(left, left + self.kept.shape[1])
 
     def crop_coarse(self, image: NDArray[Scalar]) -> NDArray[Scalar]:
         """Keep of a (y, x, ...) image of the scene in coarse pixels what belongs to the region."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -286,12 +286,16 @@ def misfit(config: SegmenterConfig, claimed: Mapping[str, Any]) -> str:
     return ""
 
 
-def unusable(tensors: Mapping[str, Tensor]) -> str:
-    """Which tensor holds numbers that nothing can be computed with, in words; nothing where none does."""
+def unusable(tensors: Mapping[str, Tensor], spreads: Sequence[str] = (SPREAD,)) -> str:
+    """Which tensor holds numbers that nothing can be computed with, in words; nothing where none does.
+
+    Those called as ``spreads`` are divided by.
+    """
     for name, value in tensors.items():
         if value.is_floating_point() and not bool(torch.isfinite(value).all()):
             count = int((~torch.isfinite(value)).sum())
             return f"{count} of {value.numel()} numbers of tensor {name} are not finite"
-    if not bool((tensors[SPREAD] > 0).all()):
-        return f"tensor {SPREAD} holds a spread that is not above 0"
+    for name in spreads:
+        if not bool((tensors[name] > 0).all()):
+            return f"tensor {name} holds a spread that is not above 0"
     return ""

@@ -294,8 +294,7 @@ class Archive:
 
     def new_run(self, name: str) -> RunDraft:
         """Begin the folder of one run; nothing of it is seen under ``runs`` before :meth:`RunDraft.publish`."""
-        clean = re.sub(r"[^A-Za-z0-9_-]+", "-", name).strip("-")[:60] or "run"
-        stem = f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{clean}"
+        stem = f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{run_stem(name)}"
         run_id, number = stem, 1
         with refusals(self.root, "write to the archive"):
             while (draft := self._begin_run(run_id)) is None:  # another run of the same second takes the next number
@@ -371,3 +370,8 @@ class Archive:
         finally:
             if release is not None:
                 release()
+
+
+def run_stem(name: str) -> str:
+    """What the folder of a run is called by its survey's name, after its time."""
+    return re.sub(r"[^A-Za-z0-9_-]+", "-", name).strip("-")[:60] or "run"

@@ -2,29 +2,34 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.survey.field_work import FieldWork, look_at, region_params, seat_columns
+from flows.survey.field_work import Drawing, FieldWork, MemoryPart, look_at, region_params, seat_columns
 from flows.survey.run import SurveyRun
 from flows.survey.stage import Product, Wanted, stage
 from models.reading.inference import CoarseLook, Glance, read_glance
 from models.reading.regions import whole_field
+from models.reading.remembered import Comparison
 from pipeline.ground.map_grid import GroundGrid, classes_at, ground_grid, image_at, map_blocks
 from pipeline.ground.view import GroundView
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS
 from storage.archive.keys import StageRef, array_digest
 from storage.archive.manifests import read_table, write_table
+from storage.arrays.beliefs import create_belief, write_changes
 from storage.arrays.class_maps import ClassNames, clear_classes, create_class_map, load_class_map
 from storage.arrays.ground_maps import BLOCK, GroundMapWriter
 from storage.arrays.layout import SHARD_ROWS, open_group, read_array, read_bands
 from storage.arrays.mosaics import open_patches
 from storage.arrays.quicklooks import choose_bands, develop, stretch
 
-CLASS_MAP = Product("segment", version=5, files=("class_map.zarr",), by_weights=True)
+CLASS_MAP = Product("segment", version=6, files=("class_map.zarr", "belief.zarr"), by_weights=True)
 STRANGE = "strange.json"  # beside a map, where values were no readings
+MEMORY = "memory.json"  # beside a map that goes on from an earlier one: what became of the memory
 
 
 @stage("draw_map", "class map", CLASS_MAP, of=("rectify", "cut_patches"), unit="operations of the map", size="pixels")
@@ -32,21 +37,78 @@ def draw_map(run: SurveyRun, mosaic: StageRef, patches: StageRef) -> Wanted:
     """Draw the class map from coarse and fine patches, region by region; no class where the scene has no value."""
 
     def build(path: Path) -> None:
-        out, legend = path / "class_map.zarr", ClassNames(run.weights.class_names, run.weights.class_colours)
-        create_class_map(out, (run.grid.height, run.grid.width), legend, grid=run.angular_grid())
-        strange = FieldWork.of(run).draw(mosaic.path / "mosaic.zarr", patches.path / "patches.zarr", out, run.report)
-        if any(strange):
-            write_table(path / STRANGE, dict(zip(("coarse_px", "fine_px"), strange, strict=True)))
+        work, out = FieldWork.of(run), path / "class_map.zarr"
+        drawing = _drawing(run, work, mosaic, patches, path)
+        drawn = work.draw(drawing, run.report)
+        if drawn.comparison is not None:
+            put_aside = drawn.comparison.is_of_another_field
+            write_table(path / MEMORY, _memory_told(run, drawn.comparison, put_aside=put_aside))
+            if put_aside:
+                drawn = work.draw(replace(drawing, memory=None), run.report)
+        if drawn.changed is not None:
+            write_changes(path / "belief.zarr", drawn.changed)
+        if any(drawn.strange):
+            write_table(path / STRANGE, dict(zip(("coarse_px", "fine_px"), drawn.strange, strict=True)))
         if run.scene.missing is not None:
             clear_classes(out, run.scene.missing)
 
+    prior = run.prior
     params = {
         "weights": run.weights_key,
         "grid": asdict(run.grid),
         **region_params(run.grid),
         **({} if run.scene.missing is None else {"missing": array_digest(run.scene.missing)}),
     }
-    return Wanted(build, params, [mosaic, patches])
+    if prior is not None:
+        reader = None if run.reader is None else run.reader.key
+        params |= {"days": prior.days, "classes": list(prior.classes), "reader": reader, "light": _light(run)}
+    return Wanted(build, params, [mosaic, patches, *(() if prior is None else (prior.belief, prior.mosaic))])
+
+
+def _drawing(run: SurveyRun, work: FieldWork, mosaic: StageRef, patches: StageRef, path: Path) -> Drawing:
+    """What workers need to draw the map, into stores that are begun here."""
+    legend, shape = ClassNames(run.weights.class_names, run.weights.class_colours), (run.grid.height, run.grid.width)
+    create_class_map(path / "class_map.zarr", shape, legend, grid=run.angular_grid())
+    create_belief(path / "belief.zarr", shape, legend, grid=run.angular_grid())
+    prior = run.prior
+    memory = None
+    if prior is not None:
+        belief, coarse = (prior.belief.path / "belief.zarr").resolve(), (prior.mosaic.path / "mosaic.zarr").resolve()
+        memory = MemoryPart(belief, coarse, prior.days, prior.classes)
+    seen = (mosaic.path / "mosaic.zarr").resolve(), (patches.path / "patches.zarr").resolve()
+    made = (path / "class_map.zarr").resolve(), (path / "belief.zarr").resolve()
+    light, step = _light(run)
+    return Drawing(work.weights, *seen, *made, light, step, memory)
+
+
+def _light(run: SurveyRun) -> tuple[float, int]:
+    """Exposure of a line that is read in detail as a share of the reference, and pixels to the next."""
+    settings = run.settings
+    exposure_ms = settings.scan_exposure_ms if run.plan.plain else None
+    return (exposure_ms or run.camera.exposure_ms) / DEFAULT_EXPOSURE_MS, settings.scan_step or 1
+
+
+def _memory_told(run: SurveyRun, comparison: Comparison, *, put_aside: bool) -> dict[str, Any]:
+    """What became of a memory: agreement with today's look, and pixels that changed from class to class."""
+    assert run.prior is not None
+    names, changed = run.weights.class_names, comparison.changed
+    pairs = [(int(changed[old, new]), names[old], names[new]) for old, new in np.argwhere(changed) if old != new]
+    return {
+        "run": run.prior.run,
+        "days": run.prior.days,
+        "reader": "none" if run.reader is None else run.reader.key,
+        "agreement": None if np.isnan(comparison.agreement) else comparison.agreement,
+        "put_aside": put_aside,
+        "compared_px": int(changed.sum()),
+        "changed_px": 0 if put_aside else sum(count for count, _, _ in pairs),
+        "changes": [] if put_aside else [list(pair) for pair in sorted(pairs, key=lambda pair: -pair[0])],
+    }
+
+
+def memory_told(class_map: StageRef) -> dict[str, Any] | None:
+    """What became of the memory that a map goes on from; None of a field's first look."""
+    told = class_map.path / MEMORY
+    return dict(read_table(told)) if told.is_file() else None
 
 
 def strange_pixels(class_map: StageRef) -> dict[str, int]:

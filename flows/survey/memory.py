@@ -1,0 +1,138 @@
+"""The memory of a field that a survey goes on from: which earlier run, and how many days ago that was."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
+from pipeline.errors import IncompleteStoreError, SettingsError
+from pipeline.geometry.grid import SceneGrid
+from pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
+from storage.archive.archive import Archive, run_stem
+from storage.archive.keys import StageRef, published_runs
+from storage.archive.records import Run, read_run
+from storage.arrays.beliefs import BeliefStore
+
+NONE, LATEST, AUTO = "none", "latest", "auto"
+LOOKED_THROUGH = 60  # newest runs of a field among which the visit before is looked for
+BELIEF = "belief"  # a product of runs
+
+
+@dataclass(frozen=True)
+class Prior:
+    """The run whose belief is gone on from."""
+
+    run: str
+    belief: StageRef  # the store that holds belief.zarr
+    mosaic: StageRef  # the coarse look of that run
+    days: float  # between that look and this one
+    classes: tuple[int, ...]  # for each class of the weights its number in the belief; -1 where that lacks it
+
+
+def find_prior(
+    archive: Archive, settings: Settings, name: str, grid: SceneGrid, class_names: tuple[str, ...]
+) -> tuple[Prior | None, tuple[str, ...]]:
+    """The run that a survey of ``name`` goes on from, and what to say of it; None where there is none.
+
+    Of the newest runs of the field it is the one looked at last before this visit: one that was taken later, and
+    published earlier, is no memory of it. Raises SettingsError: a run that is named cannot be gone on from.
+    """
+    if settings.prior in (NONE, AUTO):
+        return None, ()
+    if settings.prior != LATEST:
+        folder = archive.root / "runs" / Path(settings.prior).name
+        why = "there is no such run in the archive"
+        if folder.is_dir():
+            found = _usable(archive, read_run(folder, {}), settings, grid, class_names)
+            if isinstance(found, Prior):
+                return found, ()
+            why = found
+        raise SettingsError(f"--prior {settings.prior}: {why}; give another run, latest or none")
+    notes: list[str] = []
+    for run in _before(archive, settings, name):
+        found = _usable(archive, run, settings, grid, class_names)
+        if isinstance(found, Prior):
+            return found, (*notes, f"goes on from what {run.folder.name} left, {found.days:.3g} days earlier")
+        notes.append(f"the memory of {run.folder.name} cannot be used: {found}")
+    return None, (*notes, f"nothing is remembered of {name}: this look is its first")
+
+
+def _before(archive: Archive, settings: Settings, name: str) -> Iterator[Run]:
+    """Newest runs of a field with a belief, those first that were looked at last before this visit."""
+    found: list[tuple[float, int, Run]] = []
+    part = run_stem(name)
+    for number, folder in enumerate(reversed(published_runs(archive.root))):
+        if part not in folder.name:  # no receipt has to be read for that
+            continue
+        run = read_run(folder, {})
+        if run.receipt.get("survey") == name and BELIEF in run.products:
+            days = _days_since(run, settings)
+            if days >= 0:
+                found.append((days, number, run))
+            if len(found) >= LOOKED_THROUGH:
+                break
+    yield from (run for _, _, run in sorted(found, key=lambda one: one[:2]))
+
+
+def _usable(
+    archive: Archive, run: Run, settings: Settings, grid: SceneGrid, class_names: tuple[str, ...]
+) -> Prior | str:
+    """The run as a prior, or why it cannot be one."""
+    if run.problem is not None:
+        return run.problem
+    places = [run.products.get(name, "").split("/") for name in (BELIEF, "mosaic")]
+    if any(len(parts) < 3 for parts in places):
+        return "it left no belief, as runs of earlier versions"
+    try:
+        stores = [archive.find(parts[1], parts[2]) for parts in places]
+        if stores[0] is None or stores[1] is None:
+            return "what it left was cleared; reprocess makes it again"
+        store = BeliefStore(stores[0].path / "belief.zarr")
+        names = store.legend.names
+    except IncompleteStoreError as error:
+        return f"{error}"
+    if store.shape != (grid.height, grid.width):
+        return f"it is of {store.shape[1]} x {store.shape[0]} px, this field has {grid.width} x {grid.height}"
+    camera = run.settings.get("camera")
+    same = not isinstance(camera, Mapping) or all(
+        camera.get(part) == getattr(settings.camera, part) for part in ("pitch_um", "focal_length_mm")
+    )
+    if not same:
+        return "its camera had other pixels"
+    classes = tuple(names.index(one) if one in names else -1 for one in class_names)
+    if all(number < 0 for number in classes):
+        return f"it knows none of the classes of these weights, but {', '.join(names)}"
+    return Prior(run.folder.name, stores[0], stores[1], max(_days_since(run, settings), 0.0), classes)
+
+
+def _days_since(run: Run, settings: Settings) -> float:
+    """Days from a run's look to the one of these settings, below 0 where that came later.
+
+    By the moments that both visits are called by, else by day and hour of a farm, else by the clock, in whole days.
+    """
+    then, now = (_called_moment(visit) for visit in (run.settings.get("visit"), settings.visit))
+    if then is not None and now is not None:
+        return (now - then).total_seconds() / 86400
+    farm = settings.moment
+    if farm is not None and run.settings.get("scene") in BUILT_IN_SCENES:
+        before = [run.settings.get("day"), run.settings.get("hour")]
+        day, hour = (
+            usual if given is None else float(given)
+            for given, usual in zip(before, (USUAL_DAY, USUAL_HOUR), strict=True)
+        )
+        return farm[0] - day + (farm[1] - hour) / 24
+    created = _called_moment(run.created)
+    return 0.0 if created is None else float((datetime.now(UTC).date() - created.date()).days)
+
+
+def _called_moment(text: Any) -> datetime | None:
+    """A moment in ISO 8601 that a visit is called by; None where it is called otherwise."""
+    try:
+        found = datetime.fromisoformat(text) if isinstance(text, str) else None
+    except ValueError:
+        return None
+    return None if found is None else found.replace(tzinfo=found.tzinfo or UTC)

@@ -1,0 +1,251 @@
+"""What is known of a field after a look: the memory of it brought to today, pixel by pixel.
+
+Where weights have a reader of memories, it weighs what is remembered against what was seen; without one the surer of
+both stands. Where today's look did not go, the memory stays and fades with its age.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import ShapeError
+from pipeline.geometry.grid import UNLABELLED
+from pipeline.lazy import deferred
+
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
+    from models.network.memory_reader import MemoryReader
+else:
+    torch = deferred("torch")
+
+FAINTEST = -6.35  # of logarithms of probabilities that are kept: one in 572
+FADES_DAYS = 120.0  # in which a memory that nobody looks after is worth e times less, without a reader
+SURE = 0.97  # of today's look, without a reader, to speak against a memory
+CERTAIN = 0.8  # of memory and map alike, so that a pixel of another class counts as changed
+ROWS, HALO = 128, 16  # rows read at a time, and beside them: the reader sees 12 px far, and coarse pixels stay whole
+LEAST_AGREEMENT, LEAST_KAPPA = 0.5, 0.35  # of a memory that is of this field; less of both, and it is put aside
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Belief:
+    """What is known of a field, or of a part of it, after a look."""
+
+    log_probability: Floats  # (y, x, class)
+    age_days: Floats  # (y, x) since a look went there
+
+    def classes(self) -> tuple[NDArray[np.uint8], Floats]:
+        """The likeliest class of each pixel and its probability; 255 and NaN where nothing is known."""
+        known = np.isfinite(self.log_probability[..., 0])
+        found = np.nan_to_num(self.log_probability, nan=-np.inf).argmax(axis=-1)
+        sure = np.exp(np.take_along_axis(self.log_probability, found[..., None], axis=-1)[..., 0])
+        classes = np.where(known, found, UNLABELLED).astype(np.uint8)
+        return classes, np.where(known, sure, np.nan).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Looked:
+    """Today's look, as far as a memory has to know it."""
+
+    log_probability: Floats  # (y, x, class); NaN where nothing can be said
+    seen: NDArray[np.bool_]  # (y, x) where it went in detail
+    coarse: Floats  # (y / s, x / s, column) normalised; NaN where nothing was seen
+    light: float  # exposure of a line as a share of the reference
+    step: int  # pixels from line to line
+
+
+@dataclass(frozen=True)
+class Remembered:
+    """A memory as it was left, and how many days ago."""
+
+    belief: Belief
+    coarse: Floats | None  # as `Looked`'s, of the last look; None where it cannot be compared
+    days: float
+
+
+def first_belief(looked: Looked) -> Belief:
+    """What is known of a field that nobody looked at before: what was seen today, be it coarsely."""
+    kept = np.maximum(looked.log_probability, np.float32(FAINTEST))  # NaN stays
+    return Belief(kept, _ages(kept, np.zeros(looked.seen.shape, np.float32)))
+
+
+def recall(memory: Remembered, looked: Looked, reader: MemoryReader | None) -> Belief:
+    """Bring a memory to today by what was seen.
+
+    A pixel of which the memory knows nothing takes today's look, and one that nothing can be said of today keeps its
+    memory. Raises ShapeError: both are not of one field, or the reader is for other classes or columns.
+    """
+    before, today = memory.belief.log_probability, looked.log_probability
+    if before.shape != today.shape:
+        raise ShapeError(
+            f"the memory is {before.shape} (y, x, class), today's look {today.shape}; both are of one field"
+        )
+    known, shown = _told(before), _told(today)
+    seen = looked.seen & shown
+    age = np.nan_to_num(memory.belief.age_days, nan=0.0) + np.float32(memory.days)
+    flat = np.float32(-math.log(before.shape[-1]))
+    old = np.where(known[..., None], before, flat)
+    if reader is None:
+        after = _the_surer(old, np.where(seen[..., None], today, flat), seen, age)
+    else:
+        after = np.concatenate(list(_read(reader, memory, looked, old, seen, age)))
+    after = np.where(known[..., None], after, today)  # today's look alone; NaN where that has nothing either
+    kept = np.maximum(after, np.float32(FAINTEST)).astype(np.float32)
+    return Belief(kept, _ages(kept, np.where(seen | ~known, 0, age)))
+
+
+def _ages(log_probability: Floats, age_days: Floats) -> Floats:
+    """Ages, NaN where nothing is known."""
+    ages: Floats = np.where(np.isfinite(log_probability[..., 0]), age_days, np.nan).astype(np.float32)
+    return ages
+
+
+def in_classes(log_probability: Floats, numbers: Sequence[int]) -> Floats:
+    """Bring (..., class) log-probabilities to other classes: for each its number here, or -1 for one that is new.
+
+    A new class is as likely as one of those that were, of which the memory knew nothing.
+    """
+    new = [number < 0 for number in numbers]
+    taken = np.where(new, np.float32(-math.log(len(numbers))), log_probability[..., list(numbers)])
+    taken -= np.log(np.exp(taken).sum(axis=-1, keepdims=True))
+    found: Floats = np.where(np.isfinite(log_probability[..., :1]), taken, np.nan).astype(np.float32)
+    return found
+
+
+def faded(log_probability: Floats, age_days: Floats) -> Floats:
+    """What a memory is worth after some days without a look: mixed with knowing nothing."""
+    left = np.exp(-age_days.astype(np.float64) / FADES_DAYS).astype(np.float32)[..., None]
+    mixed = left * np.exp(log_probability) + (1 - left) / log_probability.shape[-1]
+    worth: Floats = np.log(np.maximum(mixed, np.float32(math.exp(FAINTEST)))).astype(np.float32)
+    return worth
+
+
+def _the_surer(before: Floats, today: Floats, seen: NDArray[np.bool_], age: Floats) -> Floats:
+    """The memory, unless today's look is sure of another class; where both agree they are surer together."""
+    old = faded(before, age)
+    against = seen & (today.argmax(axis=-1) != old.argmax(axis=-1))
+    together = old + np.where(seen[..., None], today, 0)
+    together -= np.log(np.exp(together).sum(axis=-1, keepdims=True))
+    surer = (today.max(axis=-1) > math.log(SURE)) | (today.max(axis=-1) > old.max(axis=-1) + math.log(2))
+    found: Floats = np.where((against & surer)[..., None], today, np.where(against[..., None], old, together))
+    return found
+
+
+def _read(
+    reader: MemoryReader, memory: Remembered, looked: Looked, before: Floats, seen: NDArray[np.bool_], age: Floats
+) -> Iterator[Floats]:
+    """What the reader says, some rows at a time with rows around them that it sees too."""
+    s, (y, x), classes = reader.sizes.factor, seen.shape, before.shape[-1]
+    sizes = (reader.sizes.classes, reader.sizes.columns)
+    if sizes != (classes, looked.coarse.shape[-1]):
+        raise ShapeError(
+            f"the reader of memories is for {sizes} classes and columns, got {(classes, looked.coarse.shape[-1])}"
+        )
+    past = looked.coarse if memory.coarse is None else memory.coarse
+    both = _told(past) & _told(looked.coarse)
+    if memory.coarse is None:
+        both[...] = False
+    today = np.where(seen[..., None], looked.log_probability, 0)
+    wide = -(-x // s) * s
+    taken = torch.tensor([looked.light]), torch.tensor([float(looked.step)])
+    for top in range(0, y, ROWS):
+        first, last = max(top - HALO, 0), min(top + ROWS + HALO, -(-y // s) * s)
+        rows, cells = slice(first, last), slice(first // s, last // s)
+
+        def fine(values: NDArray[np.generic], rows: slice = rows) -> Tensor:
+            part = values[rows]
+            fill = [(0, rows.stop - rows.start - len(part)), (0, wide - x), *[(0, 0)] * (part.ndim - 2)]
+            return _image(np.pad(part, fill, mode="edge"))
+
+        def coarse(values: NDArray[np.generic], cells: slice = cells) -> Tensor:
+            return _image(np.nan_to_num(values[cells, : wide // s], posinf=0, neginf=0))
+
+        with torch.inference_mode():
+            found = reader(
+                fine(before),
+                fine(today),
+                fine(seen),
+                fine(age),
+                *taken,
+                coarse(past),
+                coarse(looked.coarse),
+                coarse(both),
+            )
+        own = found[0, :, top - first : min(top + ROWS, y) - first, :x]
+        yield np.ascontiguousarray(own.permute(1, 2, 0).numpy(), np.float32)
+
+
+def _told(values: Floats) -> NDArray[np.bool_]:
+    """Pixels of (y, x, channel) of which every channel says something."""
+    return np.asarray(np.isfinite(values).all(axis=-1), np.bool_)
+
+
+def _image(values: NDArray[np.generic]) -> Tensor:
+    """(y, x) or (y, x, channel) as one image of a batch, (1, channel, y, x)."""
+    deep = values[..., None] if values.ndim == 2 else values
+    return torch.from_numpy(np.ascontiguousarray(deep.transpose(2, 0, 1)[None], np.float32))
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """How memory, look and map compare, added up over regions of a field."""
+
+    looked: NDArray[np.int64]  # (class before, class of today's look alone) pixels that both know
+    changed: NDArray[np.int64]  # (class before, class of the map) pixels that both are sure of
+
+    def __add__(self, other: Comparison) -> Comparison:
+        return Comparison(self.looked + other.looked, self.changed + other.changed)
+
+    @property
+    def agreement(self) -> float:
+        """Share of the pixels that the look shows as they are remembered; NaN where there are none."""
+        total = self.looked.sum()
+        return float(np.trace(self.looked) / total) if total else math.nan
+
+    @property
+    def is_of_another_field(self) -> bool:
+        """Whether memory and look have hardly more in common than any two fields."""
+        total = self.looked.sum()
+        if not total:
+            return False
+        chance = float(self.looked.sum(axis=0) / total @ (self.looked.sum(axis=1) / total))
+        kappa = 1.0 if chance >= 1 else (self.agreement - chance) / (1 - chance)
+        return self.agreement < LEAST_AGREEMENT and kappa < LEAST_KAPPA
+
+
+def compare(memory: Remembered, looked: Looked, after: Belief, part: tuple[slice, slice]) -> Comparison:
+    """Compare what was remembered of some rows and columns with today's look and with what is believed now."""
+    classes = after.log_probability.shape[-1]
+    before, today, now = (
+        values[part] for values in (memory.belief.log_probability, looked.log_probability, after.log_probability)
+    )
+    known = _told(before) & _told(today) & looked.seen[part]
+    old, new = (np.nan_to_num(values, nan=-np.inf).argmax(axis=-1) for values in (before, now))
+    shown = np.nan_to_num(today, nan=-np.inf).argmax(axis=-1)
+    least = math.log(CERTAIN)
+    sure = known & (before.max(axis=-1) > least) & (now.max(axis=-1) > least)
+    return Comparison(*(_counted(old[where], other[where], classes) for where, other in ((known, shown), (sure, new))))
+
+
+def _counted(rows: NDArray[np.intp], columns: NDArray[np.intp], classes: int) -> NDArray[np.int64]:
+    return np.bincount(rows * classes + columns, minlength=classes**2).reshape(classes, classes).astype(np.int64)
+
+
+def changed_shares(memory: Remembered, after: Belief, patch: int) -> Floats:
+    """Share of each seat's pixels that memory and map are sure of and give another class, (seat_y, seat_x)."""
+    before, now = memory.belief.log_probability, after.log_probability
+    least = math.log(CERTAIN)
+    sure = (before.max(axis=-1) > least) & (now.max(axis=-1) > least)  # NaN is not
+    other = sure & (np.nan_to_num(before, nan=-9).argmax(axis=-1) != np.nan_to_num(now, nan=-9).argmax(axis=-1))
+    y, x = (-(-size // patch) * patch for size in other.shape)
+    padded = np.pad(other, [(0, y - other.shape[0]), (0, x - other.shape[1])])
+    shares: Floats = padded.reshape(y // patch, patch, x // patch, patch).mean(axis=(1, 3), dtype=np.float32)
+    return shares

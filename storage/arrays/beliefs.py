@@ -1,0 +1,110 @@
+"""What is believed of a field: log-probabilities of its classes and how long ago each pixel was looked at.
+
+Both are packed by CF's rules (scale_factor, add_offset), so that any reader of netCDF or Zarr gets numbers: a fortieth
+of a nat in a byte, an eighth of a day in two.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from pipeline.errors import ShapeError
+from storage.arrays.class_maps import ClassNames, legend_of
+from storage.arrays.layout import (
+    AngularGrid,
+    create_array,
+    create_group,
+    damage_named,
+    grid_record,
+    image_spec,
+    open_group,
+    read_array,
+    whole_shards,
+    write_image,
+)
+
+STEP, FAINTEST, NOTHING = 0.025, -6.35, 255  # nats; 254 is certainty, 255 that nothing is known
+DAY_STEP, NEVER = 0.125, 65535
+Floats = NDArray[np.float32]
+
+
+def create_belief(path: Path, shape: tuple[int, int], legend: ClassNames, *, grid: AngularGrid | None = None) -> None:
+    """Begin a store for a field of (y, x) ``shape`` of which nothing is known yet."""
+    place = {} if grid is None else grid.attributes(shape)
+    names = {"class_names": list(legend.names), "class_colours": np.asarray(legend.colours).tolist()}
+    group = create_group(path, "belief", {**place, **grid_record(grid), **names})
+    about: dict[str, Any] = {
+        "long_name": "natural logarithm of the probability of each class",
+        "units": "1",
+        "scale_factor": STEP,
+        "add_offset": FAINTEST,
+        "_FillValue": NOTHING,
+        **place,
+    }
+    spec = image_spec(("y", "x", "class"), (*shape, len(legend.names)), "|u1")
+    create_array(group, "log_probability", spec, about)
+    about = {"long_name": "time since the pixel was looked at", "units": "days", "scale_factor": DAY_STEP, **place}
+    create_array(group, "age", image_spec(("y", "x"), shape, "<u2"), {**about, "_FillValue": NEVER})
+
+
+def write_belief_tile(path: Path, origin: tuple[int, int], log_probability: Floats, age_days: Floats) -> None:
+    """Store (y, x, class) log-probabilities and (y, x) ages of whole shards from row and column ``origin`` on.
+
+    NaN is what nothing is known of. Raises ShapeError: both differ in size; ChunkError: the tile splits a shard;
+    IncompleteStoreError: there is no store.
+    """
+    if log_probability.shape[:2] != age_days.shape:
+        raise ShapeError(f"probabilities {log_probability.shape} and ages {age_days.shape} are not of one tile")
+    with damage_named(str(path)):
+        group = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
+        arrays = [array for name in ("log_probability", "age") if isinstance(array := group[name], zarr.Array)]
+    place = tuple(slice(first, first + size) for first, size in zip(origin, age_days.shape, strict=True))
+    whole_shards("the belief", place, arrays[1].shape, arrays[1].shards or ())
+    packed = np.rint((np.clip(log_probability, FAINTEST, 0) - FAINTEST) / STEP)
+    arrays[0][place] = np.where(np.isnan(log_probability), NOTHING, np.minimum(packed, NOTHING - 1)).astype(np.uint8)
+    days = np.rint(np.clip(age_days, 0, DAY_STEP * (NEVER - 1)) / DAY_STEP)
+    arrays[1][place] = np.where(np.isnan(age_days), NEVER, days).astype(np.uint16)
+
+
+def write_changes(path: Path, changed: Floats) -> None:
+    """Add (seat_y, seat_x) shares of pixels that changed to a stored belief."""
+    with damage_named(str(path)):
+        group = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
+    about = {"long_name": "share of the patch's pixels with another class than remembered", "units": "1"}
+    write_image(group, "changed", ("seat_y", "seat_x"), changed, about)
+
+
+class BeliefStore:
+    """A stored belief, read in parts. Raises IncompleteStoreError where there is none, or it is damaged."""
+
+    def __init__(self, path: Path) -> None:
+        self._group = open_group(path)
+        array = self._group.get("age")
+        self.shape = (array.shape[0], array.shape[1]) if isinstance(array, zarr.Array) else (0, 0)
+
+    @property
+    def legend(self) -> ClassNames:
+        """Its classes, in the order of the probabilities."""
+        return legend_of(self._group)
+
+    def read(self, rows: slice = slice(None), columns: slice = slice(None)) -> tuple[Floats, Floats]:
+        """Log-probabilities (y, x, class) that sum to 1 once taken to powers, and ages in days (y, x).
+
+        NaN where nothing is known.
+        """
+        packed = read_array(self._group, "log_probability", np.s_[rows, columns])
+        values = (packed * np.float32(STEP) + np.float32(FAINTEST)).astype(np.float32)
+        values -= np.log(np.exp(values).sum(axis=-1, keepdims=True))
+        values[packed == NOTHING] = np.nan
+        age = read_array(self._group, "age", np.s_[rows, columns])
+        days: Floats = np.where(age == NEVER, np.nan, age * np.float32(DAY_STEP)).astype(np.float32)
+        return values, days
+
+    def changed(self) -> Floats | None:
+        """Shares of pixels that changed, by seat; None of a first look."""
+        return read_array(self._group, "changed") if "changed" in self._group else None

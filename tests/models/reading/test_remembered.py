@@ -1,0 +1,245 @@
+"""What is known of a field after a look: laws of the memory with a reader and without, and of what changed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+import models.reading.remembered as remembered
+from models.network.memory_reader import MemoryReader, MemorySizes
+from models.reading.remembered import (
+    FAINTEST,
+    Belief,
+    Looked,
+    Remembered,
+    changed_shares,
+    compare,
+    faded,
+    first_belief,
+    in_classes,
+    recall,
+)
+from pipeline.errors import ShapeError
+
+CLASSES, COLUMNS, FACTOR = 3, 4, 4
+SHAPE = (24, 20)
+seeds = st.integers(0, 2**16)
+
+
+def log_probabilities(rng: np.random.Generator, shape: tuple[int, int] = SHAPE) -> NDArray[np.float32]:
+    """Probabilities of classes drawn anew for each pixel, from sure to unsure."""
+    logits = rng.normal(0, 2, (*shape, CLASSES))
+    return np.asarray(logits - np.log(np.exp(logits).sum(axis=-1, keepdims=True)), np.float32)
+
+
+def a_look(rng: np.random.Generator, shape: tuple[int, int] = SHAPE) -> Looked:
+    """A look in detail at all of a field."""
+    coarse = rng.normal(size=(shape[0] // FACTOR, -(-shape[1] // FACTOR), COLUMNS)).astype(np.float32)
+    return Looked(log_probabilities(rng, shape), np.ones(shape, np.bool_), coarse, 0.05, 2)
+
+
+def a_memory(rng: np.random.Generator, shape: tuple[int, int] = SHAPE, days: float = 3.0) -> Remembered:
+    """What was seen some days ago."""
+    look = a_look(rng, shape)
+    return Remembered(first_belief(look), look.coarse, days)
+
+
+def a_reader(seed: int = 0) -> MemoryReader:
+    """A reader as chance made it, in which nothing is idle."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        reader = MemoryReader(MemorySizes(CLASSES, COLUMNS, FACTOR, width=8, coarse_width=4)).eval()
+        torch.nn.init.normal_(reader.leave.weight, std=0.3)
+    return reader
+
+
+READERS = pytest.mark.parametrize("reader", [None, a_reader()], ids=["without a reader", "with one"])
+
+
+@READERS
+@given(seed=seeds)
+def test_probabilities_stay_probabilities(reader: MemoryReader | None, seed: int) -> None:
+    """What is believed sums to 1 but for what the faintest classes are raised by, and is never fainter than is kept."""
+    rng = np.random.default_rng(seed)
+    after = recall(a_memory(rng), a_look(rng), reader)
+    assert after.log_probability.min() >= np.float32(FAINTEST)
+    total = np.exp(after.log_probability.astype(np.float64)).sum(axis=-1)
+    assert total.min() > 1 - 1e-5
+    assert total.max() < 1 + CLASSES * math.exp(FAINTEST) + 1e-5
+
+
+@READERS
+@given(seed=seeds)
+def test_ages_count_days_where_nobody_looked(reader: MemoryReader | None, seed: int) -> None:
+    """A pixel that was looked at is new, one that was not is older by the days between."""
+    rng = np.random.default_rng(seed)
+    memory, look = a_memory(rng), a_look(rng)
+    seen = rng.random(SHAPE) < 0.5
+    after = recall(
+        replace(memory, belief=replace(memory.belief, age_days=np.full(SHAPE, 2.0, np.float32))),
+        replace(look, seen=seen),
+        reader,
+    )
+    np.testing.assert_array_equal(after.age_days, np.where(seen, 0.0, 5.0).astype(np.float32))
+
+
+@READERS
+def test_one_that_knows_nothing_takes_the_other(reader: MemoryReader | None) -> None:
+    """Where the memory is empty today's look stands, where the look is the memory does; both empty: nothing."""
+    rng = np.random.default_rng(4)
+    memory, look = a_memory(rng), a_look(rng)
+    before, today = memory.belief.log_probability.copy(), look.log_probability.copy()
+    before[:8], today[4:12] = np.nan, np.nan
+    ages = np.where(np.isnan(before[..., 0]), np.nan, 0.0).astype(np.float32)
+    after = recall(replace(memory, belief=Belief(before, ages)), replace(look, log_probability=today), reader)
+    np.testing.assert_array_equal(after.log_probability[:4], np.maximum(today[:4], np.float32(FAINTEST)))
+    assert np.isnan(after.log_probability[4:8]).all()
+    assert np.isnan(after.age_days[4:8]).all()
+    assert np.isfinite(after.log_probability[8:]).all()
+    assert (after.classes()[0][4:8] == 255).all()
+
+
+@given(seed=seeds, days=st.floats(0, 400))
+def test_without_a_look_the_class_stays_and_fades(seed: int, days: float) -> None:
+    """A memory that nobody looks after keeps its likeliest class, and is never surer than it was."""
+    rng = np.random.default_rng(seed)
+    memory, look = a_memory(rng, days=days), a_look(rng)
+    after = recall(memory, replace(look, seen=np.zeros(SHAPE, np.bool_)), None)
+    before = memory.belief.log_probability
+    np.testing.assert_array_equal(after.classes()[0], before.argmax(axis=-1))
+    assert (after.log_probability.max(axis=-1) <= before.max(axis=-1) + 1e-5).all()
+
+
+def test_a_surer_look_speaks_against_a_memory_and_a_doubtful_one_does_not() -> None:
+    """Without a reader 0.99 for another class wins over 0.9, 0.6 does not; two that agree are surer together."""
+    before = np.log(np.array([[[0.9, 0.05, 0.05]] * 3], np.float32))
+    today = np.log(np.array([[[0.005, 0.99, 0.005], [0.2, 0.6, 0.2], [0.8, 0.1, 0.1]]], np.float32))
+    coarse = np.zeros((1, 1, COLUMNS), np.float32)
+    look = Looked(today, np.ones((1, 3), np.bool_), coarse, 1.0, 1)
+    after = recall(Remembered(first_belief(replace(look, log_probability=before)), None, 0.0), look, None)
+    assert after.classes()[0].tolist() == [[1, 0, 0]]
+    assert after.classes()[1][0, 2] == pytest.approx(0.9 * 0.8 / (0.9 * 0.8 + 2 * 0.05 * 0.1))
+
+
+def test_a_memory_is_worth_nothing_in_the_end() -> None:
+    """After many years all classes are as likely; at once nothing has faded."""
+    told = log_probabilities(np.random.default_rng(1))
+    np.testing.assert_allclose(faded(told, np.full(SHAPE, 1e5, np.float32)), -math.log(CLASSES), atol=1e-6)
+    np.testing.assert_allclose(faded(told, np.zeros(SHAPE, np.float32)), np.maximum(told, FAINTEST), atol=1e-5)
+
+
+@pytest.mark.parametrize("shape", [(40, 36), (33, 21), (7, 5)])
+def test_strips_of_rows_read_the_same_as_the_whole(monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int]) -> None:
+    """However few rows are read at a time, and whatever is left of a coarse pixel at the border."""
+    rng = np.random.default_rng(7)
+    memory, look, reader = a_memory(rng, shape), a_look(rng, shape), a_reader(3)
+    rows = -(-shape[0] // FACTOR)
+    coarse = [rng.normal(size=(rows, -(-shape[1] // FACTOR), COLUMNS)).astype(np.float32) for _ in range(2)]
+    memory, look = replace(memory, coarse=coarse[0]), replace(look, coarse=coarse[1])
+    whole = recall(memory, look, reader)
+    monkeypatch.setattr(remembered, "ROWS", 8)
+    np.testing.assert_allclose(recall(memory, look, reader).log_probability, whole.log_probability, atol=2e-5)
+
+
+def test_coarse_looks_that_cannot_be_compared_change_nothing() -> None:
+    """Without the coarse look of before, or where it has no value, today's may be anything."""
+    rng = np.random.default_rng(9)
+    memory, look, reader = a_memory(rng), a_look(rng), a_reader(5)
+    other = replace(look, coarse=rng.normal(size=look.coarse.shape).astype(np.float32))
+    blind = replace(memory, coarse=None)
+    nothing = replace(memory, coarse=np.full_like(look.coarse, np.nan))
+    found = [recall(one, seen, reader).log_probability for one in (blind, nothing) for seen in (look, other)]
+    for one in found[1:]:
+        np.testing.assert_array_equal(one, found[0])
+    assert not np.array_equal(recall(memory, look, reader).log_probability, found[0])
+
+
+def test_a_fresh_reader_weighs_both_witnesses_by_its_gates() -> None:
+    """Before it has learned anything: the sum of both logarithms, each 0.6 times, brought to a sum of 1."""
+    rng = np.random.default_rng(2)
+    memory, look = a_memory(rng, days=0.0), a_look(rng)
+    reader = MemoryReader(MemorySizes(CLASSES, COLUMNS, FACTOR)).eval()
+    expected = 0.6 * (memory.belief.log_probability + look.log_probability)
+    expected -= np.log(np.exp(expected).sum(axis=-1, keepdims=True))
+    found = recall(memory, look, reader).log_probability
+    np.testing.assert_allclose(found, np.maximum(expected, FAINTEST), atol=2e-5)
+
+
+def test_other_sizes_are_refused() -> None:
+    """A memory of another field, or a reader for other classes, in a sentence."""
+    rng = np.random.default_rng(3)
+    with pytest.raises(ShapeError, match="both are of one field"):
+        recall(a_memory(rng, (8, 8)), a_look(rng), None)
+    with pytest.raises(ShapeError, match="classes and columns"):
+        recall(a_memory(rng), a_look(rng), MemoryReader(MemorySizes(CLASSES + 1, COLUMNS, FACTOR)))
+
+
+@given(seed=seeds, order=st.permutations(range(CLASSES)))
+def test_classes_find_their_numbers(seed: int, order: list[int]) -> None:
+    """Brought to another order and back probabilities are the same, and NaN stays."""
+    told = log_probabilities(np.random.default_rng(seed))
+    told[0, 0] = np.nan
+    there = in_classes(told, order)
+    np.testing.assert_allclose(there[1:], told[1:][..., order], atol=1e-6)
+    np.testing.assert_allclose(in_classes(there, np.argsort(order).tolist()), told, atol=1e-5)
+    assert np.isnan(there[0, 0]).all()
+
+
+def test_a_class_that_the_memory_lacks_is_as_likely_as_any() -> None:
+    """Of three classes one is new: a third, and what the others were goes into the rest."""
+    told = np.log(np.array([[[0.75, 0.25]]], np.float32))
+    np.testing.assert_allclose(np.exp(in_classes(told, [0, -1, 1]))[0, 0], [0.5625, 0.25, 0.1875], atol=1e-6)
+
+
+def test_another_field_is_known_by_its_agreement() -> None:
+    """The same field agrees with itself; one with its classes drawn anew is another; nothing in common says nothing."""
+    rng = np.random.default_rng(11)
+    memory = a_memory(rng)
+    same = Looked(memory.belief.log_probability, np.ones(SHAPE, np.bool_), memory.coarse, 1.0, 1)  # type: ignore[arg-type]
+    whole = np.s_[:, :]
+    found = compare(memory, same, memory.belief, whole)
+    assert found.agreement == 1.0
+    assert not found.is_of_another_field
+    assert compare(memory, a_look(rng), memory.belief, whole).is_of_another_field
+    unseen = compare(memory, replace(same, seen=np.zeros(SHAPE, np.bool_)), memory.belief, whole)
+    assert math.isnan(unseen.agreement)
+    assert not unseen.is_of_another_field
+
+
+def test_a_field_of_one_class_is_no_other_field() -> None:
+    """Where everything is one class in memory and look alike chance would agree as well: they agree."""
+    told = np.log(np.tile(np.array([0.98, 0.01, 0.01], np.float32), (*SHAPE, 1)))
+    look = Looked(told, np.ones(SHAPE, np.bool_), np.zeros((6, 5, COLUMNS), np.float32), 1.0, 1)
+    memory = Remembered(first_belief(look), None, 1.0)
+    assert not compare(memory, look, memory.belief, np.s_[:, :]).is_of_another_field
+
+
+def test_parts_of_a_field_add_up() -> None:
+    """Comparisons of two halves are together that of the whole."""
+    rng = np.random.default_rng(12)
+    memory, look = a_memory(rng), a_look(rng)
+    after = recall(memory, look, None)
+    halves = [compare(memory, look, after, part) for part in (np.s_[:10, :], np.s_[10:, :])]
+    whole, added = compare(memory, look, after, np.s_[:, :]), halves[0] + halves[1]
+    np.testing.assert_array_equal(added.looked, whole.looked)
+    np.testing.assert_array_equal(added.changed, whole.changed)
+
+
+def test_a_seat_counts_its_pixels_of_another_class() -> None:
+    """Sure pixels alone: 8 of 64 of one seat changed, in the next as many that nobody is sure of."""
+    sure, other, doubt = (
+        np.log(np.array(one, np.float32)) for one in ([0.9, 0.05, 0.05], [0.05, 0.9, 0.05], [0.4, 0.5, 0.1])
+    )
+    before = np.tile(sure, (8, 16, 1))
+    now = before.copy()
+    now[0, :8], now[0, 8:] = other, doubt
+    memory = Remembered(Belief(before, np.zeros((8, 16), np.float32)), None, 1.0)
+    shares = changed_shares(memory, Belief(now, np.zeros((8, 16), np.float32)), 8)
+    np.testing.assert_array_equal(shares, [[0.125, 0.0]])

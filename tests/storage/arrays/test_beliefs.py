@@ -1,0 +1,114 @@
+"""What is believed of a field, stored in bytes and read back, by this project and by xarray."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.errors import ChunkError, IncompleteStoreError, ShapeError
+from storage.arrays.beliefs import DAY_STEP, NOTHING, STEP, BeliefStore, create_belief, write_belief_tile, write_changes
+from storage.arrays.class_maps import ClassNames
+
+LEGEND = ClassNames(("soil", "maize", "weed"), np.arange(9, dtype=np.uint8).reshape(3, 3))
+SHAPE = (70, 50)
+
+
+def drawn(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Probabilities of three classes and ages, some of them unknown."""
+    rng = np.random.default_rng(seed)
+    logits = rng.normal(0, 2, (*SHAPE, 3))
+    values = (logits - np.log(np.exp(logits).sum(axis=-1, keepdims=True))).astype(np.float32)
+    ages = rng.uniform(0, 400, SHAPE).astype(np.float32)
+    values[:3], ages[:3] = np.nan, np.nan
+    return values, ages
+
+
+def stored(path: Path, seed: int = 0) -> Path:
+    """A belief of two tiles."""
+    values, ages = drawn(seed)
+    create_belief(path, SHAPE, LEGEND)
+    for top, bottom in ((0, 64), (64, 70)):
+        write_belief_tile(path, (top, 0), values[top:bottom], ages[top:bottom])
+    return path
+
+
+@given(seed=st.integers(0, 2**16))
+def test_what_is_read_is_what_was_written_within_half_a_step(
+    tmp_path_factory: pytest.TempPathFactory, seed: int
+) -> None:
+    """The likeliest class stays where no other is within a step, ages to a sixteenth of a day, NaN where unknown."""
+    path = stored(tmp_path_factory.mktemp("belief") / "belief.zarr", seed)
+    values, ages = drawn(seed)
+    found, days = BeliefStore(path).read()
+    known = slice(3, None)
+    assert np.isnan(found[:3]).all()
+    assert np.isnan(days[:3]).all()
+    np.testing.assert_allclose(days[known], ages[known], atol=DAY_STEP / 2 + 1e-4)
+    np.testing.assert_allclose(np.exp(found[known]).sum(axis=-1), 1, atol=1e-5)
+    first, second = np.sort(values[known], axis=-1)[..., -1], np.sort(values[known], axis=-1)[..., -2]
+    clear = first - second > STEP
+    np.testing.assert_array_equal(found[known].argmax(axis=-1)[clear], values[known].argmax(axis=-1)[clear])
+    assert np.abs(found[known] - values[known])[values[known] > -6].max() < 1.5 * STEP
+
+
+def test_a_part_is_read_alone(tmp_path: Path) -> None:
+    """Some rows and columns are those of the whole."""
+    store = BeliefStore(stored(tmp_path / "belief.zarr"))
+    whole, part = store.read(), store.read(slice(10, 66), slice(7, 9))
+    for one, other in zip(whole, part, strict=True):
+        np.testing.assert_array_equal(one[10:66, 7:9], other)
+    assert store.shape == SHAPE
+    assert store.legend.names == LEGEND.names
+
+
+def test_xarray_unpacks_it(tmp_path: Path) -> None:
+    """Probabilities and days come as numbers by CF's packing, with a missing value where nothing is known."""
+    path = stored(tmp_path / "belief.zarr")
+    opened = xr.open_zarr(path, consolidated=False)
+    values, ages = drawn(0)
+    assert opened.log_probability.dims == ("y", "x", "class")
+    assert opened.age.attrs["units"] == "days"
+    assert np.isnan(opened.log_probability.values[:3]).all()
+    np.testing.assert_allclose(opened.log_probability.values[3:], np.maximum(values[3:], -6.35), atol=STEP / 2 + 1e-4)
+    np.testing.assert_allclose(opened.age.values[3:].astype(float), ages[3:], atol=DAY_STEP / 2 + 1e-4)
+
+
+def test_changes_are_there_once_written(tmp_path: Path) -> None:
+    """A first look has none."""
+    path = stored(tmp_path / "belief.zarr")
+    assert BeliefStore(path).changed() is None
+    write_changes(path, np.array([[0.0, 0.5]], np.float32))
+    found = BeliefStore(path).changed()
+    assert found is not None
+    assert found.tolist() == [[0.0, 0.5]]
+
+
+def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
+    """Tiles that split a shard or differ in size, and a store that is not there."""
+    path = stored(tmp_path / "belief.zarr")
+    values, ages = drawn(0)
+    with pytest.raises(ChunkError, match="split the belief's shards"):
+        write_belief_tile(path, (8, 0), values[:8], ages[:8])
+    with pytest.raises(ShapeError, match="not of one tile"):
+        write_belief_tile(path, (0, 0), values[:64], ages[:8])
+    with pytest.raises(IncompleteStoreError, match="no readable Zarr store"):
+        BeliefStore(tmp_path / "none.zarr")
+
+
+def test_certainty_is_not_mistaken_for_nothing(tmp_path: Path) -> None:
+    """A probability of 1 is stored below the byte that stands for nothing known."""
+    path = tmp_path / "belief.zarr"
+    create_belief(path, (4, 4), LEGEND)
+    sure = np.full((4, 4, 3), -50.0, np.float32)
+    sure[..., 1] = 0.0
+    write_belief_tile(path, (0, 0), sure, np.full((4, 4), 1e9, np.float32))
+    found, days = BeliefStore(path).read()
+    assert (found.argmax(axis=-1) == 1).all()
+    assert np.exp(found[..., 1]).min() > 0.99
+    assert np.isfinite(days).all()
+    assert NOTHING == 255
