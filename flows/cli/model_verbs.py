@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,7 +17,9 @@ from flows.evaluate.command import run_evaluate
 from flows.evaluate.frames import SHARES, USUAL, EvaluateRequest
 from flows.terminal.progress import print_json
 from flows.tradeoff.command import run_tradeoff
-from flows.training.train import TrainRequest, run_train, usual_crop
+from flows.training.remember import MemoryRequest, run_remember
+from flows.training.train import TrainRequest, asked_command, run_train, usual_crop
+from models.training.memory import MemoryTraining
 from models.training.train import TrainingSettings
 from pipeline.errors import SettingsError
 
@@ -65,6 +68,7 @@ def train(
     preset: Literal["two-scale", "paper", "dense", "upsampled", "coarser"] = "two-scale",
     positions: Literal["2d", "paper"] = "2d",
     init: Path | None = None,
+    remember: Path | None = None,
     dim: int = 128,
     layers: int = 4,
     heads: int = 4,
@@ -118,6 +122,11 @@ def train(
     init
         Weights to begin from: a vision transformer of timm or DeiT, a Segmenter checkpoint with its variant.yml beside
         it, or weights that this command made. What is taken is said, and kept in the weights.
+    remember
+        Weights to train a reader of memories for, and nothing else: it weighs what a field's earlier visits left
+        against a later look. Called WEIGHTS.memory.safetensors and put beside WEIGHTS.safetensors, surveys with --prior
+        use it. Of the other flags it takes --scenes, --steps, --minutes, --seed and --validation; it begins anew where
+        it was stopped. Takes 4 GB; looking at the lands before takes half an hour on top of --minutes.
     dim
         Width of the transformer, the numbers that a patch becomes; 192 and 384 are those of ViT-Tiny and ViT-Small.
     layers
@@ -147,6 +156,15 @@ def train(
         commas.
     """
 
+    if remember is not None:
+        how = MemoryTraining(minutes, steps, seed)
+        asked = MemoryRequest(dataset, remember, out, settings=how, command=asked_command())
+        given = {"lands": scenes, "judged": validation}
+        asked = replace(asked, **{name: count for name, count in given.items() if count is not None})
+        record = run_remember(asked, stderr)
+        if as_json:
+            print_json(record)
+        return 0
     size = crop if crop is not None else usual_crop(dataset, preset)
     choices = {
         "labels": labels,

@@ -24,8 +24,8 @@ from models.reading.inference import CoarseLook, Glance, look_coarsely, read_gla
 from models.reading.regions import HALO_CELLS, REGION_PX, Region, most_bytes, plan_regions, whole_field
 from models.reading.remembered import (
     Belief,
-    Comparison,
     Looked,
+    MemoryAgreement,
     Remembered,
     changed_shares,
     compare,
@@ -110,7 +110,7 @@ class Drawing:
     belief: Path
     light: float  # exposure of a line that is read in detail, as a share of the reference
     step: int  # pixels from such a line to the next
-    memory: MemoryPart | None = None  # what is remembered of the field
+    memory: FieldMemory | None = None  # what is remembered of the field
 
     def __call__(self, region: Region) -> Drawn:
         """Read what was seen of the region coarsely and finely, and store the part of the map that is kept."""
@@ -134,7 +134,7 @@ class Drawing:
             changed = changed_shares(remembered, after, region.grid.patch)
         origin = region.kept.top, region.kept.left
         write_class_tile(self.out, origin, region.crop(classes), region.crop(confidence))
-        write_belief_tile(self.belief, origin, region.crop(after.log_probability), region.crop(after.age_days))
+        write_belief_tile(self.belief, origin, *map(region.crop, (after.log_probability, after.age_days, after.light)))
         coarse = 0 if seen.strange is None else int(np.count_nonzero(region.crop_coarse(seen.strange)))
         return Drawn((coarse, int(region.crop_seats(strange).sum())), comparison, changed)
 
@@ -149,7 +149,7 @@ class Drawing:
 
 
 @dataclass(frozen=True)
-class MemoryPart:
+class FieldMemory:
     """Where the memory of a field lies, and how it is to be read."""
 
     belief: Path
@@ -159,11 +159,11 @@ class MemoryPart:
 
     def of(self, region: Region, weights: Weights) -> Remembered:
         """Read what is remembered of a region, in the classes of the weights."""
-        values, age = BeliefStore(self.belief).read(region.read.rows, region.read.columns)
+        values, age, light = BeliefStore(self.belief).read(region.read.rows, region.read.columns)
         if self.classes != tuple(range(values.shape[-1])):
             values = in_classes(values, self.classes)
         coarse = look_at(weights, self.mosaic, region).columns
-        return Remembered(Belief(values, age), coarse, self.days)
+        return Remembered(Belief(values, age, light), coarse, self.days)
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,7 @@ class Drawn:
     """What a worker says of a region that it drew."""
 
     strange: Strange
-    comparison: Comparison | None  # with what was remembered
+    comparison: MemoryAgreement | None  # with what was remembered
     changed: NDArray[np.float32] | None  # (seat_y, seat_x) of the region's scene
 
 
@@ -225,7 +225,7 @@ class DrawnField:
     """What was found while a map was drawn."""
 
     strange: Strange
-    comparison: Comparison | None  # with what was remembered; None of a field's first look
+    comparison: MemoryAgreement | None  # with what was remembered; None of a field's first look
     changed: NDArray[np.float32] | None  # (seat_y, seat_x) share of pixels with another class than remembered
 
 

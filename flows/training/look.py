@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from models.network.spectral import SpectralBasis, project
 from models.training.examples import Observation, noise_of, observe
+from models.training.looks import ColumnNoise
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
@@ -80,6 +81,18 @@ def observe_scene(
         (grid.height, grid.width),
         noise_of(scene, matrix, camera),
     )
+
+
+def observe_finely(
+    scene: RasterScene, camera: LineCamera, grid: SceneGrid, basis: SpectralBasis, seed: int
+) -> tuple[Columns, ColumnNoise]:
+    """Scan a farm by every line: columns on the basis, (y, x, column), and the noise that they have."""
+    rig, cost = Rig(camera), CostModel()
+    _, full, _ = cheapest_full(grid, camera, cost)
+    clock = sweep_starts(full, camera, cost)
+    source = SimulatedSource(scene, rig, seed, chosen_effects(scene, rig, full), clock=clock)
+    matrix, _ = basis.matrix(scene.wavelength_nm)
+    return _columns(source, full, grid, matrix), noise_of(scene, matrix, camera)
 
 
 def chosen_effects(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep]) -> Choice:

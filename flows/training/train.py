@@ -306,7 +306,7 @@ def print_start(begun: Mapping[str, Any], console: Console) -> None:
 def run_train(request: TrainRequest, console: Console) -> dict[str, Any]:
     """Train with a progress bar on ``console``; give the record kept in the weights."""
     _check_counts(request)
-    request = replace(request, command=_command())
+    request = replace(request, command=asked_command())
     last = ""
     with StageProgress(console) as progress:
 
@@ -355,7 +355,7 @@ def _check_counts(request: TrainRequest) -> None:
         )
 
 
-def _command() -> str:
+def asked_command() -> str:
     """The command without folders: a machine's paths do not belong in weights."""
     words = [Path(word).name if "/" in word else word for word in sys.argv[1:]]
     return shlex.join(["spectralzoom", *words])

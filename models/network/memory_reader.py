@@ -13,7 +13,10 @@ import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor, nn
 
 FAINT = 10.0  # logarithms of probabilities are read down to minus this
-GATE = 0.6  # of either witness, before anything is learned
+OTHERS = 5  # images that it reads beside probabilities: seen, age, light of the memory, light and step of the look
+GATES = 3  # how far the memory, and the look, are believed; how far both together replace the memory
+STARTS = (2.2, 0.0, 0.0)  # of these, before anything is learned
+LEAST_LIGHT = 1e-4  # of a memory, in reference exposures
 
 
 @dataclass(frozen=True)
@@ -32,8 +35,8 @@ class MemorySizes:
 
     def multiply_adds(self, pixels: int) -> int:
         """Multiply-adds of reading so many fine pixels."""
-        entered = 2 * self.classes + 4 + self.coarse_width
-        fine = 9 * self.width * (entered + self.width + self.classes + 2)
+        entered = 2 * self.classes + OTHERS + self.coarse_width
+        fine = 9 * self.width * (entered + self.width + self.classes + GATES)
         coarse = 9 * self.width * (2 * self.columns + 1 + self.coarse_width)
         return pixels * fine + pixels // self.factor**2 * coarse
 
@@ -47,12 +50,12 @@ class MemoryReader(nn.Module):
         width, classes = sizes.width, sizes.classes
         self.coarse_enter = nn.Conv2d(2 * sizes.columns + 1, width, 3, padding=1)
         self.coarse_leave = nn.Conv2d(width, sizes.coarse_width, 3, padding=1)
-        self.enter = nn.Conv2d(2 * classes + 4 + sizes.coarse_width, width, 3, padding=1)
+        self.enter = nn.Conv2d(2 * classes + OTHERS + sizes.coarse_width, width, 3, padding=1)
         self.middle = nn.Conv2d(width, width, 3, padding=2, dilation=2)
-        self.leave = nn.Conv2d(width, classes + 2, 3, padding=1)
+        self.leave = nn.Conv2d(width, classes + GATES, 3, padding=1)
         for start in self.leave.parameters():
             nn.init.zeros_(start)
-        self.gates = nn.Parameter(torch.full((2,), GATE).logit())
+        self.gates = nn.Parameter(torch.tensor(STARTS))
 
     def forward(
         self,
@@ -60,6 +63,7 @@ class MemoryReader(nn.Module):
         looked: Tensor,
         seen: Tensor,
         age: Tensor,
+        rests_on: Tensor,
         light: Tensor,
         step: Tensor,
         coarse_before: Tensor,
@@ -69,8 +73,9 @@ class MemoryReader(nn.Module):
         """Give log-probabilities (B, class, y, x).
 
         ``remembered`` and ``looked`` are such; ``seen`` (B, 1, y, x) is 1 where there was a look today, ``age`` (B, 1,
-        y, x) days since the memory's last look there. ``light`` (B,) is today's exposure as a share of the reference,
-        ``step`` (B,) pixels between its lines. The coarse looks are normalised columns (B, J, y / s, x / s),
+        y, x) days since the memory's last look there, ``rests_on`` (B, 1, y, x) the light that the memory was made by,
+        in reference exposures a pixel. ``light`` (B,) is today's exposure as a share of the reference, ``step`` (B,)
+        pixels between its lines. The coarse looks are normalised columns (B, J, y / s, x / s),
         ``comparable`` (B, 1, y / s, x / s) is 1 where they may be compared.
         """
         size = remembered.shape[-2:]
@@ -81,9 +86,10 @@ class MemoryReader(nn.Module):
         today = looked * seen
         taken = torch.stack([light.log(), step.log2()], dim=1)[:, :, None, None].expand(-1, 2, *size)
         scaled = [(part / 4).clamp(-FAINT / 4, 0) for part in (remembered, today)]
-        features = F.gelu(self.enter(torch.cat([*scaled, seen, torch.log1p(age) / 2, taken, below], dim=1)))
+        known = rests_on.clamp(min=LEAST_LIGHT).log() / 2
+        features = F.gelu(self.enter(torch.cat([*scaled, seen, torch.log1p(age) / 2, known, taken, below], dim=1)))
         features = features + F.gelu(self.middle(features))
-        added, gates = self.leave(features).split([self.sizes.classes, 2], dim=1)
-        trust = torch.sigmoid(gates + self.gates[None, :, None, None])
-        logits = trust[:, :1] * remembered + trust[:, 1:] * today + added
-        return F.log_softmax(logits, dim=1)
+        added, gates = self.leave(features).split([self.sizes.classes, GATES], dim=1)
+        old, new, replaced = (gates + self.gates[None, :, None, None]).split(1, dim=1)
+        both = F.log_softmax(torch.sigmoid(old) * remembered + torch.sigmoid(new) * today + added, dim=1)
+        return torch.logaddexp(F.logsigmoid(-replaced) + remembered, F.logsigmoid(replaced) + both)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,6 +27,7 @@ else:
     torch = deferred("torch")
 
 FAINTEST = -6.35  # of logarithms of probabilities that are kept: one in 572
+LIGHT_FADES_DAYS = 30.0  # in which the light that a memory rests on is worth e times less
 FADES_DAYS = 120.0  # in which a memory that nobody looks after is worth e times less, without a reader
 SURE = 0.97  # of today's look, without a reader, to speak against a memory
 CERTAIN = 0.8  # of memory and map alike, so that a pixel of another class counts as changed
@@ -41,6 +42,7 @@ class Belief:
 
     log_probability: Floats  # (y, x, class)
     age_days: Floats  # (y, x) since a look went there
+    light: Floats  # (y, x) that it rests on: reference exposures a pixel, of all looks; 0 where there was none
 
     def classes(self) -> tuple[NDArray[np.uint8], Floats]:
         """The likeliest class of each pixel and its probability; 255 and NaN where nothing is known."""
@@ -74,7 +76,13 @@ class Remembered:
 def first_belief(looked: Looked) -> Belief:
     """What is known of a field that nobody looked at before: what was seen today, be it coarsely."""
     kept = np.maximum(looked.log_probability, np.float32(FAINTEST))  # NaN stays
-    return Belief(kept, _ages(kept, np.zeros(looked.seen.shape, np.float32)))
+    return Belief(kept, _ages(kept, np.zeros(looked.seen.shape, np.float32)), _own_light(looked))
+
+
+def _own_light(looked: Looked) -> Floats:
+    """What today's look adds to the light that a memory rests on, (y, x)."""
+    own: Floats = np.where(looked.seen, looked.light / looked.step**2, 0).astype(np.float32)
+    return own
 
 
 def recall(memory: Remembered, looked: Looked, reader: MemoryReader | None) -> Belief:
@@ -92,14 +100,23 @@ def recall(memory: Remembered, looked: Looked, reader: MemoryReader | None) -> B
     seen = looked.seen & shown
     age = np.nan_to_num(memory.belief.age_days, nan=0.0) + np.float32(memory.days)
     flat = np.float32(-math.log(before.shape[-1]))
-    old = np.where(known[..., None], before, flat)
+    old, new = (_summing_to_1(np.where(where[..., None], one, flat)) for where, one in ((known, before), (seen, today)))
+    left = np.float32(math.exp(-memory.days / LIGHT_FADES_DAYS))
+    rests_on = np.where(known, memory.belief.light * left, 0).astype(np.float32)
     if reader is None:
-        after = _the_surer(old, np.where(seen[..., None], today, flat), seen, age)
+        after = _the_surer(old, new, seen, age)
     else:
-        after = np.concatenate(list(_read(reader, memory, looked, old, seen, age)))
+        images = old, np.where(seen[..., None], new, 0), seen, age, rests_on
+        after = np.concatenate(list(_read(reader, memory, looked, images)))
     after = np.where(known[..., None], after, today)  # today's look alone; NaN where that has nothing either
     kept = np.maximum(after, np.float32(FAINTEST)).astype(np.float32)
-    return Belief(kept, _ages(kept, np.where(seen | ~known, 0, age)))
+    return Belief(kept, _ages(kept, np.where(seen | ~known, 0, age)), rests_on + _own_light(replace(looked, seen=seen)))
+
+
+def _summing_to_1(log_probability: Floats) -> Floats:
+    """Logarithms of probabilities (..., class) that sum to 1."""
+    summing: Floats = log_probability - np.log(np.exp(log_probability).sum(axis=-1, keepdims=True))
+    return summing
 
 
 def _ages(log_probability: Floats, age_days: Floats) -> Floats:
@@ -140,10 +157,10 @@ def _the_surer(before: Floats, today: Floats, seen: NDArray[np.bool_], age: Floa
 
 
 def _read(
-    reader: MemoryReader, memory: Remembered, looked: Looked, before: Floats, seen: NDArray[np.bool_], age: Floats
+    reader: MemoryReader, memory: Remembered, looked: Looked, images: Sequence[NDArray[np.generic]]
 ) -> Iterator[Floats]:
-    """What the reader says, some rows at a time with rows around them that it sees too."""
-    s, (y, x), classes = reader.sizes.factor, seen.shape, before.shape[-1]
+    """What the reader says of its first images, some rows at a time with rows around them that it sees too."""
+    s, (y, x, classes) = reader.sizes.factor, images[0].shape
     sizes = (reader.sizes.classes, reader.sizes.columns)
     if sizes != (classes, looked.coarse.shape[-1]):
         raise ShapeError(
@@ -153,7 +170,6 @@ def _read(
     both = _told(past) & _told(looked.coarse)
     if memory.coarse is None:
         both[...] = False
-    today = np.where(seen[..., None], looked.log_probability, 0)
     wide = -(-x // s) * s
     taken = torch.tensor([looked.light]), torch.tensor([float(looked.step)])
     for top in range(0, y, ROWS):
@@ -169,16 +185,8 @@ def _read(
             return _image(np.nan_to_num(values[cells, : wide // s], posinf=0, neginf=0))
 
         with torch.inference_mode():
-            found = reader(
-                fine(before),
-                fine(today),
-                fine(seen),
-                fine(age),
-                *taken,
-                coarse(past),
-                coarse(looked.coarse),
-                coarse(both),
-            )
+            coarsely = coarse(past), coarse(looked.coarse), coarse(both)
+            found = reader(*map(fine, images), *taken, *coarsely)
         own = found[0, :, top - first : min(top + ROWS, y) - first, :x]
         yield np.ascontiguousarray(own.permute(1, 2, 0).numpy(), np.float32)
 
@@ -195,14 +203,14 @@ def _image(values: NDArray[np.generic]) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class MemoryAgreement:
     """How memory, look and map compare, added up over regions of a field."""
 
     looked: NDArray[np.int64]  # (class before, class of today's look alone) pixels that both know
     changed: NDArray[np.int64]  # (class before, class of the map) pixels that both are sure of
 
-    def __add__(self, other: Comparison) -> Comparison:
-        return Comparison(self.looked + other.looked, self.changed + other.changed)
+    def __add__(self, other: MemoryAgreement) -> MemoryAgreement:
+        return MemoryAgreement(self.looked + other.looked, self.changed + other.changed)
 
     @property
     def agreement(self) -> float:
@@ -221,7 +229,7 @@ class Comparison:
         return self.agreement < LEAST_AGREEMENT and kappa < LEAST_KAPPA
 
 
-def compare(memory: Remembered, looked: Looked, after: Belief, part: tuple[slice, slice]) -> Comparison:
+def compare(memory: Remembered, looked: Looked, after: Belief, part: tuple[slice, slice]) -> MemoryAgreement:
     """Compare what was remembered of some rows and columns with today's look and with what is believed now."""
     classes = after.log_probability.shape[-1]
     before, today, now = (
@@ -232,7 +240,9 @@ def compare(memory: Remembered, looked: Looked, after: Belief, part: tuple[slice
     shown = np.nan_to_num(today, nan=-np.inf).argmax(axis=-1)
     least = math.log(CERTAIN)
     sure = known & (before.max(axis=-1) > least) & (now.max(axis=-1) > least)
-    return Comparison(*(_counted(old[where], other[where], classes) for where, other in ((known, shown), (sure, new))))
+    return MemoryAgreement(
+        *(_counted(old[where], other[where], classes) for where, other in ((known, shown), (sure, new)))
+    )
 
 
 def _counted(rows: NDArray[np.intp], columns: NDArray[np.intp], classes: int) -> NDArray[np.int64]:

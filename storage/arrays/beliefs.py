@@ -1,7 +1,7 @@
-"""What is believed of a field: log-probabilities of its classes and how long ago each pixel was looked at.
+"""What is believed of a field: log-probabilities of its classes, how long ago a pixel was looked at and by what light.
 
-Both are packed by CF's rules (scale_factor, add_offset), so that any reader of netCDF or Zarr gets numbers: a fortieth
-of a nat in a byte, an eighth of a day in two.
+All are packed by CF's rules (scale_factor, add_offset), so that any reader of netCDF or Zarr gets numbers: a fortieth
+of a nat in a byte, an eighth of a day in two, a sixteenth of an octave of light in one.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from storage.arrays.layout import (
 
 STEP, FAINTEST, NOTHING = 0.025, -6.35, 255  # nats; 254 is certainty, 255 that nothing is known
 DAY_STEP, NEVER = 0.125, 65535
+OCTAVE_STEP, DARKEST, DARK = 0.0625, -10.0, 255  # log2 of reference exposures; 255 where there was no light
 Floats = NDArray[np.float32]
 
 
@@ -50,25 +51,35 @@ def create_belief(path: Path, shape: tuple[int, int], legend: ClassNames, *, gri
     create_array(group, "log_probability", spec, about)
     about = {"long_name": "time since the pixel was looked at", "units": "days", "scale_factor": DAY_STEP, **place}
     create_array(group, "age", image_spec(("y", "x"), shape, "<u2"), {**about, "_FillValue": NEVER})
+    about = {"long_name": "log2 of the reference exposures that it rests on", "units": "1", "_FillValue": DARK, **place}
+    packing = {"scale_factor": OCTAVE_STEP, "add_offset": DARKEST}
+    create_array(group, "log2_light", image_spec(("y", "x"), shape, "|u1"), {**about, **packing})
 
 
-def write_belief_tile(path: Path, origin: tuple[int, int], log_probability: Floats, age_days: Floats) -> None:
-    """Store (y, x, class) log-probabilities and (y, x) ages of whole shards from row and column ``origin`` on.
+def write_belief_tile(
+    path: Path, origin: tuple[int, int], log_probability: Floats, age_days: Floats, light: Floats
+) -> None:
+    """Store (y, x, class) log-probabilities, (y, x) ages and light of whole shards from row and column ``origin`` on.
 
-    NaN is what nothing is known of. Raises ShapeError: both differ in size; ChunkError: the tile splits a shard;
+    NaN is what nothing is known of. Raises ShapeError: they differ in size; ChunkError: the tile splits a shard;
     IncompleteStoreError: there is no store.
     """
-    if log_probability.shape[:2] != age_days.shape:
-        raise ShapeError(f"probabilities {log_probability.shape} and ages {age_days.shape} are not of one tile")
+    if not log_probability.shape[:2] == age_days.shape == light.shape:
+        sizes = f"{log_probability.shape}, ages {age_days.shape} and light {light.shape}"
+        raise ShapeError(f"probabilities {sizes} are not of one tile")
     with damage_named(str(path)):
         group = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
-        arrays = [array for name in ("log_probability", "age") if isinstance(array := group[name], zarr.Array)]
+        names = ("log_probability", "age", "log2_light")
+        arrays = [array for name in names if isinstance(array := group[name], zarr.Array)]
     place = tuple(slice(first, first + size) for first, size in zip(origin, age_days.shape, strict=True))
     whole_shards("the belief", place, arrays[1].shape, arrays[1].shards or ())
     packed = np.rint((np.clip(log_probability, FAINTEST, 0) - FAINTEST) / STEP)
     arrays[0][place] = np.where(np.isnan(log_probability), NOTHING, np.minimum(packed, NOTHING - 1)).astype(np.uint8)
     days = np.rint(np.clip(age_days, 0, DAY_STEP * (NEVER - 1)) / DAY_STEP)
     arrays[1][place] = np.where(np.isnan(age_days), NEVER, days).astype(np.uint16)
+    octaves = np.clip(np.log2(np.maximum(light, 2.0**DARKEST)), DARKEST, DARKEST + OCTAVE_STEP * (DARK - 1))
+    packed = np.rint((octaves - DARKEST) / OCTAVE_STEP)
+    arrays[2][place] = np.where(light > 0, packed, DARK).astype(np.uint8)
 
 
 def write_changes(path: Path, changed: Floats) -> None:
@@ -92,10 +103,10 @@ class BeliefStore:
         """Its classes, in the order of the probabilities."""
         return legend_of(self._group)
 
-    def read(self, rows: slice = slice(None), columns: slice = slice(None)) -> tuple[Floats, Floats]:
-        """Log-probabilities (y, x, class) that sum to 1 once taken to powers, and ages in days (y, x).
+    def read(self, rows: slice = slice(None), columns: slice = slice(None)) -> tuple[Floats, Floats, Floats]:
+        """Log-probabilities (y, x, class) that sum to 1 once taken to powers, ages in days and light (y, x).
 
-        NaN where nothing is known.
+        NaN where nothing is known, no light where there was none.
         """
         packed = read_array(self._group, "log_probability", np.s_[rows, columns])
         values = (packed * np.float32(STEP) + np.float32(FAINTEST)).astype(np.float32)
@@ -103,7 +114,9 @@ class BeliefStore:
         values[packed == NOTHING] = np.nan
         age = read_array(self._group, "age", np.s_[rows, columns])
         days: Floats = np.where(age == NEVER, np.nan, age * np.float32(DAY_STEP)).astype(np.float32)
-        return values, days
+        packed_light = read_array(self._group, "log2_light", np.s_[rows, columns])
+        light = np.exp2(packed_light * np.float32(OCTAVE_STEP) + np.float32(DARKEST))
+        return values, days, np.where(packed_light == DARK, 0, light).astype(np.float32)
 
     def changed(self) -> Floats | None:
         """Shares of pixels that changed, by seat; None of a first look."""

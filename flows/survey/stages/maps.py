@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.survey.field_work import Drawing, FieldWork, MemoryPart, look_at, region_params, seat_columns
+from flows.survey.field_work import Drawing, FieldMemory, FieldWork, look_at, region_params, seat_columns
 from flows.survey.run import SurveyRun
 from flows.survey.stage import Product, Wanted, stage
 from models.reading.inference import CoarseLook, Glance, read_glance
 from models.reading.regions import whole_field
-from models.reading.remembered import Comparison
+from models.reading.remembered import MemoryAgreement
 from pipeline.ground.map_grid import GroundGrid, classes_at, ground_grid, image_at, map_blocks
 from pipeline.ground.view import GroundView
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS
@@ -74,7 +74,7 @@ def _drawing(run: SurveyRun, work: FieldWork, mosaic: StageRef, patches: StageRe
     memory = None
     if prior is not None:
         belief, coarse = (prior.belief.path / "belief.zarr").resolve(), (prior.mosaic.path / "mosaic.zarr").resolve()
-        memory = MemoryPart(belief, coarse, prior.days, prior.classes)
+        memory = FieldMemory(belief, coarse, prior.days, prior.classes)
     seen = (mosaic.path / "mosaic.zarr").resolve(), (patches.path / "patches.zarr").resolve()
     made = (path / "class_map.zarr").resolve(), (path / "belief.zarr").resolve()
     light, step = _light(run)
@@ -88,7 +88,7 @@ def _light(run: SurveyRun) -> tuple[float, int]:
     return (exposure_ms or run.camera.exposure_ms) / DEFAULT_EXPOSURE_MS, settings.scan_step or 1
 
 
-def _memory_told(run: SurveyRun, comparison: Comparison, *, put_aside: bool) -> dict[str, Any]:
+def _memory_told(run: SurveyRun, comparison: MemoryAgreement, *, put_aside: bool) -> dict[str, Any]:
     """What became of a memory: agreement with today's look, and pixels that changed from class to class."""
     assert run.prior is not None
     names, changed = run.weights.class_names, comparison.changed

@@ -100,6 +100,7 @@ def _run(side: int, policy: str, *, plain: bool = False) -> SurveyRun:
         scene=SimpleNamespace(wavelength_nm=np.linspace(400, 1000, BANDS)),
         settings=SimpleNamespace(policy=policy),
         plan=SimpleNamespace(plain=plain),
+        prior=None,
     )
     return cast("SurveyRun", made)
 

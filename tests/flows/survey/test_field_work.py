@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from flows.settings.load import load_settings
-from flows.survey.field_work import SHARD, FieldWork, Scoring, WeightsFile, region_params
+from flows.survey.field_work import SHARD, Drawing, FieldWork, Scoring, WeightsFile, region_params
 from flows.survey.run import SurveyRun, open_run
 from models.reading.regions import Region, plan_regions
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
+from storage.arrays.beliefs import create_belief
 from storage.arrays.class_maps import ClassNames, create_class_map, load_class_map
 from storage.arrays.mosaics import load_attention
 from storage.parallel.crew import Crew
@@ -49,8 +50,9 @@ def _draw(work: FieldWork, run: SurveyRun, stages: Path, out: Path) -> dict[str,
     """The bytes of the map that this work draws."""
     legend = ClassNames(run.weights.class_names, run.weights.class_colours)
     create_class_map(out, run.scene.shape, legend, grid=run.angular_grid())
+    create_belief(out.with_suffix(".belief"), run.scene.shape, legend, grid=run.angular_grid())
     mosaic, patches = _store(stages, "rectify/*/mosaic.zarr"), _store(stages, "patches/*/patches.zarr")
-    work.draw(mosaic, patches, out, lambda done: None)
+    work.draw(Drawing(work.weights, mosaic, patches, out, out.with_suffix(".belief"), 1.0, 1), lambda done: None)
     return _contents(out)
 
 

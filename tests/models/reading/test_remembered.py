@@ -98,7 +98,11 @@ def test_one_that_knows_nothing_takes_the_other(reader: MemoryReader | None) -> 
     before, today = memory.belief.log_probability.copy(), look.log_probability.copy()
     before[:8], today[4:12] = np.nan, np.nan
     ages = np.where(np.isnan(before[..., 0]), np.nan, 0.0).astype(np.float32)
-    after = recall(replace(memory, belief=Belief(before, ages)), replace(look, log_probability=today), reader)
+    after = recall(
+        replace(memory, belief=Belief(before, ages, np.ones(SHAPE, np.float32))),
+        replace(look, log_probability=today),
+        reader,
+    )
     np.testing.assert_array_equal(after.log_probability[:4], np.maximum(today[:4], np.float32(FAINTEST)))
     assert np.isnan(after.log_probability[4:8]).all()
     assert np.isnan(after.age_days[4:8]).all()
@@ -162,14 +166,16 @@ def test_coarse_looks_that_cannot_be_compared_change_nothing() -> None:
 
 
 def test_a_fresh_reader_weighs_both_witnesses_by_its_gates() -> None:
-    """Before it has learned anything: the sum of both logarithms, each 0.6 times, brought to a sum of 1."""
+    """Before it has learned anything: half the memory, half the product of it to the power .9 and of the look to .5."""
     rng = np.random.default_rng(2)
     memory, look = a_memory(rng, days=0.0), a_look(rng)
     reader = MemoryReader(MemorySizes(CLASSES, COLUMNS, FACTOR)).eval()
-    expected = 0.6 * (memory.belief.log_probability + look.log_probability)
-    expected -= np.log(np.exp(expected).sum(axis=-1, keepdims=True))
+    old, new = (np.exp(one.log_probability.astype(np.float64)) for one in (memory.belief, look))
+    old /= old.sum(axis=-1, keepdims=True)
+    product = old ** (1 / (1 + math.exp(-2.2))) * new**0.5
+    expected = old / 2 + product / product.sum(axis=-1, keepdims=True) / 2
     found = recall(memory, look, reader).log_probability
-    np.testing.assert_allclose(found, np.maximum(expected, FAINTEST), atol=2e-5)
+    np.testing.assert_allclose(np.exp(found), np.maximum(expected, math.exp(FAINTEST)), atol=1e-5)
 
 
 def test_other_sizes_are_refused() -> None:
@@ -240,6 +246,6 @@ def test_a_seat_counts_its_pixels_of_another_class() -> None:
     before = np.tile(sure, (8, 16, 1))
     now = before.copy()
     now[0, :8], now[0, 8:] = other, doubt
-    memory = Remembered(Belief(before, np.zeros((8, 16), np.float32)), None, 1.0)
-    shares = changed_shares(memory, Belief(now, np.zeros((8, 16), np.float32)), 8)
+    memory = Remembered(Belief(before, *np.zeros((2, 8, 16), np.float32)), None, 1.0)
+    shares = changed_shares(memory, Belief(now, *np.zeros((2, 8, 16), np.float32)), 8)
     np.testing.assert_array_equal(shares, [[0.125, 0.0]])

@@ -18,22 +18,22 @@ LEGEND = ClassNames(("soil", "maize", "weed"), np.arange(9, dtype=np.uint8).resh
 SHAPE = (70, 50)
 
 
-def drawn(seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Probabilities of three classes and ages, some of them unknown."""
+def drawn(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Probabilities of three classes and ages, some of them unknown, and light, some of it none."""
     rng = np.random.default_rng(seed)
     logits = rng.normal(0, 2, (*SHAPE, 3))
     values = (logits - np.log(np.exp(logits).sum(axis=-1, keepdims=True))).astype(np.float32)
     ages = rng.uniform(0, 400, SHAPE).astype(np.float32)
     values[:3], ages[:3] = np.nan, np.nan
-    return values, ages
+    return values, ages, np.where(rng.random(SHAPE) < 0.1, 0, 2 ** rng.uniform(-8, 4, SHAPE)).astype(np.float32)
 
 
 def stored(path: Path, seed: int = 0) -> Path:
     """A belief of two tiles."""
-    values, ages = drawn(seed)
+    values, ages, light = drawn(seed)
     create_belief(path, SHAPE, LEGEND)
     for top, bottom in ((0, 64), (64, 70)):
-        write_belief_tile(path, (top, 0), values[top:bottom], ages[top:bottom])
+        write_belief_tile(path, (top, 0), values[top:bottom], ages[top:bottom], light[top:bottom])
     return path
 
 
@@ -43,12 +43,13 @@ def test_what_is_read_is_what_was_written_within_half_a_step(
 ) -> None:
     """The likeliest class stays where no other is within a step, ages to a sixteenth of a day, NaN where unknown."""
     path = stored(tmp_path_factory.mktemp("belief") / "belief.zarr", seed)
-    values, ages = drawn(seed)
-    found, days = BeliefStore(path).read()
+    values, ages, light = drawn(seed)
+    found, days, shown = BeliefStore(path).read()
     known = slice(3, None)
     assert np.isnan(found[:3]).all()
     assert np.isnan(days[:3]).all()
     np.testing.assert_allclose(days[known], ages[known], atol=DAY_STEP / 2 + 1e-4)
+    np.testing.assert_allclose(shown, light, rtol=0.023)  # half of a sixteenth of an octave
     np.testing.assert_allclose(np.exp(found[known]).sum(axis=-1), 1, atol=1e-5)
     first, second = np.sort(values[known], axis=-1)[..., -1], np.sort(values[known], axis=-1)[..., -2]
     clear = first - second > STEP
@@ -70,7 +71,9 @@ def test_xarray_unpacks_it(tmp_path: Path) -> None:
     """Probabilities and days come as numbers by CF's packing, with a missing value where nothing is known."""
     path = stored(tmp_path / "belief.zarr")
     opened = xr.open_zarr(path, consolidated=False)
-    values, ages = drawn(0)
+    values, ages, light = drawn(0)
+    np.testing.assert_allclose(2 ** opened.log2_light.values[light > 0], light[light > 0], rtol=0.023)
+    assert np.isnan(opened.log2_light.values[light == 0]).all()
     assert opened.log_probability.dims == ("y", "x", "class")
     assert opened.age.attrs["units"] == "days"
     assert np.isnan(opened.log_probability.values[:3]).all()
@@ -91,11 +94,11 @@ def test_changes_are_there_once_written(tmp_path: Path) -> None:
 def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
     """Tiles that split a shard or differ in size, and a store that is not there."""
     path = stored(tmp_path / "belief.zarr")
-    values, ages = drawn(0)
+    values, ages, light = drawn(0)
     with pytest.raises(ChunkError, match="split the belief's shards"):
-        write_belief_tile(path, (8, 0), values[:8], ages[:8])
+        write_belief_tile(path, (8, 0), values[:8], ages[:8], light[:8])
     with pytest.raises(ShapeError, match="not of one tile"):
-        write_belief_tile(path, (0, 0), values[:64], ages[:8])
+        write_belief_tile(path, (0, 0), values[:64], ages[:8], light[:64])
     with pytest.raises(IncompleteStoreError, match="no readable Zarr store"):
         BeliefStore(tmp_path / "none.zarr")
 
@@ -106,9 +109,10 @@ def test_certainty_is_not_mistaken_for_nothing(tmp_path: Path) -> None:
     create_belief(path, (4, 4), LEGEND)
     sure = np.full((4, 4, 3), -50.0, np.float32)
     sure[..., 1] = 0.0
-    write_belief_tile(path, (0, 0), sure, np.full((4, 4), 1e9, np.float32))
-    found, days = BeliefStore(path).read()
+    write_belief_tile(path, (0, 0), sure, *np.full((2, 4, 4), 1e9, np.float32))
+    found, days, light = BeliefStore(path).read()
     assert (found.argmax(axis=-1) == 1).all()
     assert np.exp(found[..., 1]).min() > 0.99
     assert np.isfinite(days).all()
+    assert light.min() > 30
     assert NOTHING == 255

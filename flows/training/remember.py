@@ -1,0 +1,228 @@
+"""`spectralzoom train --remember`: what reads a field's memory beside today's look, trained on lands through days.
+
+Built-in lands are scanned on several days; by the law of noise each scan is shown as shorter exposures and wider steps
+would have shown it, and read by the weights that the memory is for. Other lands then say what the memory is worth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from flows.terminal.progress import StageProgress
+from flows.training.look import observe_finely
+from models.evaluation.metrics import confusion, mean_iou
+from models.network.spectral import patches_of
+from models.reading.inference import glance_of_columns, segment
+from models.reading.remembered import Belief, Looked, Remembered, first_belief, recall
+from models.training.looks import REFERENCE_MS, ColumnNoise, Looks
+from models.training.memory import MemoryTraining, PastLook, Visit, train_reader
+from models.training.train import Progress
+from models.weights.files import Weights, content_key, load_weights
+from models.weights.memory_files import MemoryWeights, save_memory
+from pipeline.errors import SettingsError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid, pad_by_reflection
+from pipeline.simulator.scenes.farm.farm_plan import CLASSES
+from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES, farm_scene
+
+SHAPE = (512, 640)  # (y, x) of a land
+LANDS, FIRST_SEED, JUDGED_SEED = 48, 200_000, 300_000
+VISITS = 5  # to each land
+DAYS, LAST_DAY = (95, 290), 318  # of the year: of first visits, and of any
+GAPS = (0, 1, 1, 2, 3, 3, 5, 6, 6, 7, 7, 10, 14)  # days between two
+HOURS = (9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0)
+STEPS = {1: 0.3, 2: 0.5, 4: 0.2}  # how often lines are so many pixels apart
+DARKEST_MS, BRIGHTEST_MS = 3.0, 50.0
+LOOKS = 2  # of each visit
+JUDGED_DAY, JUDGED_AFTER, JUDGED_LANDS = 172, (1, 3, 7), 3
+BEFORE, NOW = (1, 25.0), (2, 5.0)  # step and exposure [ms] of the looks that are judged
+Report = Callable[[str, float, str], None]
+
+
+@dataclass(frozen=True)
+class MemoryRequest:
+    """For which weights, where to, and how."""
+
+    dataset: str
+    weights: Path
+    out: Path
+    lands: int = LANDS
+    judged: int = JUDGED_LANDS
+    shape: tuple[int, int] = SHAPE
+    settings: MemoryTraining = field(default_factory=MemoryTraining)
+    command: str = ""
+
+
+def train_memory(request: MemoryRequest, report: Report = lambda what, done, figure: None) -> dict[str, Any]:
+    """Train a reader for some weights, judge it on other lands and save it; give the record that stands in the file.
+
+    Raises SettingsError: no built-in farm, or a place that cannot be written to; WeightsError: the weights cannot be
+    read; SettingsError: they are not of the farm's classes.
+    """
+    if request.dataset not in FARM_NAMES:
+        raise SettingsError(
+            f"--remember trains on one land at several days, which only the built-in farm gives: expected farm, got"
+            f" {request.dataset}; without a reader surveys go on from a memory by the surer of two looks"
+        )
+    if not request.out.parent.is_dir() or request.out.is_dir():
+        raise SettingsError(f"-o {request.out}: expected the name of a file in a folder that exists")
+    weights = load_weights(request.weights)
+    if weights.class_names != CLASSES:
+        raise SettingsError(
+            f"--remember {request.weights}: expected weights of the farm's classes, {', '.join(CLASSES)}"
+        )
+    looks = Looks(weights.normalisation)
+    lands = []
+    for number in range(request.lands):
+        seed = FIRST_SEED + number
+        report("visiting lands", number / request.lands, f"land {seed}")
+        rng = np.random.default_rng([request.settings.seed, seed])
+        lands.append([_visit(weights, looks, request.shape, seed, *moment, rng) for moment in _moments(rng)])
+
+    def progress(now: Progress) -> None:
+        report("training", now.done, f"step {now.step}, loss {now.loss:.3f}")
+
+    reader, steps = train_reader(lands, request.settings, weights.config.factor, progress)
+    made = MemoryWeights(reader, content_key(request.weights), weights.class_names)
+    record = {
+        "command": request.command,
+        "lands": [FIRST_SEED + number for number in range(request.lands)],
+        "settings": asdict(request.settings),
+        "steps": steps,
+        "validation": judge_memory(weights, looks, made, request, report),
+    }
+    save_memory(MemoryWeights(reader, made.weights_key, made.class_names, record), request.out)
+    return record
+
+
+def _moments(rng: np.random.Generator) -> list[tuple[int, float]]:
+    """Days of the year, each later than the one before, and hours."""
+    days = [int(rng.integers(*DAYS))]
+    while len(days) < VISITS:
+        days.append(min(days[-1] + max(int(rng.choice(GAPS)), 0), LAST_DAY))
+    return [(day, float(rng.choice(HOURS))) for day in days]
+
+
+def _visit(
+    weights: Weights, looks: Looks, shape: tuple[int, int], seed: int, day: int, hour: float, rng: np.random.Generator
+) -> Visit:
+    """A land on a day, as looks drawn by chance show it."""
+    seen = _Land.observed(weights, shape, seed, day, hour)
+    drawn = []
+    for _ in range(LOOKS):
+        step = int(rng.choice(list(STEPS), p=list(STEPS.values())))
+        exposure_ms = float(np.exp(rng.uniform(np.log(DARKEST_MS), np.log(BRIGHTEST_MS))))
+        looked = seen.look(weights, looks, step, exposure_ms, rng)
+        probability = np.exp(looked.log_probability).astype(np.float16)
+        drawn.append(PastLook(step, looked.light, probability, looked.coarse.astype(np.float16)))
+    return Visit(day + hour / 24, seen.labels, drawn)
+
+
+@dataclass(frozen=True)
+class _Land:
+    """A land as a scan of every line at the reference exposure shows it."""
+
+    columns: NDArray[np.float32]  # normalised, of the padded grid
+    noise: ColumnNoise
+    labels: NDArray[np.uint8]
+    grid: SceneGrid
+
+    @staticmethod
+    def observed(weights: Weights, shape: tuple[int, int], seed: int, day: int, hour: float) -> _Land:
+        camera = LineCamera()
+        scene = farm_scene(seed, shape, camera=camera, day=day, hour=hour)
+        grid = SceneGrid(*shape, weights.config.patch, weights.config.factor)
+        seen, noise = observe_finely(scene, camera, grid, weights.basis, 1000 * seed + day)
+        padded = np.asarray(pad_by_reflection(seen, grid.padded_shape), np.float32)
+        columns = weights.normalisation.apply(padded, np.ones(weights.basis.columns, np.bool_))
+        return _Land(columns, noise, np.asarray(scene.labels, np.uint8), grid)
+
+    def look(self, weights: Weights, looks: Looks, step: int, exposure_ms: float, rng: np.random.Generator) -> Looked:
+        """What a plain scan would have shown, read by the weights."""
+        grid, light = self.grid, exposure_ms / REFERENCE_MS
+        fine, means = looks.scan(self.columns, self.noise, grid.factor, light=light, step=step, rng=rng)
+        seats = grid.valid_seats()
+        glance = glance_of_columns(weights, means, grid)
+        drawn = segment(weights, glance, patches_of(fine, grid.patch)[seats], seats, every_class=True)
+        assert drawn.log_probability is not None
+        return Looked(drawn.log_probability, np.ones(self.labels.shape, np.bool_), means, light, step)
+
+
+def judge_memory(
+    weights: Weights, looks: Looks, memory: MemoryWeights, request: MemoryRequest, report: Report
+) -> list[dict[str, float]] | None:
+    """What maps score some days after a first visit, mIoU in the mean of lands that training did not see.
+
+    ``kept``: the map of before; ``look``: today's look alone; ``remembered``: both by the reader; ``surer``: without
+    it; ``anew``: the field scanned again as it was at first. None without a land to judge on.
+    """
+    rows: dict[int, list[dict[str, float]]] = {days: [] for days in JUDGED_AFTER}
+    for number in range(request.judged):
+        seed = JUDGED_SEED + number
+        rng = np.random.default_rng([request.settings.seed, seed])
+        land = _Land.observed(weights, request.shape, seed, JUDGED_DAY, 11.0)
+        before = land.look(weights, looks, *BEFORE, rng)
+        for days in JUDGED_AFTER:
+            report(
+                "judging", (number * len(rows) + JUDGED_AFTER.index(days)) / (len(rows) * request.judged), f"{days} d"
+            )
+            later = _Land.observed(weights, request.shape, seed, JUDGED_DAY + days, 11.0)
+            now, anew = (later.look(weights, looks, *how, rng) for how in (NOW, BEFORE))
+            remembered = Remembered(first_belief(before), before.coarse, float(days))
+            beliefs = {
+                "kept": first_belief(before),
+                "look": first_belief(now),
+                "surer": recall(remembered, now, None),
+                "remembered": recall(remembered, now, memory.reader),
+                "anew": first_belief(anew),
+            }
+            rows[days].append({name: _score(belief, later.labels) for name, belief in beliefs.items()})
+    if not request.judged:
+        return None
+    return [{"days": float(days), **_means(found)} for days, found in rows.items()]
+
+
+def _score(belief: Belief, labels: NDArray[np.uint8]) -> float:
+    return mean_iou(confusion(labels, belief.classes()[0], len(CLASSES)))
+
+
+def _means(rows: Iterable[dict[str, float]]) -> dict[str, float]:
+    found = list(rows)
+    return {name: float(np.mean([row[name] for row in found])) for name in found[0]}
+
+
+def run_remember(request: MemoryRequest, console: Console) -> dict[str, Any]:
+    """Train with a progress bar on ``console``; give the record kept in the file."""
+    last = ""
+    with StageProgress(console) as progress:
+
+        def report(what: str, done: float, figure: str) -> None:
+            nonlocal last
+            if last not in ("", what):
+                progress.show(last, 1.0, ended=True)
+            last = what
+            progress.show(what, done, figure)
+
+        record = train_memory(request, report)
+        progress.show(last, 1.0, ended=True)
+    console.print(f"reader of memories: {request.out}, {record['steps']} steps", markup=False, soft_wrap=True)
+    if record["validation"]:
+        _print_validation(record["validation"], request.judged, console)
+    return record
+
+
+def _print_validation(rows: Sequence[dict[str, float]], lands: int, console: Console) -> None:
+    title = f"mIoU on {lands} lands that training did not see"
+    table = Table("days later", "kept", "look alone", "the surer", "remembered", "scanned anew", title=title)
+    for row in rows:
+        figures = (f"{row[name]:.1%}" for name in ("kept", "look", "surer", "remembered", "anew"))
+        table.add_row(f"{row['days']:g}", *figures)
+    console.print(table)
