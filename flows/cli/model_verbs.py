@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -17,7 +16,7 @@ from flows.evaluate.command import run_evaluate
 from flows.evaluate.frames import SHARES, USUAL, EvaluateRequest
 from flows.terminal.progress import print_json
 from flows.tradeoff.command import run_tradeoff
-from flows.training.remember import MemoryRequest, run_remember
+from flows.training.remember import JUDGED_LANDS, LANDS, MemoryRequest, run_remember
 from flows.training.train import TrainRequest, asked_command, run_train, usual_crop
 from models.training.memory import MemoryTraining
 from models.training.train import TrainingSettings
@@ -158,9 +157,8 @@ def train(
 
     if remember is not None:
         how = MemoryTraining(minutes, steps, seed)
-        asked = MemoryRequest(dataset, remember, out, settings=how, command=asked_command())
-        given = {"lands": scenes, "judged": validation}
-        asked = replace(asked, **{name: count for name, count in given.items() if count is not None})
+        lands, judged = LANDS if scenes is None else scenes, JUDGED_LANDS if validation is None else validation
+        asked = MemoryRequest(dataset, remember, out, lands, judged, settings=how, command=asked_command())
         record = run_remember(asked, stderr)
         if as_json:
             print_json(record)

@@ -181,6 +181,8 @@ def _memory_words(memory: Mapping[str, Any]) -> str:
     share = format_percent(memory["changed_px"] / memory["compared_px"]) if memory["compared_px"] else "nothing"
     most = [f"{old.replace('_', ' ')} to {new.replace('_', ' ')}" for _, old, new in memory["changes"][:MOST_CHANGES]]
     what = f": {', '.join(most)}" if most else ""
+    beside = float(np.hypot(*memory["shift_px"]))
+    since += f", which lay {beside:.0f} px beside it" if beside else ""
     return f"The map goes on from {since}: today's look agrees with {alike} of it, and {share} changed{what}."
 
 

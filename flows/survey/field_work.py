@@ -7,8 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, reduce
-from operator import add
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -20,32 +19,17 @@ from models.network.memory_reader import MemoryReader
 from models.network.sizes import saliency_bytes
 from models.policies.policies import IMAGE_POLICIES, NETWORK_POLICIES, score_seats
 from models.policies.vgg_file import VggFile
-from models.reading.inference import CoarseLook, Glance, look_coarsely, read_glance, segment
+from models.reading.inference import CoarseLook, Glance, look_coarsely, read_glance
 from models.reading.regions import HALO_CELLS, REGION_PX, Region, most_bytes, plan_regions, whole_field
-from models.reading.remembered import (
-    Belief,
-    Looked,
-    MemoryAgreement,
-    Remembered,
-    changed_shares,
-    compare,
-    first_belief,
-    in_classes,
-    recall,
-)
 from models.weights.files import Weights, content_key, describe_weights, load_weights
 from models.weights.memory_files import load_memory, memory_key, memory_path
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.readings import beyond_range, readings_alone
-from storage.arrays.beliefs import BeliefStore, write_belief_tile
-from storage.arrays.class_maps import write_class_tile
 from storage.arrays.layout import SHARD_COLUMNS, SHARD_ROWS
-from storage.arrays.mosaics import PATCHES_A_SHARD, PatchStore, mosaic_strips, mosaic_wavelengths, open_patches
+from storage.arrays.mosaics import PATCHES_A_SHARD, PatchStore, mosaic_strips, mosaic_wavelengths
 from storage.arrays.tile_work import RESERVED_BYTES, let_tiles_go
 from storage.parallel.crew import Crew, run_blocks
-
-Strange = tuple[int, int]  # coarse pixels, and fine ones, with a value that is no reading
 
 
 @dataclass(frozen=True)
@@ -99,82 +83,6 @@ class Scoring:
         return region.crop_seats(score_seats(self.policy, seen, network=network))
 
 
-@dataclass(frozen=True)
-class Drawing:
-    """Draws a region of the class map into its store: what a worker needs for that."""
-
-    weights: WeightsFile
-    mosaic: Path
-    patches: Path
-    out: Path  # of the class map
-    belief: Path
-    light: float  # exposure of a line that is read in detail, as a share of the reference
-    step: int  # pixels from such a line to the next
-    memory: FieldMemory | None = None  # what is remembered of the field
-
-    def __call__(self, region: Region) -> Drawn:
-        """Read what was seen of the region coarsely and finely, and store the part of the map that is kept."""
-        let_tiles_go()
-        weights, store = self.weights.load(), open_patches(self.patches)
-        seen = look_at(weights, self.mosaic, region)
-        strange = np.zeros(region.grid.seat_shape, np.int64)
-        seats, columns = seat_columns(weights, store, store.wavelength_nm, seen, region, strange=strange.ravel())
-        drawn = segment(weights, seen, columns, seats, every_class=True)
-        assert drawn.log_probability is not None
-        looked = self._looked(region, drawn.log_probability, seats, seen)
-        classes, confidence = drawn.classes, drawn.confidence
-        comparison, changed = None, None
-        if self.memory is None:
-            after = first_belief(looked)
-        else:
-            remembered = self.memory.of(region, weights)
-            after = recall(remembered, looked, self.weights.load_reader())
-            classes, confidence = after.classes()
-            comparison = compare(remembered, looked, after, region.kept_here)
-            changed = changed_shares(remembered, after, region.grid.patch)
-        origin = region.kept.top, region.kept.left
-        write_class_tile(self.out, origin, region.crop(classes), region.crop(confidence))
-        write_belief_tile(self.belief, origin, *map(region.crop, (after.log_probability, after.age_days, after.light)))
-        coarse = 0 if seen.strange is None else int(np.count_nonzero(region.crop_coarse(seen.strange)))
-        return Drawn((coarse, int(region.crop_seats(strange).sum())), comparison, changed)
-
-    def _looked(
-        self, region: Region, log_probability: NDArray[np.float32], seats: NDArray[np.int64], seen: CoarseLook
-    ) -> Looked:
-        grid = region.grid
-        detailed = np.zeros(grid.seat_shape, np.bool_)
-        detailed.ravel()[seats] = True
-        pixels = np.repeat(np.repeat(detailed, grid.patch, axis=0), grid.patch, axis=1)[: grid.height, : grid.width]
-        return Looked(log_probability, pixels, seen.columns, self.light, self.step)
-
-
-@dataclass(frozen=True)
-class FieldMemory:
-    """Where the memory of a field lies, and how it is to be read."""
-
-    belief: Path
-    mosaic: Path
-    days: float
-    classes: tuple[int, ...]  # see `flows.survey.memory.Prior`
-
-    def of(self, region: Region, weights: Weights) -> Remembered:
-        """Read what is remembered of a region, in the classes of the weights."""
-        values, age, light = BeliefStore(self.belief).read(region.read.rows, region.read.columns)
-        if self.classes != tuple(range(values.shape[-1])):
-            values = in_classes(values, self.classes)
-        coarse = look_at(weights, self.mosaic, region).columns
-        return Remembered(Belief(values, age, light), coarse, self.days)
-
-
-@dataclass(frozen=True)
-class Drawn:
-    """What a worker says of a region that it drew."""
-
-    strange: Strange
-    comparison: MemoryAgreement | None  # with what was remembered
-    changed: NDArray[np.float32] | None  # (seat_y, seat_x) of the region's scene
-
-
 def look_at(weights: Weights, mosaic: Path, region: Region) -> CoarseLook:
     """Read the part of a stored coarse mosaic that a region needs, some rows at a time."""
     strips = mosaic_strips(mosaic, region.coarse.rows, region.coarse.columns)
@@ -218,15 +126,6 @@ def seat_columns(
                 coarse = seen.columns[np.ix_(y // seen.grid.factor, x // seen.grid.factor)]
                 patch[~there] = coarse[~there]
     return seats[:kept], columns[:kept]
-
-
-@dataclass(frozen=True)
-class DrawnField:
-    """What was found while a map was drawn."""
-
-    strange: Strange
-    comparison: MemoryAgreement | None  # with what was remembered; None of a field's first look
-    changed: NDArray[np.float32] | None  # (seat_y, seat_x) share of pixels with another class than remembered
 
 
 SHARD = (SHARD_ROWS, SHARD_COLUMNS)
@@ -290,29 +189,6 @@ class FieldWork:
         work = Scoring(self.weights, mosaic, policy)
         (scores,) = run_blocks(work, [whole_field(grid)], crew, report=report, paths=[mosaic])
         return np.asarray(scores, np.float64)
-
-    def draw(self, work: Drawing, report: Callable[[float], None]) -> DrawnField:
-        """Draw class map and belief into the stores that were created for them; count pixels that were left out.
-
-        These are the coarse pixels, and the fine ones, with a value that the weights take for no reading. Raises
-        SettingsError: not even one region at a time fits the memory.
-        """
-        store = open_patches(work.patches)
-        crew = self.crew_for(store.seats, len(store.wavelength_nm))
-        remembered = () if work.memory is None else (work.memory.belief, work.memory.mosaic)
-        paths = (work.mosaic, work.patches, work.out, work.belief, *remembered)
-        parts: list[Drawn] = run_blocks(work, self.regions, crew, report=report, paths=paths)
-        strange = sum(part.strange[0] for part in parts), sum(part.strange[1] for part in parts)
-        compared = [part.comparison for part in parts if part.comparison is not None]
-        changed = None
-        if compared:
-            changed = np.zeros(self.regions[0].field.seat_shape, np.float32)
-            for region, part in zip(self.regions, parts, strict=True):
-                assert part.changed is not None
-                whole = np.zeros(region.grid.seat_shape, np.float32)
-                whole[: part.changed.shape[0], : part.changed.shape[1]] = part.changed
-                changed[region.kept_seats.rows, region.kept_seats.columns] = region.crop_seats(whole)
-        return DrawnField(strange, reduce(add, compared) if compared else None, changed)
 
     def crew_for(self, seats: NDArray[np.integer], bands: int, *, beside: int = 0) -> Crew:
         """Give the crew, no larger than memory holds regions with their parts of these seats of the field.

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 FAINT = 10.0  # logarithms of probabilities are read down to minus this
 OTHERS = 5  # images that it reads beside probabilities: seen, age, light of the memory, light and step of the look
 GATES = 3  # how far the memory, and the look, are believed; how far both together replace the memory
-STARTS = (2.2, 0.0, 0.0)  # of these, before anything is learned
+STARTS = (2.2, 0.0, -1.0)  # of these, before anything is learned
 LEAST_LIGHT = 1e-4  # of a memory, in reference exposures
 
 

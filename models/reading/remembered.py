@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 else:
     torch = deferred("torch")
 
-FAINTEST = -6.35  # of logarithms of probabilities that are kept: one in 572
+FAINTEST = -12.7  # of logarithms of probabilities that are kept: one in 330 000
 LIGHT_FADES_DAYS = 30.0  # in which the light that a memory rests on is worth e times less
 FADES_DAYS = 120.0  # in which a memory that nobody looks after is worth e times less, without a reader
 SURE = 0.97  # of today's look, without a reader, to speak against a memory

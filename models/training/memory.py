@@ -21,10 +21,11 @@ from torch import Tensor
 
 from models.network.memory_reader import MemoryReader, MemorySizes
 from models.reading.remembered import FAINTEST, LIGHT_FADES_DAYS
+from models.training.objective import map_loss, weights_of_classes
 from models.training.train import Progress
 from pipeline.geometry.grid import UNLABELLED
 
-FAINT = 1e-4  # least probability of a look
+FAINT = 1e-5  # least probability of a look
 PARTLY_SEEN = 0.3  # how often a visit after the first sees a part of the land alone
 INCOMPARABLE = 0.1  # how often the coarse looks of two visits cannot be compared
 OTHER_LAND, BESIDE = 0.06, 0.06  # how often some memories of a batch are of another land, or lie beside it
@@ -64,12 +65,13 @@ class MemoryTraining:
     minutes: float = 32.0
     steps: int = 4000
     seed: int = 0
-    batch: int = 6
-    crop: int = 128  # px
+    batch: int = 16
+    crop: int = 64  # px
     visits: int = 4  # in a row
     learning_rate: float = 3e-3
     weight_decay: float = 0.01
     average: float = 0.995
+    weight_cap: float = 5.0  # of rare classes
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,8 @@ def train_reader(
         torch.manual_seed(settings.seed)
         reader = MemoryReader(sizes).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     averaged = copy.deepcopy(reader).eval()
+    labels = [visit.labels for land in lands for visit in land]
+    weight = weights_of_classes(labels, sizes.classes, settings.weight_cap)
     rng = np.random.default_rng([settings.seed, 0x3E3])
     optimiser = torch.optim.AdamW(reader.parameters(), settings.learning_rate, weight_decay=settings.weight_decay)
     started, step, loss = time.monotonic(), 0, math.nan
@@ -107,7 +111,7 @@ def train_reader(
         for group in optimiser.param_groups:
             group["lr"] = settings.learning_rate * rate
         optimiser.zero_grad()
-        value = _learn(reader, _sequences(lands, settings, factor, rng), rng)
+        value = _learn(reader, _sequences(lands, settings, factor, rng), weight, rng)
         torch.nn.utils.clip_grad_norm_(reader.parameters(), 1.0)
         optimiser.step()
         step += 1
@@ -120,8 +124,8 @@ def train_reader(
     return averaged, step
 
 
-def _learn(reader: MemoryReader, visits: Sequence[_Batch], rng: np.random.Generator) -> float:
-    """Bring memories through visits, and learn at each but the first from its labels; the mean loss."""
+def _learn(reader: MemoryReader, visits: Sequence[_Batch], weight: Tensor, rng: np.random.Generator) -> float:
+    """Bring memories through visits, and learn at each but the first from its labels, as maps do; the mean loss."""
     start = visits[0]
     state, coarse = start.looked, start.coarse
     age = torch.zeros_like(start.seen)
@@ -133,8 +137,8 @@ def _learn(reader: MemoryReader, visits: Sequence[_Batch], rng: np.random.Genera
         told, told_coarse = _wrong(state, coarse, reader.sizes.factor, rng)
         images = told, now.looked, now.seen, age, rests_on
         found = reader(*images, now.light, now.step, told_coarse, now.coarse, small * now.comparable)
-        known = now.labels != UNLABELLED
-        loss = F.cross_entropy(found, now.labels.where(known, 0), reduction="none").mul(known).mean()
+        losses = F.nll_loss(found, now.labels.where(now.labels != UNLABELLED, 0), reduction="none")
+        loss = map_loss(found, losses, now.labels, weight, soft_dice=True)
         torch.autograd.backward(loss)
         total += float(loss.detach()) / (len(visits) - 1)
         state = found.detach().clamp(min=FAINTEST)

@@ -11,11 +11,13 @@ same crops.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
+from numpy.typing import NDArray
 from torch import Tensor
 
 from models.network.controls import Control, Network
@@ -52,10 +54,15 @@ def phase_at(done: float) -> Phase:
 
 
 def class_weights(examples: list[Example], classes: int, cap: float) -> Tensor:
+    """Weights of the classes that scenes show, as `weights_of_classes`."""
+    return weights_of_classes([example.labels for example in examples], classes, cap)
+
+
+def weights_of_classes(labels: Iterable[NDArray[np.uint8]], classes: int, cap: float) -> Tensor:
     """Weights 1 / sqrt(frequency), mean 1 over the labelled pixels' classes, capped; 0 for a class without a pixel."""
     counts = np.zeros(classes)
-    for example in examples:
-        counts += np.bincount(example.labels[example.labels != UNLABELLED], minlength=classes)
+    for image in labels:
+        counts += np.bincount(image[image != UNLABELLED], minlength=classes)
     share = counts / max(counts.sum(), 1)
     weight = np.divide(1, np.sqrt(share), out=np.zeros(classes), where=share > 0)
     weight /= max((weight * share).sum(), 1e-12)

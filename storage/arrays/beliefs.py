@@ -1,7 +1,7 @@
 """What is believed of a field: log-probabilities of its classes, how long ago a pixel was looked at and by what light.
 
-All are packed by CF's rules (scale_factor, add_offset), so that any reader of netCDF or Zarr gets numbers: a fortieth
-of a nat in a byte, an eighth of a day in two, a sixteenth of an octave of light in one.
+All are packed by CF's rules (scale_factor, add_offset), so that any reader of netCDF or Zarr gets numbers: a
+twentieth of a nat in a byte, an eighth of a day in two, a sixteenth of an octave of light in one.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from storage.arrays.layout import (
     write_image,
 )
 
-STEP, FAINTEST, NOTHING = 0.025, -6.35, 255  # nats; 254 is certainty, 255 that nothing is known
+STEP, FAINTEST, NOTHING = 0.05, -12.7, 255  # nats; 254 is certainty, 255 that nothing is known
 DAY_STEP, NEVER = 0.125, 65535
 OCTAVE_STEP, DARKEST, DARK = 0.0625, -10.0, 255  # log2 of reference exposures; 255 where there was no light
 Floats = NDArray[np.float32]

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.survey.field_work import Drawing, FieldMemory, FieldWork, look_at, region_params, seat_columns
+from flows.survey.drawing import Drawing, FieldMemory, draw_field, memory_shift
+from flows.survey.field_work import FieldWork, look_at, region_params, seat_columns
 from flows.survey.run import SurveyRun
 from flows.survey.stage import Product, Wanted, stage
 from models.reading.inference import CoarseLook, Glance, read_glance
@@ -39,12 +40,14 @@ def draw_map(run: SurveyRun, mosaic: StageRef, patches: StageRef) -> Wanted:
     def build(path: Path) -> None:
         work, out = FieldWork.of(run), path / "class_map.zarr"
         drawing = _drawing(run, work, mosaic, patches, path)
-        drawn = work.draw(drawing, run.report)
+        drawn = draw_field(work, drawing, run.report)
         if drawn.comparison is not None:
             put_aside = drawn.comparison.is_of_another_field
-            write_table(path / MEMORY, _memory_told(run, drawn.comparison, put_aside=put_aside))
+            assert drawing.memory is not None
+            shift = drawing.memory.shift_px
+            write_table(path / MEMORY, _memory_told(run, drawn.comparison, shift, put_aside=put_aside))
             if put_aside:
-                drawn = work.draw(replace(drawing, memory=None), run.report)
+                drawn = draw_field(work, replace(drawing, memory=None), run.report)
         if drawn.changed is not None:
             write_changes(path / "belief.zarr", drawn.changed)
         if any(drawn.strange):
@@ -74,7 +77,8 @@ def _drawing(run: SurveyRun, work: FieldWork, mosaic: StageRef, patches: StageRe
     memory = None
     if prior is not None:
         belief, coarse = (prior.belief.path / "belief.zarr").resolve(), (prior.mosaic.path / "mosaic.zarr").resolve()
-        memory = FieldMemory(belief, coarse, prior.days, prior.classes)
+        shift = memory_shift(coarse, mosaic.path / "mosaic.zarr", run.grid.factor)
+        memory = FieldMemory(belief, coarse, prior.days, prior.classes, shift)
     seen = (mosaic.path / "mosaic.zarr").resolve(), (patches.path / "patches.zarr").resolve()
     made = (path / "class_map.zarr").resolve(), (path / "belief.zarr").resolve()
     light, step = _light(run)
@@ -88,7 +92,9 @@ def _light(run: SurveyRun) -> tuple[float, int]:
     return (exposure_ms or run.camera.exposure_ms) / DEFAULT_EXPOSURE_MS, settings.scan_step or 1
 
 
-def _memory_told(run: SurveyRun, comparison: MemoryAgreement, *, put_aside: bool) -> dict[str, Any]:
+def _memory_told(
+    run: SurveyRun, comparison: MemoryAgreement, shift: tuple[int, int], *, put_aside: bool
+) -> dict[str, Any]:
     """What became of a memory: agreement with today's look, and pixels that changed from class to class."""
     assert run.prior is not None
     names, changed = run.weights.class_names, comparison.changed
@@ -99,6 +105,7 @@ def _memory_told(run: SurveyRun, comparison: MemoryAgreement, *, put_aside: bool
         "reader": "none" if run.reader is None else run.reader.key,
         "agreement": None if np.isnan(comparison.agreement) else comparison.agreement,
         "put_aside": put_aside,
+        "shift_px": list(shift),
         "compared_px": int(changed.sum()),
         "changed_px": 0 if put_aside else sum(count for count, _, _ in pairs),
         "changes": [] if put_aside else [list(pair) for pair in sorted(pairs, key=lambda pair: -pair[0])],

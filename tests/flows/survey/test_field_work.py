@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from flows.settings.load import load_settings
-from flows.survey.field_work import SHARD, Drawing, FieldWork, Scoring, WeightsFile, region_params
+from flows.survey.drawing import Drawing, draw_field
+from flows.survey.field_work import SHARD, FieldWork, Scoring, WeightsFile, region_params
 from flows.survey.run import SurveyRun, open_run
 from models.reading.regions import Region, plan_regions
 from pipeline.errors import SettingsError, WeightsError
@@ -52,7 +53,8 @@ def _draw(work: FieldWork, run: SurveyRun, stages: Path, out: Path) -> dict[str,
     create_class_map(out, run.scene.shape, legend, grid=run.angular_grid())
     create_belief(out.with_suffix(".belief"), run.scene.shape, legend, grid=run.angular_grid())
     mosaic, patches = _store(stages, "rectify/*/mosaic.zarr"), _store(stages, "patches/*/patches.zarr")
-    work.draw(Drawing(work.weights, mosaic, patches, out, out.with_suffix(".belief"), 1.0, 1), lambda done: None)
+    drawing = Drawing(work.weights, mosaic, patches, out, out.with_suffix(".belief"), 1.0, 1)
+    draw_field(work, drawing, lambda done: None)
     return _contents(out)
 
 
@@ -115,7 +117,8 @@ def test_a_worker_goes_region_by_region(
     """What it held for the mosaic is given back before a region is read; each region moves the bar."""
     run, stages = surveyed
     let_go: list[bool] = []
-    monkeypatch.setattr("flows.survey.field_work.let_tiles_go", lambda: let_go.append(True))
+    for module in ("field_work", "drawing"):
+        monkeypatch.setattr(f"flows.survey.{module}.let_tiles_go", lambda: let_go.append(True))
     work = _work(run, Crew(workers=1), 1)
     work.score("entropy", _store(stages, "rectify/*/mosaic.zarr"), lambda done: None)
     assert len(let_go) == 2

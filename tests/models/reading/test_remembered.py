@@ -166,14 +166,15 @@ def test_coarse_looks_that_cannot_be_compared_change_nothing() -> None:
 
 
 def test_a_fresh_reader_weighs_both_witnesses_by_its_gates() -> None:
-    """Before it has learned anything: half the memory, half the product of it to the power .9 and of the look to .5."""
+    """Untaught: .73 of the memory, .27 of its product to the power .9 with the look to the power .5."""
     rng = np.random.default_rng(2)
     memory, look = a_memory(rng, days=0.0), a_look(rng)
     reader = MemoryReader(MemorySizes(CLASSES, COLUMNS, FACTOR)).eval()
     old, new = (np.exp(one.log_probability.astype(np.float64)) for one in (memory.belief, look))
     old /= old.sum(axis=-1, keepdims=True)
     product = old ** (1 / (1 + math.exp(-2.2))) * new**0.5
-    expected = old / 2 + product / product.sum(axis=-1, keepdims=True) / 2
+    replaced = 1 / (1 + math.e)
+    expected = (1 - replaced) * old + replaced * product / product.sum(axis=-1, keepdims=True)
     found = recall(memory, look, reader).log_probability
     np.testing.assert_allclose(np.exp(found), np.maximum(expected, math.exp(FAINTEST)), atol=1e-5)
 

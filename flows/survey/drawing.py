@@ -1,0 +1,206 @@
+"""A field's map drawn region by region: what was seen today, weighed against what is remembered of the field.
+
+As in `flows.survey.field_work` a worker gets paths and numbers, and arrays never travel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import reduce
+from operator import add
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.survey.field_work import FieldWork, WeightsFile, look_at, seat_columns
+from models.reading.inference import CoarseLook, segment
+from models.reading.regions import Region
+from models.reading.remembered import (
+    Belief,
+    Looked,
+    MemoryAgreement,
+    Remembered,
+    changed_shares,
+    compare,
+    first_belief,
+    in_classes,
+    recall,
+)
+from models.weights.files import Weights
+from pipeline.rectify.registration.overlaps import BROAD_BANDS
+from pipeline.rectify.registration.shifts import pair_shift
+from storage.arrays.beliefs import BeliefStore, write_belief_tile
+from storage.arrays.class_maps import write_class_tile
+from storage.arrays.layout import SHARD_ROWS, open_group, read_array, read_bands
+from storage.arrays.mosaics import open_patches
+from storage.arrays.tile_work import let_tiles_go
+from storage.parallel.crew import run_blocks
+
+Strange = tuple[int, int]  # coarse pixels, and fine ones, with a value that is no reading
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """Draws a region of the class map into its store: what a worker needs for that."""
+
+    weights: WeightsFile
+    mosaic: Path
+    patches: Path
+    out: Path  # of the class map
+    belief: Path
+    light: float  # exposure of a line that is read in detail, as a share of the reference
+    step: int  # pixels from such a line to the next
+    memory: FieldMemory | None = None  # what is remembered of the field
+
+    def __call__(self, region: Region) -> Drawn:
+        """Read what was seen of the region coarsely and finely, and store the part of the map that is kept."""
+        let_tiles_go()
+        weights, store = self.weights.load(), open_patches(self.patches)
+        seen = look_at(weights, self.mosaic, region)
+        strange = np.zeros(region.grid.seat_shape, np.int64)
+        seats, columns = seat_columns(weights, store, store.wavelength_nm, seen, region, strange=strange.ravel())
+        drawn = segment(weights, seen, columns, seats, every_class=True)
+        assert drawn.log_probability is not None
+        looked = self._looked(region, drawn.log_probability, seats, seen)
+        classes, confidence = drawn.classes, drawn.confidence
+        comparison, changed = None, None
+        if self.memory is None:
+            after = first_belief(looked)
+        else:
+            remembered = self.memory.of(region, weights)
+            after = recall(remembered, looked, self.weights.load_reader())
+            classes, confidence = after.classes()
+            comparison = compare(remembered, looked, after, region.kept_here)
+            changed = changed_shares(remembered, after, region.grid.patch)
+        origin = region.kept.top, region.kept.left
+        write_class_tile(self.out, origin, region.crop(classes), region.crop(confidence))
+        write_belief_tile(self.belief, origin, *map(region.crop, (after.log_probability, after.age_days, after.light)))
+        coarse = 0 if seen.strange is None else int(np.count_nonzero(region.crop_coarse(seen.strange)))
+        return Drawn((coarse, int(region.crop_seats(strange).sum())), comparison, changed)
+
+    def _looked(
+        self, region: Region, log_probability: NDArray[np.float32], seats: NDArray[np.int64], seen: CoarseLook
+    ) -> Looked:
+        grid = region.grid
+        detailed = np.zeros(grid.seat_shape, np.bool_)
+        detailed.ravel()[seats] = True
+        pixels = np.repeat(np.repeat(detailed, grid.patch, axis=0), grid.patch, axis=1)[: grid.height, : grid.width]
+        return Looked(log_probability, pixels, seen.columns, self.light, self.step)
+
+
+@dataclass(frozen=True)
+class FieldMemory:
+    """Where the memory of a field lies, and how it is to be read."""
+
+    belief: Path
+    mosaic: Path
+    days: float
+    classes: tuple[int, ...]  # see `flows.survey.memory.Prior`
+    shift_px: tuple[int, int] = (0, 0)  # down and to the right, that brings it onto today's look
+
+    def of(self, region: Region, weights: Weights) -> Remembered:
+        """Read what is remembered of a region, in the classes of the weights."""
+        store, down, across = BeliefStore(self.belief), *self.shift_px
+        rows, row_gap = _moved(region.read.rows, down, store.shape[0])
+        columns, column_gap = _moved(region.read.columns, across, store.shape[1])
+        gaps = row_gap, column_gap
+        values, age, light = (_framed(part, gaps) for part in store.read(rows, columns))
+        if self.classes != tuple(range(values.shape[-1])):
+            values = in_classes(values, self.classes)
+        coarse, cell = look_at(weights, self.mosaic, region).columns, region.grid.factor
+        moves = [
+            _moved(slice(0, size), round(by / cell), size)
+            for size, by in zip(coarse.shape, self.shift_px, strict=False)
+        ]
+        seen = coarse[moves[0][0], moves[1][0]]
+        return Remembered(
+            Belief(values, age, np.nan_to_num(light)), _framed(seen, (moves[0][1], moves[1][1])), self.days
+        )
+
+
+Gap = tuple[int, int]  # what lies before the first and behind the last
+
+
+def _moved(part: slice, by: int, size: int) -> tuple[slice, Gap]:
+    """Where a part of an axis of ``size`` lies before it is moved ``by``, and what of it lies beyond the ends."""
+    start, stop = part.start - by, part.stop - by
+    first, last = min(max(start, 0), size), min(max(stop, 0), size)
+    whole = stop - start
+    before = min(max(-start, 0), whole)
+    return slice(first, last), (before, whole - before - (last - first))
+
+
+def _framed(values: NDArray[np.float32], gaps: tuple[Gap, Gap]) -> NDArray[np.float32]:
+    """Images (y, x, ...) with NaN where nothing lies."""
+    if not any(map(any, gaps)):
+        return values
+    return np.pad(values, [*gaps, *[(0, 0)] * (values.ndim - 2)], constant_values=np.nan)
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What a worker says of a region that it drew."""
+
+    strange: Strange
+    comparison: MemoryAgreement | None  # with what was remembered
+    changed: NDArray[np.float32] | None  # (seat_y, seat_x) of the region's scene
+
+
+@dataclass(frozen=True)
+class DrawnField:
+    """What was found while a map was drawn."""
+
+    strange: Strange
+    comparison: MemoryAgreement | None  # with what was remembered; None of a field's first look
+    changed: NDArray[np.float32] | None  # (seat_y, seat_x) share of pixels with another class than remembered
+
+
+def draw_field(field: FieldWork, work: Drawing, report: Callable[[float], None]) -> DrawnField:
+    """Draw class map and belief into the stores that were created for them; count pixels that were left out.
+
+    These are the coarse pixels, and the fine ones, with a value that the weights take for no reading. Raises
+    SettingsError: not even one region at a time fits the memory.
+    """
+    store = open_patches(work.patches)
+    crew = field.crew_for(store.seats, len(store.wavelength_nm))
+    remembered = () if work.memory is None else (work.memory.belief, work.memory.mosaic)
+    paths = (work.mosaic, work.patches, work.out, work.belief, *remembered)
+    parts: list[Drawn] = run_blocks(work, field.regions, crew, report=report, paths=paths)
+    strange = sum(part.strange[0] for part in parts), sum(part.strange[1] for part in parts)
+    compared = [part.comparison for part in parts if part.comparison is not None]
+    changed = None
+    if compared:
+        changed = np.zeros(field.regions[0].field.seat_shape, np.float32)
+        for region, part in zip(field.regions, parts, strict=True):
+            assert part.changed is not None
+            whole = np.zeros(region.grid.seat_shape, np.float32)
+            whole[: part.changed.shape[0], : part.changed.shape[1]] = part.changed
+            changed[region.kept_seats.rows, region.kept_seats.columns] = region.crop_seats(whole)
+    return DrawnField(strange, reduce(add, compared) if compared else None, changed)
+
+
+REACH_PX = 64.0  # within which a memory that lies beside today's look is found
+LEAST_SHIFT = 0.3  # of a coarse pixel; less is how well two looks can be laid on each other
+
+
+def memory_shift(before: Path, now: Path, factor: int) -> tuple[int, int]:
+    """How far down and to the right, in fine px, a stored coarse mosaic has to be moved to lie on another.
+
+    Nothing where the two do not say, or where it is no more than a look may be off.
+    """
+    found = pair_shift(_broad_image(now), _broad_image(before), prior_px=REACH_PX / factor)
+    if found.status != "found" or np.hypot(*found.shift) < LEAST_SHIFT:
+        return 0, 0
+    down, across = np.rint(factor * found.shift).astype(int).tolist()
+    return down, across
+
+
+def _broad_image(mosaic: Path) -> NDArray[np.float32]:
+    """The mean of a few bands of a stored mosaic, (y, x); NaN where nothing was captured."""
+    group = open_group(mosaic)
+    bands = np.unique(np.linspace(0, len(read_bands(group)[0]) - 1, BROAD_BANDS).astype(int))
+    height = len(read_array(group, "coverage"))
+    blocks = (slice(first, min(first + SHARD_ROWS, height)) for first in range(0, height, SHARD_ROWS))
+    return np.concatenate([read_array(group, "values", rows)[..., bands].mean(axis=-1) for rows in blocks])
