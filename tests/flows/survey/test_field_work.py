@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from flows.settings.load import load_settings
-from flows.survey.drawing import Drawing, draw_field
+from flows.survey.drawing import Drawing, FieldMemory, draw_field
 from flows.survey.field_work import SHARD, FieldWork, Scoring, WeightsFile, region_params
 from flows.survey.run import SurveyRun, open_run
-from models.reading.regions import Region, plan_regions
+from models.reading.regions import Region, plan_regions, whole_field
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
 from storage.arrays.beliefs import create_belief
@@ -166,3 +166,28 @@ def test_weights_that_changed_are_refused(tmp_path: Path, weights: Path) -> None
 def test_only_keys_of_fields_that_are_cut_know_of_regions(size: tuple[int, int]) -> None:
     """What was stored of a field up to the limit is found again; a larger one is another result than read whole."""
     assert bool(region_params(SceneGrid(*size, 16, 4))) == (max(size) > 2560)
+
+
+@pytest.mark.parametrize("shift", [(0, 0), (8, -20), (-500, 3), (-3, 500)])
+def test_a_memory_is_moved_and_leaves_nothing_behind(surveyed: tuple[SurveyRun, Path], shift: tuple[int, int]) -> None:
+    """What lay at a pixel lies ``shift`` further, in fine and coarse pixels alike, and nothing where it came from."""
+    run, stages = surveyed
+    belief, mosaic = _store(stages, "segment/*/belief.zarr"), _store(stages, "rectify/*/mosaic.zarr")
+    region = whole_field(run.grid)
+    classes = tuple(range(len(run.weights.class_names)))
+    still = FieldMemory(belief, mosaic, 1.0, classes).of(region, run.weights)
+    moved = FieldMemory(belief, mosaic, 1.0, classes, shift).of(region, run.weights)
+    coarse = tuple(round(by / run.grid.factor) for by in shift)
+    assert still.coarse is not None
+    assert moved.coarse is not None
+    pairs = [
+        (still.belief.log_probability, moved.belief.log_probability, shift),
+        (still.belief.age_days, moved.belief.age_days, shift),
+        (still.coarse, moved.coarse, coarse),
+    ]
+    for before, now, by in pairs:
+        expected = np.full_like(before, np.nan)
+        there = [slice(max(one, 0), max(size + min(one, 0), 0)) for one, size in zip(by, before.shape, strict=False)]
+        here = [slice(max(-one, 0), max(size - max(one, 0), 0)) for one, size in zip(by, before.shape, strict=False)]
+        expected[tuple(there)] = before[tuple(here)]
+        np.testing.assert_array_equal(now, expected)

@@ -240,9 +240,7 @@ def test_a_survey_in_two_passes_remembers_where_it_did_not_look(survey_png: Surv
     assert set(np.unique(belief.age.values).tolist()) == {0.0, 3.0}
 
 
-def test_a_rig_that_was_moved_finds_its_memory(
-    survey_png: Survey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_rig_that_was_moved_finds_its_memory(survey_png: Survey, tmp_path: Path) -> None:
     """A field that lies 12 px lower and 20 px further left than it did: its memory is brought there, edges are new."""
     values, labels = patchy_scene((160, 192), 3, seed=5)
     places = {"before": np.s_[12:140, 0:160], "now": np.s_[0:128, 20:180]}
@@ -253,12 +251,8 @@ def test_a_rig_that_was_moved_finds_its_memory(
         flags[name] = {"scene": str(tmp_path / f"{name}.png"), "labels": str(tmp_path / f"{name}-labels.png")}
     out = tmp_path / "archive"
     survey_png(out, **PLAIN, **flags["before"], visit=FIRST)
-    blind = Path(shutil.copytree(out, tmp_path / "blind"))
     words, later = words_of(out, survey_png, **flags["now"], visit=LATER, prior="latest")
     assert later.receipt["memory"]["shift_px"] == [12, -20]
     assert "which lay 23 px beside it" in words
     belief = xr.open_zarr(out / later.receipt["products"]["belief"], consolidated=False)
     assert np.isfinite(belief.age.values).all()
-    monkeypatch.setattr("flows.survey.stages.maps.memory_shift", lambda *looks: (0, 0))
-    unmoved = survey_png(blind, **PLAIN, **flags["now"], visit=LATER, prior="latest")
-    assert later.receipt["memory"]["agreement"] > unmoved.receipt["memory"]["agreement"] + 0.1
