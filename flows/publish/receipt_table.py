@@ -173,6 +173,10 @@ def _memory_words(memory: Mapping[str, Any]) -> str:
     """What became of the memory that the map goes on from."""
     since = f"{memory['run']}, {days_words(memory['days'])}"
     alike = "nothing" if memory["agreement"] is None else format_percent(memory["agreement"])
+    if memory["put_aside"] == "turned":
+        return (
+            f"What {since}, left was put aside: the rig was turned since, by {abs(memory['turned_deg']):.1f} degrees."
+        )
     if memory["put_aside"]:
         return (
             f"What {since}, left was put aside: today's look shows {alike} of the field as it is remembered, as of "

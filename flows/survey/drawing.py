@@ -5,8 +5,9 @@ As in `flows.survey.field_work` a worker gets paths and numbers, and arrays neve
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
 from pathlib import Path
@@ -29,8 +30,8 @@ from models.reading.remembered import (
     recall,
 )
 from models.weights.files import Weights
+from pipeline.rectify.registration.field_shift import FieldShift, field_shift
 from pipeline.rectify.registration.overlaps import BROAD_BANDS
-from pipeline.rectify.registration.shifts import pair_shift
 from storage.arrays.beliefs import BeliefStore, write_belief_tile
 from storage.arrays.class_maps import write_class_tile
 from storage.arrays.layout import SHARD_ROWS, open_group, read_array, read_bands
@@ -182,19 +183,19 @@ def draw_field(field: FieldWork, work: Drawing, report: Callable[[float], None])
 
 
 REACH_PX = 64.0  # within which a memory that lies beside today's look is found
-LEAST_SHIFT = 0.3  # of a coarse pixel; less is how well two looks can be laid on each other
+LEAST_SHIFT_PX = 1.2
 
 
-def memory_shift(before: Path, now: Path, factor: int) -> tuple[int, int]:
-    """How far down and to the right, in fine px, a stored coarse mosaic has to be moved to lie on another.
+def memory_lies(before: Path, now: Path, factor: int) -> FieldShift:
+    """How the field of a stored coarse mosaic lies beside that of another, in fine px."""
+    found = field_shift(_broad_image(now), _broad_image(before), reach_px=REACH_PX / factor)
+    return replace(found, shift=(factor * found.shift[0], factor * found.shift[1]))
 
-    Nothing where the two do not say, or where it is no more than a look may be off.
-    """
-    found = pair_shift(_broad_image(now), _broad_image(before), prior_px=REACH_PX / factor)
-    if found.status != "found" or np.hypot(*found.shift) < LEAST_SHIFT:
-        return 0, 0
-    down, across = np.rint(factor * found.shift).astype(int).tolist()
-    return down, across
+
+def whole_pixels(lies: FieldShift) -> tuple[int, int]:
+    """Rows and columns to move a memory by; none where it lies as well as looks can be laid on each other."""
+    down, across = lies.shift
+    return (0, 0) if math.hypot(down, across) < LEAST_SHIFT_PX else (round(down), round(across))
 
 
 def _broad_image(mosaic: Path) -> NDArray[np.float32]:

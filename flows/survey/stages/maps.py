@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.survey.drawing import Drawing, FieldMemory, draw_field, memory_shift
+from flows.survey.drawing import Drawing, FieldMemory, draw_field, memory_lies, whole_pixels
 from flows.survey.field_work import FieldWork, look_at, region_params, seat_columns
 from flows.survey.run import SurveyRun
 from flows.survey.stage import Product, Wanted, stage
@@ -18,6 +18,7 @@ from models.reading.regions import whole_field
 from models.reading.remembered import MemoryAgreement
 from pipeline.ground.map_grid import GroundGrid, classes_at, ground_grid, image_at, map_blocks
 from pipeline.ground.view import GroundView
+from pipeline.rectify.registration.field_shift import FieldShift
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS
 from storage.archive.keys import StageRef, array_digest
 from storage.archive.manifests import read_table, write_table
@@ -30,6 +31,7 @@ from storage.arrays.quicklooks import choose_bands, develop, stretch
 
 CLASS_MAP = Product("segment", version=6, files=("class_map.zarr", "belief.zarr"), by_weights=True)
 STRANGE = "strange.json"  # beside a map, where values were no readings
+MOST_TURN_PX = 4.0  # that a field's corners may lie off by, as it is turned, so that its memory is of use
 MEMORY = "memory.json"  # beside a map that goes on from an earlier one: what became of the memory
 
 
@@ -39,14 +41,13 @@ def draw_map(run: SurveyRun, mosaic: StageRef, patches: StageRef) -> Wanted:
 
     def build(path: Path) -> None:
         work, out = FieldWork.of(run), path / "class_map.zarr"
-        drawing = _drawing(run, work, mosaic, patches, path)
+        lies = _memory_lies(run, mosaic)
+        drawing = _drawing(run, work, mosaic, patches, path, lies)
         drawn = draw_field(work, drawing, run.report)
-        if drawn.comparison is not None:
-            put_aside = drawn.comparison.is_of_another_field
-            assert drawing.memory is not None
-            shift = drawing.memory.shift_px
-            write_table(path / MEMORY, _memory_told(run, drawn.comparison, shift, put_aside=put_aside))
-            if put_aside:
+        if run.prior is not None:
+            told = _memory_told(run, lies, drawn.comparison)
+            write_table(path / MEMORY, told)
+            if told["put_aside"] is not None and drawn.comparison is not None:
                 drawn = draw_field(work, replace(drawing, memory=None), run.report)
         if drawn.changed is not None:
             write_changes(path / "belief.zarr", drawn.changed)
@@ -68,17 +69,29 @@ def draw_map(run: SurveyRun, mosaic: StageRef, patches: StageRef) -> Wanted:
     return Wanted(build, params, [mosaic, patches, *(() if prior is None else (prior.belief, prior.mosaic))])
 
 
-def _drawing(run: SurveyRun, work: FieldWork, mosaic: StageRef, patches: StageRef, path: Path) -> Drawing:
+def _memory_lies(run: SurveyRun, mosaic: StageRef) -> FieldShift:
+    """How the field of before lies beside the one of today, in fine px."""
+    if run.prior is None:
+        return FieldShift()
+    return memory_lies(run.prior.mosaic.path / "mosaic.zarr", mosaic.path / "mosaic.zarr", run.grid.factor)
+
+
+def _is_turned(run: SurveyRun, lies: FieldShift) -> bool:
+    return lies.edge_px((run.grid.height, run.grid.width)) > MOST_TURN_PX
+
+
+def _drawing(
+    run: SurveyRun, work: FieldWork, mosaic: StageRef, patches: StageRef, path: Path, lies: FieldShift
+) -> Drawing:
     """What workers need to draw the map, into stores that are begun here."""
     legend, shape = ClassNames(run.weights.class_names, run.weights.class_colours), (run.grid.height, run.grid.width)
     create_class_map(path / "class_map.zarr", shape, legend, grid=run.angular_grid())
     create_belief(path / "belief.zarr", shape, legend, grid=run.angular_grid())
     prior = run.prior
     memory = None
-    if prior is not None:
+    if prior is not None and not _is_turned(run, lies):
         belief, coarse = (prior.belief.path / "belief.zarr").resolve(), (prior.mosaic.path / "mosaic.zarr").resolve()
-        shift = memory_shift(coarse, mosaic.path / "mosaic.zarr", run.grid.factor)
-        memory = FieldMemory(belief, coarse, prior.days, prior.classes, shift)
+        memory = FieldMemory(belief, coarse, prior.days, prior.classes, whole_pixels(lies))
     seen = (mosaic.path / "mosaic.zarr").resolve(), (patches.path / "patches.zarr").resolve()
     made = (path / "class_map.zarr").resolve(), (path / "belief.zarr").resolve()
     light, step = _light(run)
@@ -92,20 +105,22 @@ def _light(run: SurveyRun) -> tuple[float, int]:
     return (exposure_ms or run.camera.exposure_ms) / DEFAULT_EXPOSURE_MS, settings.scan_step or 1
 
 
-def _memory_told(
-    run: SurveyRun, comparison: MemoryAgreement, shift: tuple[int, int], *, put_aside: bool
-) -> dict[str, Any]:
+def _memory_told(run: SurveyRun, lies: FieldShift, comparison: MemoryAgreement | None) -> dict[str, Any]:
     """What became of a memory: agreement with today's look, and pixels that changed from class to class."""
     assert run.prior is not None
-    names, changed = run.weights.class_names, comparison.changed
+    names = run.weights.class_names
+    changed = np.zeros((len(names),) * 2, np.int64) if comparison is None else comparison.changed
+    agreement = None if comparison is None or np.isnan(comparison.agreement) else comparison.agreement
+    put_aside = "turned" if comparison is None else "another field" if comparison.is_of_another_field else None
     pairs = [(int(changed[old, new]), names[old], names[new]) for old, new in np.argwhere(changed) if old != new]
     return {
         "run": run.prior.run,
         "days": run.prior.days,
         "reader": "none" if run.reader is None else run.reader.key,
-        "agreement": None if np.isnan(comparison.agreement) else comparison.agreement,
+        "agreement": agreement,
         "put_aside": put_aside,
-        "shift_px": list(shift),
+        "shift_px": list(whole_pixels(lies)),
+        "turned_deg": lies.turned_deg,
         "compared_px": int(changed.sum()),
         "changed_px": 0 if put_aside else sum(count for count, _, _ in pairs),
         "changes": [] if put_aside else [list(pair) for pair in sorted(pairs, key=lambda pair: -pair[0])],

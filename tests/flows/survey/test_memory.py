@@ -14,6 +14,7 @@ import torch
 import xarray as xr
 from PIL import Image
 from rich.console import Console
+from scipy.ndimage import gaussian_filter, rotate
 
 from flows.archive.plan_command import plan_content
 from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
@@ -80,7 +81,7 @@ def test_a_later_look_goes_on_from_the_one_before(twice: tuple[Path, Any, Any]) 
     """Receipt, page and manifest name it; the days between are those of the visits."""
     out, first, later = twice
     memory = later.receipt["memory"]
-    assert (memory["run"], memory["days"], memory["put_aside"]) == (first.folder.name, 3.0, False)
+    assert (memory["run"], memory["days"], memory["put_aside"]) == (first.folder.name, 3.0, None)
     assert later.receipt["settings"]["prior"] == first.folder.name
     assert memory["agreement"] > 0.9  # it is the same picture with other noise
     page = (later.folder / "report.html").read_text(encoding="utf-8")
@@ -145,7 +146,7 @@ def test_another_field_under_the_same_name_is_put_aside(visited: Path, survey_pn
     }
     words, wrong = words_of(visited, survey_png, **flags, prior="latest")
     alone = survey_png(tmp_path / "alone", **{**PLAIN, **flags})
-    assert wrong.receipt["memory"]["put_aside"]
+    assert wrong.receipt["memory"]["put_aside"] == "another field"
     assert "left was put aside: today's look shows" in words
     np.testing.assert_array_equal(class_map(visited, wrong), class_map(tmp_path / "alone", alone))
     belief = xr.open_zarr(visited / wrong.receipt["products"]["belief"], consolidated=False)
@@ -256,3 +257,22 @@ def test_a_rig_that_was_moved_finds_its_memory(survey_png: Survey, tmp_path: Pat
     assert "which lay 23 px beside it" in words
     belief = xr.open_zarr(out / later.receipt["products"]["belief"], consolidated=False)
     assert np.isfinite(belief.age.values).all()
+
+
+def test_a_rig_that_was_turned_is_noticed(survey_png: Survey, tmp_path: Path) -> None:
+    """By four degrees: its memory is put aside, and receipt and page say by how much."""
+    values, _ = patchy_scene((300, 320), 3, seed=6)
+    soft = gaussian_filter(values, (1.5, 1.5, 0))
+    there = np.s_[2:290, 8:312]
+    images = {"before": soft[there], "now": rotate(soft, 4.0, reshape=False, order=1, mode="nearest")[there]}
+    for name, image in images.items():
+        Image.fromarray(np.clip(image, 0, 255).astype(np.uint8)).save(tmp_path / f"{name}.png")
+    flags = {**PLAIN, "labels": None}
+    survey_png(tmp_path / "a", **flags, scene=str(tmp_path / "before.png"), visit=FIRST)
+    now = {"labels": None, "scene": str(tmp_path / "now.png"), "visit": LATER, "prior": "latest"}
+    words, later = words_of(tmp_path / "a", survey_png, **now)
+    assert later.receipt["memory"]["put_aside"] == "turned"
+    assert abs(later.receipt["memory"]["turned_deg"]) == pytest.approx(4.0, abs=0.3)
+    assert "was put aside: the rig was turned since, by 4.0 degrees" in words.replace("3.9", "4.0").replace(
+        "4.1", "4.0"
+    )

@@ -1,0 +1,99 @@
+"""How a whole field lies beside an earlier look at it: moved, and turned, by what windows of two coarse images say.
+
+Crops grow between two looks, shadows go round and leaves fall: a window may say what is not so. What most windows say
+together is believed.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise, product
+
+import numpy as np
+from numpy.typing import NDArray
+from skimage.measure import ransac
+from skimage.transform import EuclideanTransform
+
+from pipeline.rectify.registration.shifts import pair_shift
+
+WINDOWS = 3  # along either side of a field
+LEAST_WINDOW_PX = 24  # on a side; a smaller field is compared as one
+WINDOW_REACH_PX = 8.0  # what the shift of one window may differ by from that of the field
+AGREE_PX = 0.5  # within which windows say the same
+LEAST_WINDOWS, LEAST_SHARE = 4, 0.6  # that have to agree, and of those that say something
+TRIALS = 200
+
+
+@dataclass(frozen=True)
+class FieldShift:
+    """What brings an earlier image onto a later one: ``shift`` rows and columns [px], then ``turned_deg`` about it."""
+
+    shift: tuple[float, float] = (0.0, 0.0)
+    turned_deg: float = 0.0
+
+    def edge_px(self, shape: tuple[int, ...]) -> float:
+        """How far the corners of a field of (y, x) ``shape`` move by the turn alone."""
+        return math.radians(abs(self.turned_deg)) * math.hypot(*shape[:2]) / 2
+
+
+def field_shift(now: NDArray[np.floating], before: NDArray[np.floating], *, reach_px: float) -> FieldShift:
+    """Find how ``before`` lies beside ``now``, two (y, x) broad-band images of one field with NaN where nothing is.
+
+    No more than ``reach_px`` is looked for. Nothing is said where no two looks agree on it: fields that changed all
+    over, or that show nothing. Raises ShapeError as `pair_shift`.
+    """
+    whole = pair_shift(now, before, prior_px=reach_px)
+    start = np.rint(whole.shift) if whole.status == "found" else np.zeros(2)
+    if min(now.shape) < WINDOWS * LEAST_WINDOW_PX:
+        return FieldShift((float(whole.shift[0]), float(whole.shift[1]))) if whole.status == "found" else FieldShift()
+    found = _of_windows(now, _moved_by(before, start)) if start.any() else []
+    there = _of_windows(now, before)
+    best = max((_agreed(there, np.zeros(2), now.shape), _agreed(found, start, now.shape)), key=lambda one: one[0])
+    return best[1]
+
+
+Pairs = list[tuple[NDArray[np.float64], NDArray[np.float64]]]  # middle of a window, and its shift
+
+
+def _of_windows(now: NDArray[np.floating], before: NDArray[np.floating]) -> Pairs:
+    """What windows say that say anything."""
+    edges = [np.linspace(0, size, WINDOWS + 1).astype(int).tolist() for size in now.shape]
+    pairs: Pairs = []
+    for (top, bottom), (left, right) in product(pairwise(edges[0]), pairwise(edges[1])):
+        window = np.s_[top:bottom, left:right]
+        found = pair_shift(now[window], before[window], prior_px=WINDOW_REACH_PX)
+        if found.status == "found":
+            pairs.append((np.array([(top + bottom) / 2, (left + right) / 2]), found.shift))
+    return pairs
+
+
+def _agreed(pairs: Pairs, start: NDArray[np.float64], shape: tuple[int, ...]) -> tuple[int, FieldShift]:
+    """How many windows agree, and on what; 0 and nothing where too few do."""
+    if len(pairs) < LEAST_WINDOWS:
+        return 0, FieldShift()
+    middle = np.array(shape[:2]) / 2
+    places = np.array([place - middle for place, _ in pairs])
+    moved = places + np.array([shift for _, shift in pairs])
+    model, inliers = ransac(  # type: ignore[no-untyped-call]
+        (places, moved), EuclideanTransform, min_samples=2, residual_threshold=AGREE_PX, max_trials=TRIALS, rng=0
+    )
+    count = 0 if inliers is None else int(inliers.sum())
+    if model is None or count < max(LEAST_WINDOWS, LEAST_SHARE * len(pairs)):
+        return 0, FieldShift()
+    down, across = (model.translation + start).tolist()
+    return count, FieldShift((float(down), float(across)), math.degrees(model.rotation))
+
+
+def _moved_by(image: NDArray[np.floating], by: NDArray[np.float64]) -> NDArray[np.floating]:
+    """An image as many whole pixels further down and to the right, NaN where it came from."""
+    moved = np.full_like(image, np.nan)
+    down, across = by.astype(int).tolist()
+    there = tuple(
+        slice(max(one, 0), max(size + min(one, 0), 0)) for one, size in zip((down, across), image.shape, strict=True)
+    )
+    here = tuple(
+        slice(max(-one, 0), max(size - max(one, 0), 0)) for one, size in zip((down, across), image.shape, strict=True)
+    )
+    moved[there] = image[here]
+    return moved
