@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -19,6 +19,7 @@ from flows.publish.receipt_table import LEAST_HECTARES, area_words
 from flows.publish.report import render_page
 from flows.schedule.date_charts import Chart, line_chart
 from flows.schedule.field_schedule import ENDINGS, read_moment
+from flows.schedule.visit_pictures import VisitPicture, visit_pictures
 from flows.survey.scores import score_of
 from flows.terminal.figures import DASH, counted, format_percent, known_number
 from flows.terminal.processes import DONE
@@ -41,6 +42,7 @@ class FieldHistory:
     archive: str
     runs: Sequence[Mapping[str, Any]]
     events: Sequence[Mapping[str, Any]]
+    visits: Sequence[VisitPicture] = ()
 
     @property
     def counts(self) -> dict[str, int]:
@@ -79,12 +81,12 @@ def _history(archive: Archive, catalogue: Catalogue, name: str, ledger: Ledger |
     lines = [] if ledger is None else ledger.lines()
     events = [line for line in lines if line.get("event") in (*ENDINGS, "passed")]
     by_run = {line["run"]: line for line in events if isinstance(line.get("run"), str)}
-    rows = [
-        _row(archive, catalogue, run, by_run.get(run.uri, {}))
-        for run in catalogue.runs
-        if run.uri in by_run or called(run) == name
+    own = [run for run in catalogue.runs if run.uri in by_run or called(run) == name]
+    rows = [_row(archive, catalogue, run, by_run.get(run.uri, {})) for run in own]
+    looked = [
+        (run, _short(str(row["visit"] or row["due"] or row["created"]))) for run, row in zip(own, rows, strict=True)
     ]
-    return FieldHistory(name, archive.name, rows, events)
+    return FieldHistory(name, archive.name, rows, events, visit_pictures(archive, looked))
 
 
 def _row(archive: Archive, catalogue: Catalogue, run: Run, line: Mapping[str, Any]) -> dict[str, Any]:
@@ -101,7 +103,9 @@ def _row(archive: Archive, catalogue: Catalogue, run: Run, line: Mapping[str, An
         "run": run.uri,
         "created": run.created,
         "due": line.get("due"),
+        "visit": run.settings.get("visit"),
         "attempts": line.get("attempts"),
+        "capture_seconds": _seconds(savings),
         **score_of(receipt),
         "savings": {
             name: known_number(entry.get("ratio")) if isinstance(entry := savings.get(name), Mapping) else None
@@ -112,6 +116,13 @@ def _row(archive: Archive, catalogue: Catalogue, run: Run, line: Mapping[str, An
         "unit": unit,
         "problem": run.problem,
     }
+
+
+def _seconds(savings: Mapping[str, Any]) -> dict[str, float | None]:
+    """Seconds at the camera, of this run and of scanning everything."""
+    entry = savings.get("capture_s")
+    told = entry if isinstance(entry, Mapping) else {}
+    return {"done": known_number(told.get("done")), "full": known_number(told.get("full"))}
 
 
 def _covered(archive: Archive, catalogue: Catalogue, run: Run) -> tuple[dict[str, float], str]:
@@ -133,8 +144,8 @@ def _covered(archive: Archive, catalogue: Catalogue, run: Run) -> tuple[dict[str
 
 
 def day_of(row: Mapping[str, Any]) -> float | None:
-    """When a row's run was due or else published, in seconds since 1970; None where that is not known."""
-    moment = read_moment(row.get("due")) or read_moment(row.get("created"))
+    """When a row's run looked, was due or else published, in seconds since 1970; None where that is not known."""
+    moment = next((at for name in ("visit", "due", "created") if (at := read_moment(row.get(name))) is not None), None)
     return None if moment is None else moment.timestamp()
 
 
@@ -191,6 +202,7 @@ def render_history(history: FieldHistory, runs_at: str) -> str:
         about=f"{history.archive}; times in UTC",
         areas=_areas(history.runs),
         savings=_savings(history.runs),
+        visits=[asdict(one) for one in history.visits],
         troubles=[_trouble(event) for event in reversed(troubles[-MOST_ROWS:])],
         older_troubles=len(troubles) - MOST_ROWS,
         runs=[_run(row, runs_at) for row in reversed(history.runs[-MOST_ROWS:])],
@@ -259,7 +271,24 @@ def _savings(runs: Rows) -> list[Chart]:
         for labels in (SAVINGS, SCORES)
     )
     drawn = [line_chart(spent, "Share of everything", "%")]
-    return [*drawn, line_chart(scores, "Score against the truth", "%")] if scores else drawn
+    drawn += [line_chart(scores, "Score against the truth", "%")] if scores else []
+    return [*drawn, line_chart(_summed_seconds(runs), "Seconds at the camera, all visits so far", "s")]
+
+
+def _summed_seconds(runs: Rows) -> dict[str, list[tuple[float, float]]]:
+    """What all visits up to each took, and what scanning everything every time would have."""
+    dated = sorted(
+        ((moment, row["capture_seconds"]))
+        for row in runs
+        if (moment := day_of(row)) is not None and None not in row["capture_seconds"].values()
+    )
+    names, spent = {"done": "these visits", "full": "everything, every time"}, {"done": 0.0, "full": 0.0}
+    points: dict[str, list[tuple[float, float]]] = {label: [] for label in names.values()}
+    for moment, seconds in dated:
+        for name, label in names.items():
+            spent[name] += seconds[name]
+            points[label].append((moment, spent[name]))
+    return {label: found for label, found in points.items() if found}
 
 
 def _trouble(event: Mapping[str, Any]) -> dict[str, str]:

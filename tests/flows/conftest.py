@@ -56,31 +56,38 @@ def problems(out: Path) -> list[str]:
 
 
 class Page(HTMLParser):
-    """A page whose tags close in order: its links, what else it would load from elsewhere, and its tags."""
+    """A page whose tags close in order: its links, what else it would load from elsewhere, and its own scripts."""
 
     def __init__(self, page: str) -> None:
         super().__init__()
         self.links: list[str] = []
         self.loaded: list[str] = []
         self.open: list[str] = []
+        self.scripts: list[str] = []
         self.feed(page)
         self.close()
         assert not self.open
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Remember addresses; tags without an end are not open, and scripts and frames are none of ours."""
-        assert tag not in ("script", "link", "iframe")
+        """Remember addresses; tags without an end are not open, frames and scripts of elsewhere are none of ours."""
+        assert tag not in ("link", "iframe")
+        assert tag != "script" or not attrs
         found = [str(value) for name, value in attrs if name in ("src", "href", "srcset", "action", "xlink:href")]
         if tag == "a":
             self.links += found
         self.loaded += [one for one in found if tag != "a" and not one.startswith("#")]  # but for parts of the page
-        if tag not in ("meta", "img"):
+        if tag not in ("meta", "img", "input"):
             self.open.append(tag)
+
+    def handle_data(self, data: str) -> None:
+        """Keep what runs."""
+        if self.open and self.open[-1] == "script":
+            self.scripts.append(data)
 
     def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         """Nothing is open after it."""
         self.handle_starttag(tag, attrs)
-        if tag not in ("meta", "img"):
+        if tag not in ("meta", "img", "input"):
             self.open.pop()
 
     def handle_endtag(self, tag: str) -> None:

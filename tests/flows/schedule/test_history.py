@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +28,7 @@ def archive(tmp_path_factory: pytest.TempPathFactory, survey_png: Any) -> Path:
     """Two surveys of one field, one of another, and a ledger that knows the first and three troubles."""
     root = tmp_path_factory.mktemp("history") / "archive"
     first = survey_png(root, name="north", visit="a").folder
-    survey_png(root, name="north", visit="b")
+    survey_png(root, name="north", visit=f"b {BAD}")
     survey_png(root, name="south")
     ledger = Ledger(root, "north")
     due = {"at": "2026-06-01T10:00:20Z", "due": "2026-06-01T10:00:00Z"}
@@ -70,13 +72,14 @@ def test_runs_and_ledger_are_one_history(archive: Path) -> None:
 
 
 def test_pages_load_nothing_and_lead_to_reports(archive: Path, command_line: Any, tmp_path: Path) -> None:
-    """Without script, every word escaped; each link is a file that is there, on a field's page and on the index."""
+    """With no script but the player's, every word escaped; each link is a file that is there, on either page."""
     page = tmp_path / "pages" / "history.html"
     ended = command_line("report", archive, "--field", "north", "-o", page)
     assert ended.code == 0, ended.err
     text = page.read_text(encoding="utf-8")
     found = Page(text)
-    assert found.loaded == []
+    assert [one for one in found.loaded if not one.startswith("data:image/png;base64,")] == []
+    assert len(found.scripts) == 1
     assert BAD not in text
     assert "&lt;script&gt;" in text
     assert not re.search(r"https?://|@import|url\(", text)
@@ -89,6 +92,32 @@ def test_pages_load_nothing_and_lead_to_reports(archive: Path, command_line: Any
     found = Page(page.read_text(encoding="utf-8"))
     assert sorted(found.links) == ["index-north.html", "index-south.html"]
     assert all((tmp_path / link).is_file() for link in found.links)
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed: no page can be tried")
+def test_a_page_plays_the_visits(archive: Path, command_line: Any, tmp_path: Path) -> None:
+    """In a browser the slider shows the visit that it stands at, and Play begins with the first."""
+    page = tmp_path / "history.html"
+    assert command_line("report", archive, "--field", "north", "-o", page).code == 0
+    text = page.read_text(encoding="utf-8")
+    shown = {}
+    for name, act in {
+        "last": "",
+        "first": "which.value = 0; which.dispatchEvent(new Event('input'));",
+        "played": "play.click();",
+    }.items():
+        tried = page.with_name(f"{name}.html")
+        tried.write_text(text.replace("</body>", f"<script>{act}</script></body>"), encoding="utf-8")
+        asked = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--dump-dom", tried.as_uri()]
+        dom = subprocess.run(asked, capture_output=True, text=True, timeout=60, check=True).stdout
+        told = re.search(r'<output id="said">(.*?)</output>', dom)
+        assert told is not None
+        shown[name] = told[1]
+    assert shown["last"].startswith("b &lt;script&gt;")
+    assert shown["first"].startswith("a: ")
+    assert shown["played"] == shown["first"]
+    assert "at the camera, mIoU" in shown["first"]
+    assert shown["first"].endswith("a first look")
 
 
 @pytest.mark.parametrize(

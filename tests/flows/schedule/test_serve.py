@@ -162,6 +162,9 @@ def test_fields_are_asked_for_by_archive_and_day(field_file: Callable[..., Path]
     berlin = parse_timetable("30 0 * * *", None, "Europe/Berlin")
     asked = one.settings_of(due, berlin)
     assert (asked.name, asked.visit, asked.day) == ("farm", "2026-02-01T23:30:00Z", 33)
+    assert asked.prior == "latest"  # a field that is served is remembered, unless its file says otherwise
+    alone = ServedField("farm", Path("farm.toml"), Settings(scene="farm@2", prior="none"))
+    assert alone.settings_of(due, berlin).prior == "none"
     fixed = ServedField("farm", Path("farm.toml"), Settings(scene="farm@2", day=172))
     assert fixed.settings_of(due, berlin).day == 172
     rig = ServedField("farm", Path("farm.toml"), Settings(scene="farm@2", source="rig"))

@@ -1,0 +1,91 @@
+"""A field's visits in pictures, for a page that plays them: the map of each, what changed, and its words."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from flows.publish.change_picture import CHANGED_SHARE
+from flows.publish.panels import class_palette, class_rgb
+from flows.publish.receipt_table import days_words
+from flows.terminal.figures import format_percent, format_points, format_seconds, known_number
+from storage.archive.archive import Archive
+from storage.archive.records import Run
+from storage.arrays.beliefs import BeliefStore
+from storage.arrays.class_maps import ClassMap, load_class_map
+
+MOST_VISITS = 60  # that a page plays: the newest
+MOST_PX = 360  # of a picture's longer side
+PALE = 0.8  # of what did not change
+GAP_PX = 6
+
+
+@dataclass(frozen=True)
+class VisitPicture:
+    """One visit: when, its picture as PNG in base64, and what is said of it."""
+
+    when: str
+    png: str
+    words: str
+
+
+def visit_pictures(archive: Archive, runs: Sequence[tuple[Run, str]]) -> list[VisitPicture]:
+    """Pictures of runs with a map, given with words for when they looked, oldest first; damaged ones are left out."""
+    found = []
+    for run, when in runs[-MOST_VISITS:]:
+        address = run.products.get("class_map")
+        if run.problem is None and address is not None:
+            with suppress(OSError, LookupError, ValueError):
+                shown = load_class_map(archive.locate(address))
+                seats = _changed_seats(archive, run)
+                found.append(VisitPicture(when, _drawn(shown, seats), _words(run.receipt)))
+    return found
+
+
+def _changed_seats(archive: Archive, run: Run) -> NDArray[np.bool_] | None:
+    """Seats with another class than remembered; None of a first look."""
+    address = run.products.get("belief")
+    if address is None:
+        return None
+    changed = BeliefStore(archive.locate(address)).changed()
+    return None if changed is None else changed >= CHANGED_SHARE
+
+
+def _drawn(shown: ClassMap, seats: NDArray[np.bool_] | None) -> str:
+    """The map beside what changed of it, all else pale."""
+    thin = -(-max(shown.classes.shape) // MOST_PX)
+    colours = class_rgb(shown.classes[::thin, ::thin], class_palette(len(shown.names), shown.colours))
+    picture = colours
+    if seats is not None:
+        y, x = shown.classes.shape
+        patch = next(size for size in (8, 16, 32, 64) if seats.shape[0] * size >= y)
+        fine = np.repeat(np.repeat(seats, patch, axis=0), patch, axis=1)[:y, :x][::thin, ::thin]
+        changes = np.where(fine[..., None], colours, PALE + (1 - PALE) * colours)
+        picture = np.concatenate([colours, np.ones((len(colours), GAP_PX, 3)), changes], axis=1)
+    buffer = io.BytesIO()
+    Image.fromarray(np.rint(255 * picture).astype(np.uint8)).quantize(64).save(buffer, "PNG", optimize=True)
+    return base64.b64encode(buffer.getvalue()).decode("ascii")
+
+
+def _words(receipt: Mapping[str, Any]) -> str:
+    """Seconds spent, score, and what became of the memory."""
+    savings = receipt.get("savings") or {}
+    seconds = known_number((savings.get("capture_s") or {}).get("done"))
+    parts = [] if seconds is None else [f"{format_seconds(seconds)} at the camera"]
+    score = known_number((receipt.get("accuracy") or {}).get("miou"))
+    parts += [] if score is None else [f"mIoU {format_points(score)}"]
+    memory = receipt.get("memory")
+    if not isinstance(memory, Mapping):
+        return ", ".join([*parts, "a first look"])
+    if memory.get("put_aside"):
+        return ", ".join([*parts, f"its memory put aside ({memory['put_aside']})"])
+    share = memory["changed_px"] / memory["compared_px"] if memory.get("compared_px") else 0.0
+    return ", ".join([*parts, f"goes on from {days_words(memory['days'])}", f"{format_percent(share)} changed"])

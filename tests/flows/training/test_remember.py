@@ -1,0 +1,109 @@
+"""Training of a reader of memories: what it is trained on, what it says of itself, and what it refuses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from rich.console import Console
+
+from flows.survey.run import shipped_weights
+from flows.training.remember import MemoryRequest, _moments, run_remember, train_memory
+from models.evaluation.metrics import confusion, mean_iou
+from models.network.memory_reader import MemoryReader, MemorySizes
+from models.reading.remembered import Looked, Remembered, first_belief, recall
+from models.training.memory import MemoryTraining, PastLook, Visit, train_reader
+from models.weights.files import content_key, describe_weights
+from models.weights.memory_files import load_memory, memory_path
+from pipeline.errors import SettingsError
+
+QUICK = MemoryTraining(minutes=0.5, steps=2, batch=2, crop=64, visits=2)
+
+
+def test_a_reader_learns_whom_to_believe() -> None:
+    """Looks that are right in 95 of 100 pixels on one side of a band and wrong on the other, memories the other way."""
+    rng, classes, columns = np.random.default_rng(0), 3, 4
+    lands = []
+    for _ in range(4):
+        labels = rng.integers(0, classes, (64, 64), dtype=np.uint8)
+        coarse = np.zeros((16, 16, columns), np.float16)
+
+        def look(right: float, step: int, truth: np.ndarray = labels, still: np.ndarray = coarse) -> PastLook:
+            said = np.where(rng.random(truth.shape) < right, truth, rng.integers(0, classes, truth.shape))
+            probability = np.full((*truth.shape, classes), 0.1, np.float16)
+            np.put_along_axis(probability, said[..., None], np.float16(0.8), axis=-1)
+            return PastLook(step, 0.25, probability, still)
+
+        lands.append([Visit(1.0, labels, [look(0.95, 1)]), Visit(4.0, labels, [look(0.3, 4)])])
+    reader, steps = train_reader(lands, MemoryTraining(steps=60, batch=4, crop=64, visits=2), 4)
+    assert steps == 60
+    first, later = lands[0]
+    images = [np.log(visit.looks[0].probability.astype(np.float32)) for visit in (first, later)]
+    seen, coarse = np.ones((64, 64), np.bool_), np.zeros((16, 16, columns), np.float32)
+    before, now = (Looked(image, seen, coarse, 0.25, step) for image, step in zip(images, (1, 4), strict=True))
+    after = recall(Remembered(first_belief(before), coarse, 3.0), now, reader)
+    scores = [
+        mean_iou(confusion(first.labels, one.classes()[0], classes))
+        for one in (first_belief(before), first_belief(now), after)
+    ]
+    assert scores[2] > scores[0] - 0.01
+    assert scores[2] > scores[1] + 0.3
+
+
+def test_lands_are_visited_in_the_order_of_their_days() -> None:
+    """Five visits, none before the one before it, all within the farm's year."""
+    for seed in range(40):
+        days = [day for day, _ in _moments(np.random.default_rng(seed))]
+        assert days == sorted(days)
+        assert len(days) == 5
+        assert 95 <= days[0] < 290
+        assert days[-1] <= 318
+
+
+def test_the_command_trains_judges_and_says_how(tmp_path: Path) -> None:
+    """A file for the weights that it was trained for, with seeds, settings and what it is worth on another land."""
+    out = tmp_path / "farm.memory.safetensors"
+    request = MemoryRequest("farm", shipped_weights(), out, 1, 1, (128, 192), QUICK, "spectralzoom train")
+    record = run_remember(request, Console(quiet=True))
+    found = load_memory(out, describe_weights(shipped_weights()))
+    assert found.weights_key == content_key(shipped_weights())
+    assert dict(found.record) == record
+    assert (record["lands"], record["steps"], record["command"]) == ([200_000], 2, "spectralzoom train")
+    assert [row["days"] for row in record["validation"]] == [1.0, 3.0, 7.0]
+    for row in record["validation"]:
+        assert row["remembered"] > row["look"] - 0.05  # hardly trained, it keeps to the memory
+
+
+@pytest.mark.parametrize(
+    ("dataset", "out", "why"),
+    [
+        (
+            "frames",
+            "x.safetensors",
+            "--remember trains on one land at several days, which only the built-in farm gives",
+        ),
+        ("farm", "no/x.safetensors", "expected the name of a file in a folder that exists"),
+    ],
+)
+def test_what_cannot_be_trained_is_refused(tmp_path: Path, dataset: str, out: str, why: str) -> None:
+    """Other data than the farm, and a place that is not there, before anything is looked at."""
+    with pytest.raises(SettingsError, match=why):
+        train_memory(MemoryRequest(dataset, shipped_weights(), tmp_path / out))
+
+
+def test_weights_of_other_classes_are_refused(tmp_path: Path, weights: Path) -> None:
+    """The farm has its own."""
+    with pytest.raises(SettingsError, match="expected weights of the farm's classes, soil, maize"):
+        train_memory(MemoryRequest("farm", weights, tmp_path / "x.safetensors"))
+
+
+def test_the_shipped_weights_have_a_reader() -> None:
+    """It fits them, was trained for them, and tells the lands that it has seen."""
+    found = load_memory(memory_path(shipped_weights()), describe_weights(shipped_weights()))
+    assert found.weights_key == content_key(shipped_weights())
+    assert min(found.record["lands"]) >= 200_000
+    assert found.reader.sizes == MemorySizes(11, 24)
+    assert isinstance(found.reader, MemoryReader)
+    assert all(torch.isfinite(tensor).all() for tensor in found.reader.state_dict().values())
