@@ -86,7 +86,6 @@ class Settings:
         "auto",
         "What of the field is remembered: latest (what its newest run left), the name of a run, or none; auto is latest"
         " for surveys that are served, else none",
-        example="latest",
     )
     scene: SceneName = stated(
         "farm", "`farm` (built in; `farm@2`), or a file: PNG, JPEG, GeoTIFF, .npy, .npz, .mat, ENVI, Zarr"
