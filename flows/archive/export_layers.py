@@ -114,12 +114,18 @@ def map_layers(run: ExportedRun) -> list[Layer]:
     drawn = _layer(run, product, "classes", ("class",), nodata=UNLABELLED, legend=legend)
     sure = _layer(run, product, "confidence", ("confidence",), nodata=np.nan)
     seen = _picture(run) if run.geobox is None else _layer(run, product, "picture", RGB, nodata=0)
-    return [
+    score = _of_seats(run, "attention", "score", ("score",))
+    layers = [
         Layer("class_map", "Class map", ("data",), *drawn, fields=classes(legend)),
         Layer("confidence", "Probability of the class given", ("data", "confidence"), *sure, "1"),
-        Layer("attention", "Worth of a fine look, by seat", ("data",), *_attention(run), "1"),
+        Layer("attention", "Worth of a fine look, by seat", ("data",), *score, "1"),
         Layer("rgb", "Picture of the coarse look", ("visual", "overview"), *seen),
     ]
+    memory = run.receipt.get("memory")
+    if memory is not None and memory["put_aside"] is None:
+        title = "Share of pixels with another class than remembered, by seat"
+        layers.append(Layer("changed", title, ("data",), *_of_seats(run, "belief", "changed", ("changed",)), "1"))
+    return layers
 
 
 def _tags(run: ExportedRun, product: str, place: Place) -> dict[str, str]:
@@ -158,17 +164,19 @@ def _layer(
     return image, stored.rows
 
 
-def _attention(run: ExportedRun) -> tuple[CogImage, Callable[[], Rows]]:
-    """Scores of the seats, on the angular grid that their size in pixels gives."""
-    stored, patch = open_image(run.path("attention"), "score"), open_image(run.path("patches"), "valid").shape[1]
+def _of_seats(
+    run: ExportedRun, product: str, array: str, bands: tuple[str, ...]
+) -> tuple[CogImage, Callable[[], Rows]]:
+    """A figure of each seat, on the angular grid that their size in pixels gives."""
+    stored, patch = open_image(run.path(product), array), open_image(run.path("patches"), "valid").shape[1]
     scene = grid_of(open_image(run.path("class_map"), "classes").about)
     if scene is None:
         raise IncompleteStoreError(f"the class map of run {run.id} does not say its grid; run its survey again")
     shape = (stored.shape[0], stored.shape[1])
     place = Place.on_angles(replace(scene, factor=patch), shape)
-    policy = str(stored.about.get("policy", ""))
-    tags = {**_tags(run, "attention", place), "policy": policy, "seat_px": str(patch)}
-    return CogImage(shape, stored.dtype.name, place, ("score",), np.nan, tags=tags), stored.rows
+    policy = {"policy": str(stored.about.get("policy", ""))} if product == "attention" else {}
+    tags = {**_tags(run, product, place), **policy, "seat_px": str(patch)}
+    return CogImage(shape, stored.dtype.name, place, bands, np.nan, tags=tags), stored.rows
 
 
 def _picture(run: ExportedRun) -> tuple[CogImage, Callable[[], Rows]]:

@@ -10,12 +10,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rasterio
 import torch
 import xarray as xr
 from PIL import Image
 from rich.console import Console
 from scipy.ndimage import gaussian_filter, rotate
 
+import flows.survey.memory as memory
 from flows.archive.plan_command import plan_content
 from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
 from flows.settings.load import load_settings
@@ -23,10 +25,11 @@ from models.network.memory_reader import MemoryReader, MemorySizes
 from models.weights.files import load_weights
 from models.weights.memory_files import MemoryWeights, memory_path, save_memory
 from pipeline.errors import SettingsError, WeightsError
+from pipeline.geometry.grid import SceneGrid
 from storage.archive.archive import Archive
 from storage.archive.records import read_run
 from storage.maintenance.garbage import clear_up
-from tests.conftest import Survey, WeightsMaker, patchy_scene
+from tests.conftest import CLASSES, Survey, WeightsMaker, patchy_scene
 from tests.flows.conftest import problems
 from tests.remembered_work import without_effects
 
@@ -276,3 +279,39 @@ def test_a_rig_that_was_turned_is_noticed(survey_png: Survey, tmp_path: Path) ->
     assert "was put aside: the rig was turned since, by 4.0 degrees" in words.replace("3.9", "4.0").replace(
         "4.1", "4.0"
     )
+
+
+def test_what_changed_is_exported(twice: tuple[Path, Any, Any], tmp_path: Path, command_line: Any) -> None:
+    """On its seats, beside the class map, of a run that goes on from another; a first look has no such file."""
+    out, first, later = twice
+    ended = command_line("export", out, later.folder.name, "-o", tmp_path / "maps")
+    assert ended.code == 0, ended.err
+    (file,) = (tmp_path / "maps").rglob("*changed*.tif")
+    with rasterio.open(file) as opened:
+        found = opened.read(1)
+    stored = xr.open_zarr(out / later.receipt["products"]["belief"], consolidated=False).changed.values
+    np.testing.assert_array_equal(found, stored)
+    command_line("export", out, first.folder.name, "-o", tmp_path / "first")
+    assert list((tmp_path / "first").rglob("*changed*")) == []
+
+
+def test_a_thousand_visits_cost_as_much_as_sixty(visited: Path, twice: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many runs a field has, the newest alone are read; those of other fields not at all."""
+    _, first, later = twice
+    for number in range(200):
+        for name, source in (("north", later), ("south", first)):
+            copy = visited / "runs" / f"20270101T{number:06d}-{name}"
+            shutil.copytree(visited / "runs" / source.folder.name, copy)
+    read: list[str] = []
+
+    def counted(folder: Path, stores: Any) -> Any:
+        read.append(folder.name)
+        return read_run(folder, stores)
+
+    monkeypatch.setattr(memory, "read_run", counted)
+    settings = load_settings(None, {"prior": "latest", "visit": "2026-06-20T10:00:00Z"})
+    found, _ = memory.find_prior(Archive.open(visited), settings, "north", SceneGrid(96, 128, 8, 4), CLASSES)
+    assert found is not None
+    assert found.days == 16.0
+    assert len(read) == memory.LOOKED_THROUGH
+    assert {name.rpartition("-")[2] for name in read} == {"north"}
