@@ -9,13 +9,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flows.survey.run import SurveyRun, weights_path
-from models.network.memory_reader import MemoryReader
 from models.network.sizes import saliency_bytes
 from models.policies.policies import IMAGE_POLICIES, NETWORK_POLICIES, score_seats
 from models.policies.vgg_file import VggFile
@@ -30,6 +29,9 @@ from storage.arrays.layout import SHARD_COLUMNS, SHARD_ROWS
 from storage.arrays.mosaics import PATCHES_A_SHARD, PatchStore, mosaic_strips, mosaic_wavelengths
 from storage.arrays.tile_work import RESERVED_BYTES, let_tiles_go
 from storage.parallel.crew import Crew, run_blocks
+
+if TYPE_CHECKING:
+    from models.network.memory_reader import MemoryReader
 
 
 @dataclass(frozen=True)

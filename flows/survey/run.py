@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
 from flows.survey.capture_plan import CapturePlan, plan_capture
-from flows.survey.memory import NONE, Prior, find_prior
+from flows.survey.memory import AUTO, NONE, Prior, find_prior
 from flows.survey.scan_choice import ScanChoice, choose_plain_scan
 from flows.survey.scene import (
     FieldSource,
@@ -37,7 +37,7 @@ from models.weights.files import (
     load_weights,
     unsealed_note,
 )
-from models.weights.memory_files import ReaderFile, describe_reader
+from models.weights.memory_files import ReaderFile, describe_reader, load_memory
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
@@ -195,6 +195,8 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
         vgg.saliency(load())  # refuses one that does not go with the weights
         vgg_notes = (f"VGG19 from {vgg.path.name}: {vgg.report()}",)
     reader = describe_reader(path, described)
+    if reader is not None and not planning:
+        load_memory(reader.path, described)  # refuses tensors that are not those that were written
     simulated, planned = make_source(scene, settings), (*plan.coarse, *plan.full)
     source = field_source(scene, settings, simulated, planned)
     check_memory(settings, simulated, grid, plan)
@@ -204,7 +206,8 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     key, archive = content_key(path), open_archive(settings.out) if archive is None else archive
     name = settings.name or Path(scene.name).stem
     prior, prior_notes = find_prior(archive, settings, name, grid, described.class_names)
-    settings = replace(settings, prior=NONE if prior is None else prior.run)  # what is meant when it is asked for again
+    if settings.prior != AUTO:  # what is meant when it is asked for again
+        settings = replace(settings, prior=NONE if prior is None else prior.run)
     return SurveyRun(
         settings=settings,
         archive=archive,

@@ -6,39 +6,15 @@ spectra do. This network sees both, how long ago the memory is, how the new look
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-
 import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 from torch import Tensor, nn
 
+from models.network.sizes import GATES, OTHERS, MemorySizes
+
 FAINT = 10.0  # logarithms of probabilities are read down to minus this
-OTHERS = 5  # images that it reads beside probabilities: seen, age, light of the memory, light and step of the look
-GATES = 3  # how far the memory, and the look, are believed; how far both together replace the memory
-STARTS = (2.2, 0.0, -1.0)  # of these, before anything is learned
+STARTS = (2.2, 0.0, -1.0)  # of the gates, before anything is learned
 LEAST_LIGHT = 1e-4  # of a memory, in reference exposures
-
-
-@dataclass(frozen=True)
-class MemorySizes:
-    """All that is needed to build the network again."""
-
-    classes: int
-    columns: int
-    factor: int = 4  # fine pixels a side of a coarse one
-    width: int = 32
-    coarse_width: int = 16
-
-    def as_dict(self) -> dict[str, int]:
-        """Plain numbers for a file."""
-        return asdict(self)
-
-    def multiply_adds(self, pixels: int) -> int:
-        """Multiply-adds of reading so many fine pixels."""
-        entered = 2 * self.classes + OTHERS + self.coarse_width
-        fine = 9 * self.width * (entered + self.width + self.classes + GATES)
-        coarse = 9 * self.width * (2 * self.columns + 1 + self.coarse_width)
-        return pixels * fine + pixels // self.factor**2 * coarse
 
 
 class MemoryReader(nn.Module):

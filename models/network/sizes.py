@@ -48,6 +48,8 @@ VGG_FROM = (  # in words: what to give, and where it can be had
 TRAINED_VGG_FROM = "VGG19 trained on data of your own, saved as torchvision lays it out (the one without bn)"
 BYTES_A_PIXEL, NETWORK_BYTES = 4096, 85_000_000  # of VGG19 on its way there and back
 CHANNEL_BYTES = 32  # the same, of a pixel's channel beyond the third: entered, padded, its gradient, and copies
+OTHERS = 5  # images that a reader of memories reads beside probabilities: seen, age, lights, step
+GATES = 3  # of its own: how far the memory, and the look, are believed; how far both together replace the memory
 AROUND_PX = 32  # pixels of its surroundings that a block sees too, and the least over which its ends are joined
 
 
@@ -203,3 +205,25 @@ def saliency_multiply_adds(shape: tuple[int, int], columns: int, channels: int =
     sizes = VggSizes(channels=channels)
     y, x = (sum(part.closed(sizes.coarsest) for part in stretches(size)) for size in shape)
     return round(2 * sizes.forward_multiply_adds * y * x) + channels * columns * shape[0] * shape[1]
+
+
+@dataclass(frozen=True)
+class MemorySizes:
+    """All that is needed to build the network again."""
+
+    classes: int
+    columns: int
+    factor: int = 4  # fine pixels a side of a coarse one
+    width: int = 32
+    coarse_width: int = 16
+
+    def as_dict(self) -> dict[str, int]:
+        """Plain numbers for a file."""
+        return asdict(self)
+
+    def multiply_adds(self, pixels: int) -> int:
+        """Multiply-adds of reading so many fine pixels."""
+        entered = 2 * self.classes + OTHERS + self.coarse_width
+        fine = 9 * self.width * (entered + self.width + self.classes + GATES)
+        coarse = 9 * self.width * (2 * self.columns + 1 + self.coarse_width)
+        return pixels * fine + pixels // self.factor**2 * coarse

@@ -19,7 +19,8 @@ import torch.nn.functional as F  # noqa: N812 - its usual name
 from numpy.typing import NDArray
 from torch import Tensor
 
-from models.network.memory_reader import MemoryReader, MemorySizes
+from models.network.memory_reader import MemoryReader
+from models.network.sizes import MemorySizes
 from models.reading.remembered import FAINTEST, LIGHT_FADES_DAYS
 from models.training.objective import map_loss, weights_of_classes
 from models.training.train import Progress

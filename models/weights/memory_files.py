@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from safetensors import safe_open
 
-from models.network.memory_reader import MemoryReader, MemorySizes
+from models.network.sizes import MemorySizes
 from models.weights.files import Description, unusable
 from models.weights.sealed_files import (
     DAMAGED,
@@ -24,8 +25,12 @@ from pipeline.lazy import deferred
 
 if TYPE_CHECKING:
     import torch
+
+    import models.network.memory_reader as memory_reader
+    from models.network.memory_reader import MemoryReader
 else:
     torch = deferred("torch")
+    memory_reader = deferred("models.network.memory_reader")
 
 FORMAT = "spectralzoom-memory/1"
 SUFFIX = ".memory.safetensors"
@@ -53,11 +58,16 @@ class ReaderFile:
 
 
 def describe_reader(weights: Path, described: Description) -> ReaderFile | None:
-    """The reader of memories beside some weights; None where there is none. Raises WeightsError as `load_memory`."""
+    """The reader of memories beside some weights, by what its file says; None where there is none.
+
+    Reads no tensor, and takes no torch. Raises WeightsError as `load_memory` where the description is wrong.
+    """
     path = memory_path(weights)
     if not path.is_file():
         return None
-    return ReaderFile(path, memory_key(path), load_memory(path, described).reader.sizes)
+    with _opened(path, "np") as file:
+        sizes = _checked(path, _described(path, file), described)
+    return ReaderFile(path, memory_key(path), sizes)
 
 
 def memory_path(weights: Path) -> Path:
@@ -95,27 +105,39 @@ def load_memory(path: Path, described: Description) -> MemoryWeights:
 
     Raises WeightsError where it is damaged, of another format, or for other classes or columns than the weights have.
     """
-    try:
-        with safe_open(path, framework="pt") as file:
-            about = read_about(file)
-            if about.get("format") != FORMAT:
-                raise _refused(path, f"it holds {about.get('format', 'no format mark')}, expected {FORMAT}")
-            if wrong := broken_seal(about):
-                raise _refused(path, wrong)
-            sizes = _checked(path, about, described)
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
-    except DAMAGED as error:
-        raise _refused(path, str(error)[:120]) from error
+    with _opened(path, "pt") as file:
+        about = _described(path, file)
+        sizes = _checked(path, about, described)
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
     if wrong := changed_tensor(about, tensors) or unusable(tensors, spreads=()):
         raise _refused(path, wrong)
     with torch.device("meta"):
-        reader = MemoryReader(sizes)
+        reader = memory_reader.MemoryReader(sizes)
     try:
         reader.load_state_dict(tensors, assign=True)
     except RuntimeError as error:
         raise _refused(path, str(error).splitlines()[-1].strip()) from error
     names = tuple(map(str, about["class_names"]))
     return MemoryWeights(reader.eval(), str(about["weights_key"]), names, dict(about["record"]))
+
+
+@contextmanager
+def _opened(path: Path, framework: str) -> Iterator[Any]:
+    try:
+        with safe_open(path, framework=framework) as file:
+            yield file
+    except DAMAGED as error:
+        raise _refused(path, str(error)[:120]) from error
+
+
+def _described(path: Path, file: Any) -> dict[str, Any]:
+    """What the file says of itself, as it was written."""
+    about = read_about(file)
+    if about.get("format") != FORMAT:
+        raise _refused(path, f"it holds {about.get('format', 'no format mark')}, expected {FORMAT}")
+    if wrong := broken_seal(about):
+        raise _refused(path, wrong)
+    return about
 
 
 def _checked(path: Path, about: Mapping[str, Any], described: Description) -> MemorySizes:

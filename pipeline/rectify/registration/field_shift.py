@@ -9,13 +9,20 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise, product
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from skimage.measure import ransac
-from skimage.transform import EuclideanTransform
 
+from pipeline.lazy import deferred
 from pipeline.rectify.registration.shifts import pair_shift
+
+if TYPE_CHECKING:
+    import skimage.measure as skimage_measure
+    import skimage.transform as skimage_transform
+else:
+    skimage_measure = deferred("skimage.measure")
+    skimage_transform = deferred("skimage.transform")
 
 WINDOWS = 3  # along either side of a field
 LEAST_WINDOW_PX = 24  # on a side; a smaller field is compared as one
@@ -75,8 +82,13 @@ def _agreed(pairs: Pairs, start: NDArray[np.float64], shape: tuple[int, ...]) ->
     middle = np.array(shape[:2]) / 2
     places = np.array([place - middle for place, _ in pairs])
     moved = places + np.array([shift for _, shift in pairs])
-    model, inliers = ransac(  # type: ignore[no-untyped-call]
-        (places, moved), EuclideanTransform, min_samples=2, residual_threshold=AGREE_PX, max_trials=TRIALS, rng=0
+    model, inliers = skimage_measure.ransac(  # type: ignore[no-untyped-call]
+        (places, moved),
+        skimage_transform.EuclideanTransform,
+        min_samples=2,
+        residual_threshold=AGREE_PX,
+        max_trials=TRIALS,
+        rng=0,
     )
     count = 0 if inliers is None else int(inliers.sum())
     if model is None or count < max(LEAST_WINDOWS, LEAST_SHARE * len(pairs)):

@@ -21,7 +21,8 @@ import flows.survey.memory as memory
 from flows.archive.plan_command import plan_content
 from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
 from flows.settings.load import load_settings
-from models.network.memory_reader import MemoryReader, MemorySizes
+from models.network.memory_reader import MemoryReader
+from models.network.sizes import MemorySizes
 from models.weights.files import load_weights
 from models.weights.memory_files import MemoryWeights, memory_path, save_memory
 from pipeline.errors import SettingsError, WeightsError

@@ -12,7 +12,8 @@ from rich.console import Console
 from flows.survey.run import shipped_weights
 from flows.training.remember import MemoryRequest, _moments, run_remember, train_memory
 from models.evaluation.metrics import confusion, mean_iou
-from models.network.memory_reader import MemoryReader, MemorySizes
+from models.network.memory_reader import MemoryReader
+from models.network.sizes import MemorySizes
 from models.reading.remembered import Looked, Remembered, first_belief, recall
 from models.training.memory import MemoryTraining, PastLook, Visit, train_reader
 from models.weights.files import content_key, describe_weights

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import models.reading.remembered as remembered
-from models.network.memory_reader import MemoryReader, MemorySizes
+from models.network.memory_reader import MemoryReader
+from models.network.sizes import MemorySizes
 from models.reading.remembered import (
     FAINTEST,
     Belief,

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from models.network.memory_reader import MemoryReader, MemorySizes
+from models.network.memory_reader import MemoryReader
+from models.network.sizes import MemorySizes
 from models.weights.files import Description, describe_weights, save_weights
 from models.weights.memory_files import (
     MemoryWeights,
