@@ -183,7 +183,7 @@ def draw_field(field: FieldWork, work: Drawing, report: Callable[[float], None])
 
 
 REACH_PX = 64.0  # within which a memory that lies beside today's look is found
-LEAST_SHIFT_PX = 1.2
+LEAST_SHIFT_PX = 2.0  # less is how well two looks can be laid on each other
 
 
 def memory_lies(before: Path, now: Path, factor: int) -> FieldShift:

@@ -31,7 +31,7 @@ from storage.arrays.quicklooks import choose_bands, develop, stretch
 
 CLASS_MAP = Product("segment", version=6, files=("class_map.zarr", "belief.zarr"), by_weights=True)
 STRANGE = "strange.json"  # beside a map, where values were no readings
-MOST_TURN_PX = 4.0  # that a field's corners may lie off by, as it is turned, so that its memory is of use
+MOST_TURN_PX = 12.0  # that a field's corners may lie off by, as it is turned, so that its memory is of use
 MEMORY = "memory.json"  # beside a map that goes on from an earlier one: what became of the memory
 
 

@@ -7,7 +7,7 @@ together is believed.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise, product
 from typing import TYPE_CHECKING
 
@@ -18,16 +18,20 @@ from pipeline.lazy import deferred
 from pipeline.rectify.registration.shifts import pair_shift
 
 if TYPE_CHECKING:
+    import scipy.ndimage as ndimage
     import skimage.measure as skimage_measure
     import skimage.transform as skimage_transform
 else:
+    ndimage = deferred("scipy.ndimage")
     skimage_measure = deferred("skimage.measure")
     skimage_transform = deferred("skimage.transform")
 
 WINDOWS = 3  # along either side of a field
 LEAST_WINDOW_PX = 24  # on a side; a smaller field is compared as one
 WINDOW_REACH_PX = 8.0  # what the shift of one window may differ by from that of the field
-AGREE_PX = 0.5  # within which windows say the same
+AGREE_PX, LOOSELY_PX = 0.5, 1.5  # within which windows say the same, and do so loosely
+LOOSE_SHIFT_PX, LOOSE_EDGE_PX = 2.0, 3.0  # that what they say loosely is believed from: growth looks like less
+TRIED_DEG = (-8.0, 8.0, -16.0, 16.0)  # by which a field may be turned of which windows say nothing as it lies
 LEAST_WINDOWS, LEAST_SHARE = 4, 0.6  # that have to agree, and of those that say something
 TRIALS = 200
 
@@ -56,8 +60,18 @@ def field_shift(now: NDArray[np.floating], before: NDArray[np.floating], *, reac
         return FieldShift((float(whole.shift[0]), float(whole.shift[1]))) if whole.status == "found" else FieldShift()
     found = _of_windows(now, _moved_by(before, start)) if start.any() else []
     there = _of_windows(now, before)
-    best = max((_agreed(there, np.zeros(2), now.shape), _agreed(found, start, now.shape)), key=lambda one: one[0])
-    return best[1]
+    for within in (AGREE_PX, LOOSELY_PX):
+        both = (_agreed(pairs, at, now.shape, within) for pairs, at in ((there, np.zeros(2)), (found, start)))
+        count, lies = max(both, key=lambda one: one[0])
+        far = math.hypot(*lies.shift) >= LOOSE_SHIFT_PX or lies.edge_px(now.shape) >= LOOSE_EDGE_PX
+        if count:
+            return lies if far or within == AGREE_PX else FieldShift()
+    for turn in TRIED_DEG:
+        turned = ndimage.rotate(before, turn, reshape=False, order=1, cval=np.nan)
+        count, lies = _agreed(_of_windows(now, turned), np.zeros(2), now.shape, LOOSELY_PX)
+        if count:
+            return replace(lies, turned_deg=lies.turned_deg + turn)
+    return FieldShift()
 
 
 Pairs = list[tuple[NDArray[np.float64], NDArray[np.float64]]]  # middle of a window, and its shift
@@ -75,7 +89,9 @@ def _of_windows(now: NDArray[np.floating], before: NDArray[np.floating]) -> Pair
     return pairs
 
 
-def _agreed(pairs: Pairs, start: NDArray[np.float64], shape: tuple[int, ...]) -> tuple[int, FieldShift]:
+def _agreed(
+    pairs: Pairs, start: NDArray[np.float64], shape: tuple[int, ...], within_px: float
+) -> tuple[int, FieldShift]:
     """How many windows agree, and on what; 0 and nothing where too few do."""
     if len(pairs) < LEAST_WINDOWS:
         return 0, FieldShift()
@@ -86,7 +102,7 @@ def _agreed(pairs: Pairs, start: NDArray[np.float64], shape: tuple[int, ...]) ->
         (places, moved),
         skimage_transform.EuclideanTransform,
         min_samples=2,
-        residual_threshold=AGREE_PX,
+        residual_threshold=within_px,
         max_trials=TRIALS,
         rng=0,
     )
