@@ -277,11 +277,8 @@ def _savings(runs: Rows) -> list[Chart]:
 
 def _summed_seconds(runs: Rows) -> dict[str, list[tuple[float, float]]]:
     """What all visits up to each took, and what scanning everything every time would have."""
-    dated = sorted(
-        ((moment, row["capture_seconds"]))
-        for row in runs
-        if (moment := day_of(row)) is not None and None not in row["capture_seconds"].values()
-    )
+    dated = sorted((moment, row["capture_seconds"]) for row in runs if (moment := day_of(row)) is not None)
+    dated = [(moment, seconds) for moment, seconds in dated if None not in seconds.values()]
     names, spent = {"done": "these visits", "full": "everything, every time"}, {"done": 0.0, "full": 0.0}
     points: dict[str, list[tuple[float, float]]] = {label: [] for label in names.values()}
     for moment, seconds in dated:

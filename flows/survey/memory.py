@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from flows.settings.load import anchor_paths
 from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
 from pipeline.errors import IncompleteStoreError, SettingsError
 from pipeline.geometry.grid import SceneGrid
@@ -20,6 +21,10 @@ from storage.arrays.beliefs import BeliefStore
 NONE, LATEST, AUTO = "none", "latest", "auto"
 LOOKED_THROUGH = 60  # newest runs of a field among which the visit before is looked for
 BELIEF = "belief"  # a product of runs
+OF_THE_LOOK = (  # settings that the same light has alike
+    *("scene", "source", "seed", "size", "visit", "day", "hour", "effects", "pointing_px"),
+    *("scan_step", "scan_exposure_ms", "coarse_exposure_ms", "budget", "policy", "threshold"),
+)
 
 
 @dataclass(frozen=True)
@@ -69,13 +74,19 @@ def _before(archive: Archive, settings: Settings, name: str) -> Iterator[Run]:
         if part not in folder.name:  # no receipt has to be read for that
             continue
         run = read_run(folder, {})
-        if run.receipt.get("survey") == name and BELIEF in run.products:
+        if run.receipt.get("survey") == name and BELIEF in run.products and not _is_this_look(run, settings):
             days = _days_since(run, settings)
             if days >= 0:
                 found.append((days, number, run))
             if len(found) >= LOOKED_THROUGH:
                 break
     yield from (run for _, _, run in sorted(found, key=lambda one: one[:2]))
+
+
+def _is_this_look(run: Run, settings: Settings) -> bool:
+    """Whether a run was made of the very light that a survey asks for: what it saw is no earlier look."""
+    asked = anchor_paths(settings.to_dict(), Path.cwd())
+    return all(run.settings.get(part) == asked[part] for part in OF_THE_LOOK)
 
 
 def _usable(

@@ -316,3 +316,14 @@ def test_a_thousand_visits_cost_as_much_as_sixty(visited: Path, twice: Any, monk
     assert found.days == 16.0
     assert len(read) == memory.LOOKED_THROUGH
     assert {name.rpartition("-")[2] for name in read} == {"north"}
+
+
+def test_a_look_is_no_memory_of_itself(visited: Path, twice: Any, survey_png: Survey) -> None:
+    """Asked for again, a visit goes on from the one before it and finds its own map; so does the first."""
+    again = survey_png(visited, **PLAIN, visit=LATER, prior="latest")
+    assert again.receipt["memory"]["run"] == twice[1].folder.name
+    first = survey_png(visited, **PLAIN, visit=FIRST, prior="latest")
+    assert "memory" not in first.receipt
+    for published in (again, first):
+        (row,) = (stage for stage in published.receipt["stages"] if stage["name"] == "draw_map")
+        assert row["state"] == "cached"

@@ -77,6 +77,7 @@ def _history(words: str) -> FieldHistory:
         "overall_accuracy": None,
         "savings": {"capture_s": 0.5},
         "areas": {words: 1.0},
+        "capture_seconds": {"done": None, "full": None},
         "colours": {},
     }
     return FieldHistory(words, words, [row], [{"event": "failed", "due": words, "reason": words}])

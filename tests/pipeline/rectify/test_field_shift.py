@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, rotate
@@ -27,6 +27,7 @@ def cut(field: NDArray[np.float64], down: int = 0, across: int = 0) -> NDArray[n
     return field[30 - down : 150 - down, 30 - across : 180 - across]
 
 
+@settings(max_examples=12)
 @given(seed=st.integers(0, 1000), down=st.integers(-11, 11), across=st.integers(-11, 11))
 def test_a_moved_field_is_found(seed: int, down: int, across: int) -> None:
     """To a tenth of a pixel, and not turned."""
