@@ -63,6 +63,7 @@ class Drawing:
         strange = np.zeros(region.grid.seat_shape, np.int64)
         seats, columns = seat_columns(weights, store, store.wavelength_nm, seen, region, strange=strange.ravel())
         drawn = segment(weights, seen, columns, seats, every_class=True)
+        del columns  # a memory takes their room
         assert drawn.log_probability is not None
         looked = self._looked(region, drawn.log_probability, seats, seen)
         classes, confidence = drawn.classes, drawn.confidence

@@ -81,7 +81,7 @@ class DrawnMap:
     def of_scene(self, grid: SceneGrid) -> DrawnMap:
         """Give what of the map of a padded grid lies on the scene."""
         scene = np.s_[: grid.height, : grid.width]
-        every = None if self.log_probability is None else self.log_probability[scene].copy()
+        every = None if self.log_probability is None else self.log_probability[scene]  # a copy may not fit the memory
         return DrawnMap(self.classes[scene].copy(), self.confidence[scene].copy(), every)
 
 

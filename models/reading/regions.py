@@ -22,6 +22,7 @@ from pipeline.geometry.grid import SceneGrid
 REGION_PX = 2560  # a side, at most
 HALO_CELLS = 1  # coarse patches around a region that are read with it; see bench_regions.py for more and for none
 CELL_COPIES, SEAT_COPIES = 8, 2  # of a coarse cell's features, and of a patch's columns, in memory at once
+MAP_COPIES = 2  # of what is believed of every class: of the look, and of look and memory together
 STRIP_COPIES = 3  # of values on their way from a store to spectral columns
 STRIP_ROWS, PATCHES_READ = 64, 64  # at once: those of a shard
 Scalar = TypeVar("Scalar", bound=np.generic)
@@ -178,7 +179,8 @@ def region_bytes(config: SegmenterConfig, region: Region, seats: int, bands: int
     """Memory that reading one region takes at most, ``seats`` fine patches of it in use [bytes].
 
     Counted: features of coarse patches and of fine ones, what their tokens keep of each layer, columns of the patches,
-    the map, and values on their way from the stores, some rows or patches at a time.
+    the map with every class's probability (a memory takes the room of the columns), and values on their way from the
+    stores, some rows or patches at a time.
     """
     p, s = config.patch, config.factor
     coarse, features = (_feature_bytes(width, p) for width in (config.coarse_width, config.width))
@@ -186,8 +188,10 @@ def region_bytes(config: SegmenterConfig, region: Region, seats: int, bands: int
     cells = rows * columns // s**2
     memory = 2 * 4 * config.layers * config.dim * config.token_side**2  # keys and values of a patch's tokens
     patch = features + memory + (SEAT_COPIES * 4 * config.columns + 16) * p**2
+    believed = MAP_COPIES * 4 * config.classes * rows * columns * p**2
     strip = max(min(STRIP_ROWS, region.coarse.shape[0]) * region.coarse.shape[1], min(PATCHES_READ, seats) * p**2)
-    return (CELL_COPIES * coarse + memory) * cells + patch * seats + STRIP_COPIES * 4 * bands * strip
+    read = (CELL_COPIES * coarse + memory) * cells + patch * seats
+    return read + believed + STRIP_COPIES * 4 * bands * strip
 
 
 def _feature_bytes(width: int, patch: int) -> int:

@@ -7,8 +7,8 @@ both stands. Where today's look did not go, the memory stays and fades with its 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,7 +31,8 @@ LIGHT_FADES_DAYS = 30.0  # in which the light that a memory rests on is worth e 
 FADES_DAYS = 120.0  # in which a memory that nobody looks after is worth e times less, without a reader
 SURE = 0.97  # of today's look, without a reader, to speak against a memory
 CERTAIN = 0.8  # of memory and map alike, so that a pixel of another class counts as changed
-ROWS, HALO = 128, 16  # rows read at a time, and beside them: the reader sees 12 px far, and coarse pixels stay whole
+ROWS = 128  # read at a time
+SEEN_PX = 3  # that the reader sees beside a pixel, and three coarse pixels
 LEAST_AGREEMENT, LEAST_KAPPA = 0.5, 0.35  # of a memory that is of this field; less of both, and it is put aside
 Floats = NDArray[np.float32]
 
@@ -96,21 +97,38 @@ def recall(memory: Remembered, looked: Looked, reader: MemoryReader | None) -> B
         raise ShapeError(
             f"the memory is {before.shape} (y, x, class), today's look {today.shape}; both are of one field"
         )
+    if reader is not None:
+        _check_sizes(reader, looked)
+    y = len(today)
+    kept, ages, light = np.empty_like(today), *np.empty((2, *looked.seen.shape), np.float32)
+    s = 1 if reader is None else reader.sizes.factor
+    high, halo = max(ROWS // s, 1) * s, -(-(3 * s + SEEN_PX) // s) * s
+    for top in range(0, y, high):  # what lies between memory and belief is never there for all rows at once
+        first, last, stop = max(top - halo, 0), min(top + high + halo, y), min(top + high, y)
+        part, own = _recalled(memory, looked, reader, slice(first, last)), slice(top - first, stop - first)
+        kept[top:stop], ages[top:stop], light[top:stop] = part.log_probability[own], part.age_days[own], part.light[own]
+    return Belief(kept, ages, light)
+
+
+def _recalled(memory: Remembered, looked: Looked, reader: MemoryReader | None, rows: slice) -> Belief:
+    """What is believed of some rows; the outermost of them see less than there is."""
+    before, today = memory.belief.log_probability[rows], looked.log_probability[rows]
     known, shown = _told(before), _told(today)
-    seen = looked.seen & shown
-    age = np.nan_to_num(memory.belief.age_days, nan=0.0) + np.float32(memory.days)
+    seen = looked.seen[rows] & shown
+    age = np.nan_to_num(memory.belief.age_days[rows], nan=0.0) + np.float32(memory.days)
     flat = np.float32(-math.log(before.shape[-1]))
     old, new = (_summing_to_1(np.where(where[..., None], one, flat)) for where, one in ((known, before), (seen, today)))
     left = np.float32(math.exp(-memory.days / LIGHT_FADES_DAYS))
-    rests_on = np.where(known, memory.belief.light * left, 0).astype(np.float32)
+    rests_on = np.where(known, memory.belief.light[rows] * left, 0).astype(np.float32)
     if reader is None:
         after = _the_surer(old, new, seen, age)
     else:
         images = old, np.where(seen[..., None], new, 0), seen, age, rests_on
-        after = np.concatenate(list(_read(reader, memory, looked, images)))
+        after = _read(reader, memory, looked, images, rows)
     after = np.where(known[..., None], after, today)  # today's look alone; NaN where that has nothing either
     kept = np.maximum(after, np.float32(FAINTEST)).astype(np.float32)
-    return Belief(kept, _ages(kept, np.where(seen | ~known, 0, age)), rests_on + _own_light(replace(looked, seen=seen)))
+    own_light = np.where(seen, looked.light / looked.step**2, 0).astype(np.float32)
+    return Belief(kept, _ages(kept, np.where(seen | ~known, 0, age)), rests_on + own_light)
 
 
 def _summing_to_1(log_probability: Floats) -> Floats:
@@ -156,39 +174,38 @@ def _the_surer(before: Floats, today: Floats, seen: NDArray[np.bool_], age: Floa
     return found
 
 
+def _check_sizes(reader: MemoryReader, looked: Looked) -> None:
+    """Refuse a reader for other classes or columns (ShapeError)."""
+    sizes, came = (
+        (reader.sizes.classes, reader.sizes.columns),
+        (looked.log_probability.shape[-1], looked.coarse.shape[-1]),
+    )
+    if sizes != came:
+        raise ShapeError(f"the reader of memories is for {sizes} classes and columns, got {came}")
+
+
 def _read(
-    reader: MemoryReader, memory: Remembered, looked: Looked, images: Sequence[NDArray[np.generic]]
-) -> Iterator[Floats]:
-    """What the reader says of its first images, some rows at a time with rows around them that it sees too."""
-    s, (y, x, classes) = reader.sizes.factor, images[0].shape
-    sizes = (reader.sizes.classes, reader.sizes.columns)
-    if sizes != (classes, looked.coarse.shape[-1]):
-        raise ShapeError(
-            f"the reader of memories is for {sizes} classes and columns, got {(classes, looked.coarse.shape[-1])}"
-        )
-    past = looked.coarse if memory.coarse is None else memory.coarse
-    both = _told(past) & _told(looked.coarse)
+    reader: MemoryReader, memory: Remembered, looked: Looked, images: Sequence[NDArray[np.generic]], rows: slice
+) -> Floats:
+    """What the reader says of images of some rows, which begin with a coarse pixel."""
+    s, (y, x) = reader.sizes.factor, images[2].shape
+    down, across = -(-y // s), -(-x // s)
+    cells = slice(rows.start // s, rows.start // s + down)
+    now = looked.coarse[cells, :across]
+    past = now if memory.coarse is None else memory.coarse[cells, :across]
+    both = _told(past) & _told(now)
     if memory.coarse is None:
         both[...] = False
-    wide = -(-x // s) * s
     taken = torch.tensor([looked.light]), torch.tensor([float(looked.step)])
-    for top in range(0, y, ROWS):
-        first, last = max(top - HALO, 0), min(top + ROWS + HALO, -(-y // s) * s)
-        rows, cells = slice(first, last), slice(first // s, last // s)
 
-        def fine(values: NDArray[np.generic], rows: slice = rows) -> Tensor:
-            part = values[rows]
-            fill = [(0, rows.stop - rows.start - len(part)), (0, wide - x), *[(0, 0)] * (part.ndim - 2)]
-            return _image(np.pad(part, fill, mode="edge"))
+    def fine(values: NDArray[np.generic]) -> Tensor:
+        fill = [(0, s * down - y), (0, s * across - x), *[(0, 0)] * (values.ndim - 2)]
+        return _image(np.pad(values, fill, mode="edge"))
 
-        def coarse(values: NDArray[np.generic], cells: slice = cells) -> Tensor:
-            return _image(np.nan_to_num(values[cells, : wide // s], posinf=0, neginf=0))
-
-        with torch.inference_mode():
-            coarsely = coarse(past), coarse(looked.coarse), coarse(both)
-            found = reader(*map(fine, images), *taken, *coarsely)
-        own = found[0, :, top - first : min(top + ROWS, y) - first, :x]
-        yield np.ascontiguousarray(own.permute(1, 2, 0).numpy(), np.float32)
+    with torch.inference_mode():
+        coarsely = (_image(np.nan_to_num(values, posinf=0, neginf=0)) for values in (past, now))
+        found = reader(*map(fine, images), *taken, *coarsely, _image(both))
+    return np.ascontiguousarray(found[0, :, :y, :x].permute(1, 2, 0).numpy(), np.float32)
 
 
 def _told(values: Floats) -> NDArray[np.bool_]:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pipeline.errors import ShapeError
 from storage.arrays.class_maps import ClassNames, legend_of
 from storage.arrays.layout import (
+    SHARD_ROWS,
     AngularGrid,
     create_array,
     create_group,
@@ -73,8 +74,11 @@ def write_belief_tile(
         arrays = [array for name in names if isinstance(array := group[name], zarr.Array)]
     place = tuple(slice(first, first + size) for first, size in zip(origin, age_days.shape, strict=True))
     whole_shards("the belief", place, arrays[1].shape, arrays[1].shards or ())
-    packed = np.rint((np.clip(log_probability, FAINTEST, 0) - FAINTEST) / STEP)
-    arrays[0][place] = np.where(np.isnan(log_probability), NOTHING, np.minimum(packed, NOTHING - 1)).astype(np.uint8)
+    for top in range(0, len(age_days), SHARD_ROWS):  # what is packed never lies there for all rows at once
+        part = log_probability[top : top + SHARD_ROWS]
+        packed = np.rint((np.clip(part, FAINTEST, 0) - FAINTEST) / STEP)
+        rows = slice(place[0].start + top, place[0].start + top + len(part))
+        arrays[0][rows, place[1]] = np.where(np.isnan(part), NOTHING, np.minimum(packed, NOTHING - 1)).astype(np.uint8)
     days = np.rint(np.clip(age_days, 0, DAY_STEP * (NEVER - 1)) / DAY_STEP)
     arrays[1][place] = np.where(np.isnan(age_days), NEVER, days).astype(np.uint16)
     octaves = np.clip(np.log2(np.maximum(light, 2.0**DARKEST)), DARKEST, DARKEST + OCTAVE_STEP * (DARK - 1))

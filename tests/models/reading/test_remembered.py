@@ -52,11 +52,11 @@ def a_memory(rng: np.random.Generator, shape: tuple[int, int] = SHAPE, days: flo
     return Remembered(first_belief(look), look.coarse, days)
 
 
-def a_reader(seed: int = 0) -> MemoryReader:
+def a_reader(seed: int = 0, factor: int = FACTOR) -> MemoryReader:
     """A reader as chance made it, in which nothing is idle."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        reader = MemoryReader(MemorySizes(CLASSES, COLUMNS, FACTOR, width=8, coarse_width=4)).eval()
+        reader = MemoryReader(MemorySizes(CLASSES, COLUMNS, factor, width=8, coarse_width=4)).eval()
         torch.nn.init.normal_(reader.leave.weight, std=0.3)
     return reader
 
@@ -140,13 +140,16 @@ def test_a_memory_is_worth_nothing_in_the_end() -> None:
     np.testing.assert_allclose(faded(told, np.zeros(SHAPE, np.float32)), np.maximum(told, FAINTEST), atol=1e-5)
 
 
-@pytest.mark.parametrize("shape", [(40, 36), (33, 21), (7, 5)])
-def test_strips_of_rows_read_the_same_as_the_whole(monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int]) -> None:
+@pytest.mark.parametrize("factor", [2, 4, 8])
+@pytest.mark.parametrize("shape", [(80, 36), (33, 21), (7, 5)])
+def test_strips_of_rows_read_the_same_as_the_whole(
+    monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int], factor: int
+) -> None:
     """However few rows are read at a time, and whatever is left of a coarse pixel at the border."""
     rng = np.random.default_rng(7)
-    memory, look, reader = a_memory(rng, shape), a_look(rng, shape), a_reader(3)
-    rows = -(-shape[0] // FACTOR)
-    coarse = [rng.normal(size=(rows, -(-shape[1] // FACTOR), COLUMNS)).astype(np.float32) for _ in range(2)]
+    memory, look, reader = a_memory(rng, shape), a_look(rng, shape), a_reader(3, factor)
+    rows = -(-shape[0] // factor)
+    coarse = [rng.normal(size=(rows, -(-shape[1] // factor), COLUMNS)).astype(np.float32) for _ in range(2)]
     memory, look = replace(memory, coarse=coarse[0]), replace(look, coarse=coarse[1])
     whole = recall(memory, look, reader)
     monkeypatch.setattr(remembered, "ROWS", 8)
