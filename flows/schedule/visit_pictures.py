@@ -45,29 +45,29 @@ def visit_pictures(archive: Archive, runs: Sequence[tuple[Run, str]]) -> list[Vi
         if run.problem is None and address is not None:
             with suppress(OSError, LookupError, ValueError):
                 shown = load_class_map(archive.locate(address))
-                seats = _changed_seats(archive, run)
-                found.append(VisitPicture(when, _drawn(shown, seats), _words(run.receipt)))
+                changed = _changed_pixels(archive, run, shown.classes.shape)
+                found.append(VisitPicture(when, _drawn(shown, changed), _words(run.receipt)))
     return found
 
 
-def _changed_seats(archive: Archive, run: Run) -> NDArray[np.bool_] | None:
-    """Seats with another class than remembered; None of a first look."""
+def _changed_pixels(archive: Archive, run: Run, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
+    """Pixels (y, x) of seats with another class than remembered; None of a first look."""
     address = run.products.get("belief")
-    if address is None:
+    store = None if address is None else BeliefStore(archive.locate(address))
+    changed = None if store is None else store.changed()
+    if store is None or changed is None:
         return None
-    changed = BeliefStore(archive.locate(address)).changed()
-    return None if changed is None else changed >= CHANGED_SHARE
+    seats = changed >= CHANGED_SHARE
+    return seats.repeat(store.patch_px, axis=0).repeat(store.patch_px, axis=1)[: shape[0], : shape[1]]
 
 
-def _drawn(shown: ClassMap, seats: NDArray[np.bool_] | None) -> str:
+def _drawn(shown: ClassMap, changed: NDArray[np.bool_] | None) -> str:
     """The map beside what changed of it, all else pale."""
     thin = -(-max(shown.classes.shape) // MOST_PX)
     colours = class_rgb(shown.classes[::thin, ::thin], class_palette(len(shown.names), shown.colours))
     picture = colours
-    if seats is not None:
-        y, x = shown.classes.shape
-        patch = next(size for size in (8, 16, 32, 64) if seats.shape[0] * size >= y)
-        fine = np.repeat(np.repeat(seats, patch, axis=0), patch, axis=1)[:y, :x][::thin, ::thin]
+    if changed is not None:
+        fine = changed[::thin, ::thin]
         changes = np.where(fine[..., None], colours, PALE + (1 - PALE) * colours)
         picture = np.concatenate([colours, np.ones((len(colours), GAP_PX, 3)), changes], axis=1)
     buffer = io.BytesIO()

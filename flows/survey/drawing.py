@@ -31,11 +31,9 @@ from models.reading.remembered import (
 )
 from models.weights.files import Weights
 from pipeline.rectify.registration.field_shift import FieldShift, field_shift
-from pipeline.rectify.registration.overlaps import BROAD_BANDS
 from storage.arrays.beliefs import BeliefStore, write_belief_tile
 from storage.arrays.class_maps import write_class_tile
-from storage.arrays.layout import SHARD_ROWS, open_group, read_array, read_bands
-from storage.arrays.mosaics import open_patches
+from storage.arrays.mosaics import mosaic_brightness, open_patches
 from storage.arrays.tile_work import let_tiles_go
 from storage.parallel.crew import run_blocks
 
@@ -189,7 +187,7 @@ LEAST_SHIFT_PX = 2.0  # less is how well two looks can be laid on each other
 
 def memory_lies(before: Path, now: Path, factor: int) -> FieldShift:
     """How the field of a stored coarse mosaic lies beside that of another, in fine px."""
-    found = field_shift(_broad_image(now), _broad_image(before), reach_px=REACH_PX / factor)
+    found = field_shift(mosaic_brightness(now), mosaic_brightness(before), reach_px=REACH_PX / factor)
     return replace(found, shift=(factor * found.shift[0], factor * found.shift[1]))
 
 
@@ -197,12 +195,3 @@ def whole_pixels(lies: FieldShift) -> tuple[int, int]:
     """Rows and columns to move a memory by; none where it lies as well as looks can be laid on each other."""
     down, across = lies.shift
     return (0, 0) if math.hypot(down, across) < LEAST_SHIFT_PX else (round(down), round(across))
-
-
-def _broad_image(mosaic: Path) -> NDArray[np.float32]:
-    """The mean of a few bands of a stored mosaic, (y, x); NaN where nothing was captured."""
-    group = open_group(mosaic)
-    bands = np.unique(np.linspace(0, len(read_bands(group)[0]) - 1, BROAD_BANDS).astype(int))
-    height = len(read_array(group, "coverage"))
-    blocks = (slice(first, min(first + SHARD_ROWS, height)) for first in range(0, height, SHARD_ROWS))
-    return np.concatenate([read_array(group, "values", rows)[..., bands].mean(axis=-1) for rows in blocks])

@@ -17,6 +17,7 @@ from storage.archive.archive import Archive, run_stem
 from storage.archive.keys import StageRef, published_runs
 from storage.archive.records import Run, read_run
 from storage.arrays.beliefs import BeliefStore
+from storage.arrays.mosaics import mosaic_shape
 
 NONE, LATEST, AUTO = "none", "latest", "auto"
 LOOKED_THROUGH = 60  # newest runs of a field among which the visit before is looked for
@@ -103,11 +104,14 @@ def _usable(
         if stores[0] is None or stores[1] is None:
             return "what it left was cleared; reprocess makes it again"
         store = BeliefStore(stores[0].path / "belief.zarr")
-        names = store.legend.names
+        names, coarse = store.legend.names, mosaic_shape(stores[1].path / "mosaic.zarr")
     except IncompleteStoreError as error:
         return f"{error}"
     if store.shape != (grid.height, grid.width):
         return f"it is of {store.shape[1]} x {store.shape[0]} px, this field has {grid.width} x {grid.height}"
+    if coarse != grid.coarse_shape:
+        rows, columns = grid.coarse_shape
+        return f"its coarse look has {coarse[1]} x {coarse[0]} px, these weights read {columns} x {rows}"
     camera = run.settings.get("camera")
     same = not isinstance(camera, Mapping) or all(
         camera.get(part) == getattr(settings.camera, part) for part in ("pitch_um", "focal_length_mm")

@@ -86,11 +86,15 @@ def write_belief_tile(
     arrays[2][place] = np.where(light > 0, packed, DARK).astype(np.uint8)
 
 
-def write_changes(path: Path, changed: Floats) -> None:
-    """Add (seat_y, seat_x) shares of pixels that changed to a stored belief."""
+def write_changes(path: Path, changed: Floats, patch_px: int) -> None:
+    """Add (seat_y, seat_x) shares of pixels that changed to a stored belief; a seat has ``patch_px`` a side."""
     with damage_named(str(path)):
         group = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
-    about = {"long_name": "share of the patch's pixels with another class than remembered", "units": "1"}
+    about: dict[str, Any] = {
+        "long_name": "share of the patch's pixels with another class than remembered",
+        "units": "1",
+    }
+    about["patch_px"] = patch_px
     write_image(group, "changed", ("seat_y", "seat_x"), changed, about)
 
 
@@ -121,6 +125,11 @@ class BeliefStore:
         packed_light = read_array(self._group, "log2_light", np.s_[rows, columns])
         light = np.exp2(packed_light * np.float32(OCTAVE_STEP) + np.float32(DARKEST))
         return values, days, np.where(packed_light == DARK, 0, light).astype(np.float32)
+
+    @property
+    def patch_px(self) -> int:
+        """Pixels a side of the seats that changes are told of."""
+        return int(self._group["changed"].attrs["patch_px"])  # type: ignore[arg-type]
 
     def changed(self) -> Floats | None:
         """Shares of pixels that changed, by seat; None of a first look."""

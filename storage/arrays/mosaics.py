@@ -282,3 +282,13 @@ def load_attention(path: Path) -> Attention:
     """Read scores and ranks. Raises IncompleteStoreError where they are missing or damaged."""
     group = open_group(path)
     return Attention(read_array(group, "score"), read_array(group, "rank"), str(group.attrs.get("policy", "")))
+
+
+def mosaic_shape(path: Path) -> tuple[int, int]:
+    """(y, x) of a stored mosaic. Raises IncompleteStoreError where there is none, or it is damaged."""
+    group = open_group(path)
+    with damage_named(str(path)):
+        array = group["coverage"]
+        if not isinstance(array, zarr.Array):
+            raise KeyError("coverage is no array")
+        return int(array.shape[0]), int(array.shape[1])

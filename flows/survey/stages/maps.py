@@ -50,7 +50,7 @@ def draw_map(run: SurveyRun, mosaic: StageRef, patches: StageRef) -> Wanted:
             if told["put_aside"] is not None and drawn.comparison is not None:
                 drawn = draw_field(work, replace(drawing, memory=None), run.report)
         if drawn.changed is not None:
-            write_changes(path / "belief.zarr", drawn.changed)
+            write_changes(path / "belief.zarr", drawn.changed, run.grid.patch)
         if any(drawn.strange):
             write_table(path / STRANGE, dict(zip(("coarse_px", "fine_px"), drawn.strange, strict=True)))
         if run.scene.missing is not None:

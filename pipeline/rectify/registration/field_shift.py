@@ -58,7 +58,7 @@ def field_shift(now: NDArray[np.floating], before: NDArray[np.floating], *, reac
     start = np.rint(whole.shift) if whole.status == "found" else np.zeros(2)
     if min(now.shape) < WINDOWS * LEAST_WINDOW_PX:
         return FieldShift((float(whole.shift[0]), float(whole.shift[1]))) if whole.status == "found" else FieldShift()
-    found = _of_windows(now, _moved_by(before, start)) if start.any() else []
+    found = _of_windows(now, ndimage.shift(before, start, order=0, cval=np.nan)) if start.any() else []
     there = _of_windows(now, before)
     for within in (AGREE_PX, LOOSELY_PX):
         both = (_agreed(pairs, at, now.shape, within) for pairs, at in ((there, np.zeros(2)), (found, start)))
@@ -111,17 +111,3 @@ def _agreed(
         return 0, FieldShift()
     down, across = (model.translation + start).tolist()
     return count, FieldShift((float(down), float(across)), math.degrees(model.rotation))
-
-
-def _moved_by(image: NDArray[np.floating], by: NDArray[np.float64]) -> NDArray[np.floating]:
-    """An image as many whole pixels further down and to the right, NaN where it came from."""
-    moved = np.full_like(image, np.nan)
-    down, across = by.astype(int).tolist()
-    there = tuple(
-        slice(max(one, 0), max(size + min(one, 0), 0)) for one, size in zip((down, across), image.shape, strict=True)
-    )
-    here = tuple(
-        slice(max(-one, 0), max(size - max(one, 0), 0)) for one, size in zip((down, across), image.shape, strict=True)
-    )
-    moved[there] = image[here]
-    return moved

@@ -327,3 +327,14 @@ def test_a_look_is_no_memory_of_itself(visited: Path, twice: Any, survey_png: Su
     for published in (again, first):
         (row,) = (stage for stage in published.receipt["stages"] if stage["name"] == "draw_map")
         assert row["state"] == "cached"
+
+
+def test_weights_of_another_factor_have_no_memory(
+    visited: Path, survey_png: Survey, make_weights: WeightsMaker
+) -> None:
+    """Their coarse pixels are others, so that both coarse looks cannot be compared: said, and gone on without."""
+    weights = make_weights(factor=2)
+    flags = {"weights": str(weights), "visit": "2026-06-07T10:00:00Z", "prior": "latest"}
+    words, published = words_of(visited, survey_png, **flags)
+    assert "cannot be used: its coarse look has 32 x 24 px, these weights read 64 x 48" in words
+    assert "memory" not in published.receipt

@@ -85,7 +85,8 @@ def test_changes_are_there_once_written(tmp_path: Path) -> None:
     """A first look has none."""
     path = stored(tmp_path / "belief.zarr")
     assert BeliefStore(path).changed() is None
-    write_changes(path, np.array([[0.0, 0.5]], np.float32))
+    write_changes(path, np.array([[0.0, 0.5]], np.float32), 16)
+    assert BeliefStore(path).patch_px == 16
     found = BeliefStore(path).changed()
     assert found is not None
     assert found.tolist() == [[0.0, 0.5]]
