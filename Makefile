@@ -21,7 +21,7 @@ setup: $(BIN)/.ok
 $(BIN)/.ok: pyproject.toml constraints.txt
 	$(PY) -m venv $(VENV) 2>/dev/null || { $(PY) -m venv --without-pip $(VENV) \
 		&& $(PY) -m pip --python $(BIN)/python install -q pip; }
-	$(BIN)/python -m pip install -q --no-compile --disable-pip-version-check -c constraints.txt -e '.[dev,geo,s3,bench]'
+	$(BIN)/python -m pip install -q --no-compile --disable-pip-version-check -c constraints.txt -e '.[dev,s3,bench]'
 	touch $@
 
 survey: $(BIN)/.ok
@@ -68,7 +68,7 @@ soak: $(BIN)/.ok
 lock:
 	$(PY) -m venv $(VENV)-lock 2>/dev/null || { $(PY) -m venv --without-pip $(VENV)-lock \
 		&& $(PY) -m pip --python $(VENV)-lock/bin/python install -q pip; }
-	$(VENV)-lock/bin/python -m pip install -q --dry-run --ignore-installed --report $(VENV)-lock/report.json '.[dev,geo,s3,bench]'
+	$(VENV)-lock/bin/python -m pip install -q --dry-run --ignore-installed --report $(VENV)-lock/report.json '.[dev,s3,bench]'
 	$(VENV)-lock/bin/python -c "$$LOCK" $(VENV)-lock/report.json constraints.txt
 	rm -rf $(VENV)-lock
 
