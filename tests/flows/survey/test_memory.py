@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -327,6 +328,17 @@ def test_a_look_is_no_memory_of_itself(visited: Path, twice: Any, survey_png: Su
     for published in (again, first):
         (row,) = (stage for stage in published.receipt["stages"] if stage["name"] == "draw_map")
         assert row["state"] == "cached"
+
+
+def test_two_visits_at_once_are_both_kept(visited: Path, twice: Any, survey_png: Survey) -> None:
+    """Neither waits for the other or goes on from it half made: both are published, and rest on finished runs."""
+    at = ["2026-06-09T10:00:00Z", "2026-06-09T11:00:00Z"]
+    with ThreadPoolExecutor(2) as pool:
+        both = list(pool.map(lambda visit: survey_png(visited, **PLAIN, visit=visit, prior="latest"), at))
+    assert both[0].folder != both[1].folder
+    assert both[0].receipt["memory"]["run"] == twice[2].folder.name
+    assert both[1].receipt["memory"]["run"] in {twice[2].folder.name, both[0].folder.name}
+    assert not problems(visited)
 
 
 def test_weights_of_another_factor_have_no_memory(

@@ -232,6 +232,38 @@ def test_a_field_of_one_class_is_no_other_field() -> None:
     assert not compare(memory, look, memory.belief, np.s_[:, :]).is_of_another_field
 
 
+def sure_of(classes: NDArray[np.integer], how: float) -> Looked:
+    """A look in detail that gives every pixel of (y, x) its class with the same probability."""
+    told = np.full((*classes.shape, CLASSES), (1 - how) / (CLASSES - 1), np.float32)
+    np.put_along_axis(told, np.asarray(classes, np.intp)[..., None], how, axis=-1)
+    coarse = np.zeros((classes.shape[0] // FACTOR, classes.shape[1] // FACTOR, COLUMNS), np.float32)
+    return Looked(np.log(told), np.ones(classes.shape, np.bool_), coarse, 0.05, 2)
+
+
+def test_a_harvest_overnight_is_seen() -> None:
+    """Of rows of a crop, two of every five columns, a sure look finds none: soil is drawn, and those rows changed."""
+    rows = np.zeros(SHAPE, np.uint8)
+    rows[:, np.arange(SHAPE[1]) % 5 < 2] = 1
+    before, today = sure_of(rows, 0.99), sure_of(np.zeros(SHAPE, np.uint8), 0.98)
+    memory = Remembered(first_belief(before), before.coarse, 1.0)
+    after = recall(memory, today, None)
+    assert not after.classes()[0].any()
+    found = compare(memory, today, after, np.s_[:, :])
+    assert not found.is_of_another_field  # soil between the rows is as it was
+    assert found.changed[1, 0] == np.count_nonzero(rows) == found.changed.sum() - np.trace(found.changed)
+    np.testing.assert_array_equal(changed_shares(memory, after, 5)[:4], np.full((4, 4), 0.4, np.float32))
+
+
+def test_a_field_under_snow_is_no_field_that_is_remembered() -> None:
+    """Where a look is sure of one class that the memory has nowhere, the memory would only do harm: put aside."""
+    rows = np.arange(SHAPE[1]) % 5 < 2
+    before, snow = sure_of(np.broadcast_to(rows, SHAPE), 0.99), sure_of(np.full(SHAPE, 2), 0.9)
+    memory = Remembered(first_belief(before), before.coarse, 1.0)
+    found = compare(memory, snow, recall(memory, snow, None), np.s_[:, :])
+    assert found.agreement == 0
+    assert found.is_of_another_field
+
+
 def test_parts_of_a_field_add_up() -> None:
     """Comparisons of two halves are together that of the whole."""
     rng = np.random.default_rng(12)
