@@ -91,6 +91,14 @@ def remembered_work(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def no_waiting_for_the_disk() -> Iterator[None]:
+    """Files of tests need not outlive a power cut: a survey asks 300 times to be put on the disk, and waits for it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda descriptor: None)
+        yield
+
+
 @pytest.fixture
 def choosing_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every survey of this test works out its choice of effects, and draws its picture, by itself."""
