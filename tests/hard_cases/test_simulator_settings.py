@@ -87,7 +87,7 @@ ASKED = st.builds(
 )
 
 
-@settings(max_examples=4, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))  # a case takes seconds
+@settings(max_examples=2, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))  # a case takes seconds
 @given(ASKED)
 @example(Asked())
 @example(Asked(pattern="columns", binning=14, noiseless=True))
