@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from flows.survey.run import SurveyRun
-from pipeline.ground.georeference import class_areas_m2, pixel_side_m
+from pipeline.ground.georeference import class_areas_m2, crs_name, pixel_side_m
 from storage.arrays.class_maps import ClassMap
 from storage.arrays.ground_maps import M2_PER_HECTARE, GroundMap
 
@@ -13,7 +13,7 @@ from storage.arrays.ground_maps import M2_PER_HECTARE, GroundMap
 def posed_findings(drawn: GroundMap) -> dict[str, Any]:
     """Of a survey with a pose: the map that was drawn on the ground."""
     return {
-        "crs": str(drawn.geobox.crs),
+        "crs": crs_name(drawn.geobox),
         "resolution_m": abs(float(drawn.geobox.resolution.x)),
         "shape": [int(size) for size in drawn.geobox.shape],
         "areas_ha": {name: area["ha"] for name, area in drawn.areas.items()},
@@ -30,7 +30,7 @@ def placed_findings(run: SurveyRun, found: ClassMap) -> dict[str, Any]:
         return {}
     areas = class_areas_m2(geobox, found.classes, len(found.names)) / M2_PER_HECTARE
     ground = {
-        "crs": str(geobox.crs),
+        "crs": crs_name(geobox),
         "resolution_m": pixel_side_m(geobox),
         "shape": [int(size) for size in geobox.shape],
         "areas_ha": dict(zip(found.names, areas.tolist(), strict=True)),

@@ -40,7 +40,19 @@ def georeference_record(geobox: GeoBox | None) -> dict[str, Any]:
     """What says a place in the keys of stores: nothing for a scene that has none, so that its keys stay."""
     if geobox is None:
         return {}
-    return {"georeference": {"crs": str(geobox.crs), "transform": [float(number) for number in geobox.affine[:6]]}}
+    return {"georeference": {"crs": crs_key(geobox), "transform": [float(number) for number in geobox.affine[:6]]}}
+
+
+def crs_key(geobox: GeoBox) -> str:
+    """What says a grid's CRS in one word: its EPSG code, or all of it as WKT where it has none."""
+    assert geobox.crs is not None
+    return geobox.crs.to_wkt() if geobox.crs.epsg is None else f"EPSG:{geobox.crs.epsg}"
+
+
+def crs_name(geobox: GeoBox) -> str:
+    """What people call a grid's CRS: its EPSG code, or its name where it has none."""
+    assert geobox.crs is not None
+    return str(geobox.crs.proj.name) if geobox.crs.epsg is None else crs_key(geobox)
 
 
 def class_areas_m2(geobox: GeoBox, classes: NDArray[np.uint8], count: int) -> Floats:

@@ -210,7 +210,7 @@ def test_a_pose_is_the_one_place_of_a_run(tmp_path: Path, weights: Path) -> None
         run = run_survey(load_settings(words, {**flags, "budget": 0.8, "accuracy": False, "controls": False}), QUIET)
     assert any("set aside: [pose] says where it lies" in note for note in run.receipt["settings"]["notes"])
     assert "spatial_ref" not in opened(run, "class_map")
-    assert "spatial_ref" in opened(run, "ground")
+    assert "spatial_ref" in opened(run, "ground_map")
 
 
 def test_every_store_opens_without_a_word(tmp_path: Path, weights: Path) -> None:
@@ -238,7 +238,7 @@ def test_a_real_scene_goes_from_file_to_export(tmp_path: Path, real_data: Path, 
     scene = real_data / "rgbn" / "rgbn_suba.tif"
     if not scene.is_file():
         pytest.skip(f"there is no {scene}")
-    run = survey(scene, make_weights((640.0, 550.0, 460.0, 800.0)), tmp_path / "archive", effects="off")
+    run = survey(scene, make_weights((640.0, 550.0, 460.0, 800.0)), tmp_path / "archive")
     with rasterio.open(scene) as source:
         known, transform, shape, empty = source.crs, source.transform, source.shape, (source.read() == 0).all(axis=0)
     files = run_export(tmp_path / "archive", None, tmp_path / "out", envi=False, console=QUIET)["files"]
