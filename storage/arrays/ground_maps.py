@@ -16,6 +16,7 @@ import zarr
 from numpy.typing import NDArray
 
 from pipeline.errors import IncompleteStoreError, PoseError, ShapeError
+from pipeline.ground.field_scale import M2_PER_HECTARE
 from pipeline.lazy import deferred
 from storage.arrays.class_maps import CONFIDENCE, ClassNames, check_named, class_flags, legend_of
 from storage.arrays.layout import (
@@ -40,7 +41,6 @@ else:
     odc_geo_xr = deferred("odc.geo.xr")
 
 BLOCK = (4 * SHARD_ROWS, 2 * SHARD_COLUMNS)  # (y, x) px to write at a time: whole shards
-M2_PER_HECTARE = 10_000.0
 GRID_MAPPING = "spatial_ref"
 # on every image: CF's link to the grid mapping, and the same as a coordinate, so that plain xarray takes it for one
 ON_THE_MAP = {"grid_mapping": GRID_MAPPING, "coordinates": GRID_MAPPING}
