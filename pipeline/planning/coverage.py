@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -85,9 +85,16 @@ def plain_sweeps(
 
 
 def cheapest_full(
-    grid: SceneGrid, camera: LineCamera, cost: CostModel, *, overlap_px: float = 0
+    grid: SceneGrid,
+    camera: LineCamera,
+    cost: CostModel,
+    *,
+    overlap_px: float = 0,
+    cut: Callable[[list[Sweep]], list[Sweep]] = lambda sweeps: sweeps,
 ) -> tuple[Axis, list[Sweep], float]:
     """Choose the orientation of the full scan that takes the least time: axis of the lines, sweeps, seconds.
+
+    ``cut`` leaves of the sweeps what is to be captured, where that is not all.
 
     Raises PoseError: neither orientation is within the mirror's range.
     """
@@ -95,7 +102,7 @@ def cheapest_full(
     axes: tuple[Axis, Axis] = ("x", "y")
     for along in axes:
         try:
-            sweeps = full_sweeps(grid, camera, along, overlap_px=overlap_px)
+            sweeps = cut(full_sweeps(grid, camera, along, overlap_px=overlap_px))
         except PoseError:
             if along == axes[-1] and not found:
                 raise
