@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from flows.settings.survey_settings import Settings
 from pipeline.errors import ZoneError
 from pipeline.geometry.grid import SceneGrid
-from pipeline.ground.field_places import FieldPlace, NoPlace, PosedField
+from pipeline.ground.field_places import FieldPlace, NoPlace, PlacedPicture, PosedField
 from pipeline.ground.map_grid import ground_grid
 from pipeline.ground.view import GroundView
 from pipeline.ground.zones import FieldZones, extent_deg, field_zones, on_field, pixels_inside
@@ -73,7 +73,7 @@ def place_of_field(settings: Settings, scene: RasterScene) -> FieldPlace:
     Raises PoseError: from the pose no ground is seen, or the map's CRS does not suit it.
     """
     if settings.pose is None:
-        return NoPlace(scene.shape)
+        return NoPlace(scene.shape) if scene.geobox is None else PlacedPicture(scene.geobox)
     view = GroundView(settings.pose, settings.camera.ifov_rad)
     return PosedField(ground_grid(view, scene.shape, epsg=settings.map.epsg, resolution_m=settings.map.resolution_m))
 
