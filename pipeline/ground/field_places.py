@@ -163,6 +163,21 @@ class PosedField:
         on_plane = shapely.transform(shape, lambda places: self.grid.frame.map_to_ground(places)[:, :2])
         return shapely.transform(shapely.intersection(shapely.make_valid(on_plane), shown), self._pixels)
 
+    def ground_points(self, pixels: Floats) -> Floats:
+        """Metres east and north of the rig's foot (..., 2) under places x, y in pixels; NaN where the map ends."""
+        points = pixels[..., ::-1] - np.array(self.shape) / 2
+        reached = self.view.sink(points) >= self.grid.least_sink
+        ground: Floats = np.where(reached[..., None], self.view.scene_to_ground(points)[..., :2], np.nan)
+        return ground
+
+    def on_ground(self, shape: BaseGeometry) -> BaseGeometry:
+        """Bring a polygon from pixels to metres east and north of the rig's foot, as far as the map reaches."""
+        reached = shapely.affinity.translate(self._seen(0.0), self.shape[1] / 2, self.shape[0] / 2)
+        half = np.array(self.shape) / 2
+        return shapely.transform(
+            shapely.intersection(shape, reached), lambda at: self.view.scene_to_ground(at[:, ::-1] - half)[:, :2]
+        )
+
     def _pixels(self, plane: Floats) -> Floats:
         normal = self.view.normal
         ground = np.column_stack([plane, -(plane @ normal[:2]) / normal[2]])
