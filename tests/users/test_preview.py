@@ -64,9 +64,15 @@ def test_hectares_are_those_of_the_area(scene_files: Path, weights: Path, tmp_pa
     assert half["kept_share"] == pytest.approx(0.5, abs=0.03)
 
 
+def _rgb(picture: Path) -> np.ndarray[Any, np.dtype[np.int64]]:
+    """A picture's colours, (y, x, 3)."""
+    with Image.open(picture) as found:
+        return np.asarray(found.convert("RGB"), np.int64)
+
+
 def _blue(picture: Path) -> int:
     """Pixels in the colour of coarse sweeps."""
-    rgb = np.asarray(Image.open(picture).convert("RGB")).astype(int)
+    rgb = _rgb(picture)
     return int((np.abs(rgb - (0, 114, 178)).max(axis=-1) < 30).sum())
 
 
@@ -79,7 +85,7 @@ def test_the_preview_of_a_new_archive_shows_sweeps_over_the_outline(
     assert content["preview"] == str(tmp_path / "one.png")
     assert _blue(tmp_path / "one.png") > 500
     assert _blue(tmp_path / "two.png") > 1000
-    assert Image.open(tmp_path / "two.png").width > Image.open(tmp_path / "one.png").width
+    assert _rgb(tmp_path / "two.png").shape[1] > _rgb(tmp_path / "one.png").shape[1]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["one.png", "two.png"]
 
 
@@ -91,10 +97,7 @@ def test_the_preview_of_a_field_lies_over_its_last_map(
     labels = {"labels": str(scene_files / "labels.png"), "controls": False, "camera.samples": 64}
     planned(scene_files, weights, tmp_path / "archive", tmp_path / "map.png", **labels)
     planned(scene_files, weights, tmp_path / "new", tmp_path / "outline.png", **labels)
-    shown = [
-        np.unique(np.asarray(Image.open(tmp_path / name).convert("RGB")).reshape(-1, 3), axis=0)
-        for name in ("map.png", "outline.png")
-    ]
+    shown = [np.unique(_rgb(tmp_path / name).reshape(-1, 3), axis=0) for name in ("map.png", "outline.png")]
     assert len(shown[0]) > len(shown[1])
 
 
