@@ -229,7 +229,7 @@ def ground_grid(
             f"no ray of the field meets the ground from the pose {view.pose}; tilt it further down, or check roll_deg "
             "and slope_deg"
         )
-    least = max(median_sink(view, scene_shape) / FAR_PIXELS ** (2 / 3), LEAST_SINK)  # a footprint's area goes as w^-3
+    least = least_mapped_sink(view, scene_shape)
     left, bottom, right, top = _bounds(frame, view.outline_px(scene_shape, least))
     growth = USUAL_GROWTH if resolution_m is None else MOST_GROWTH
     finest = float(np.sqrt((right - left) * (top - bottom) / (growth * scene_shape[0] * scene_shape[1])))
@@ -242,6 +242,12 @@ def ground_grid(
         )
     geobox = odc_geobox.GeoBox.from_bbox((left, bottom, right, top), crs=frame.crs, resolution=step)
     return GroundGrid(frame, scene_shape, geobox, least)
+
+
+def least_mapped_sink(view: GroundView, scene_shape: tuple[int, int]) -> float:
+    """Give the sink below which a field's rays meet the ground too far away to be mapped."""
+    farther: float = FAR_PIXELS ** (2 / 3)  # a footprint's area goes as w^-3
+    return max(median_sink(view, scene_shape) / farther, LEAST_SINK)
 
 
 def median_sink(view: GroundView, scene_shape: tuple[int, int]) -> float:

@@ -15,6 +15,7 @@ import zarr
 from numpy.typing import NDArray
 
 from pipeline.errors import IncompleteStoreError, ShapeError
+from pipeline.ground.field_scale import M2_PER_HECTARE
 from storage.arrays.class_maps import CONFIDENCE, ClassNames, check_named, class_flags, legend_of
 from storage.arrays.georeference import ON_THE_MAP, geobox_of_group, load_geobox, map_attributes, write_map_coordinates
 from storage.arrays.layout import (
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
     from odc.geo.geobox import GeoBox
 
 BLOCK = (4 * SHARD_ROWS, 2 * SHARD_COLUMNS)  # (y, x) px to write at a time: whole shards
-M2_PER_HECTARE = 10_000.0
 
 
 @dataclass(frozen=True)

@@ -292,12 +292,16 @@ def _on_scene(
 def _cut_everything(
     run: SurveyRun, sweeps: Sequence[Sighted], writer: PatchWriter, seats: NDArray[np.integer], cache: LineCache
 ) -> None:
-    """Cut every seat of a plain scan, by tables of its pixels: many times as fast as looking each of them up."""
+    """Cut the wanted seats of a plain scan, by tables of its pixels: many times as fast as looking each of them up."""
     placed = [one.placed(run.camera, PixelGrid.of_scene(run.grid, 1)) for one in sweeps]
     waiting: list[tuple[NDArray[np.float32], NDArray[np.bool_]]] = []
-    done, count = 0, len(seats)
+    done, first, count, every = 0, 0, len(seats), run.grid.valid_seats()
+    row, column = np.divmod(every, run.grid.seat_shape[1])
+    wanted = np.isin(every[np.lexsort((column, row) if run.plan.along == "x" else (row, column))], seats)
     for band in read_every_seat(placed, run.camera, run.grid, run.settings.kernel, cache=cache):
-        waiting.append(band)
+        kept = wanted[first : first + len(band[0])]
+        first += len(band[0])
+        waiting.append(band if kept.all() else (band[0][kept], band[1][kept]))
         values, seen = (np.concatenate(parts) for parts in zip(*waiting, strict=True))
         whole = len(values) if done + len(values) == count else len(values) // SEATS_AT_ONCE * SEATS_AT_ONCE
         writer.write(done, *_on_scene(run, seats[done : done + whole], values[:whole], seen[:whole]))
