@@ -132,7 +132,10 @@ def evaluate(dataset: str | Path | OpenedRun, *, progress: Told | None = None, *
         asked["out"] = Path(asked["out"])
     with _working(progress):
         request = kind(str(dataset), **asked, choices=choices)
-        return evaluate_command.evaluate_weights(request, lambda what, done, words: _tell(progress, what, done))
+        content: dict[str, Any] = evaluate_command.evaluate_weights(
+            request, lambda what, done, words: _tell(progress, what, done)
+        )
+    return content
 
 
 def train(
