@@ -208,7 +208,7 @@ def _working(progress: Told | None, *, quiet: bool = True) -> Iterator[Console]:
 
 def _judge(
     run: OpenedRun, progress: Told | None, labels: str | Path | None = None, controls: bool | None = None
-) -> Any:
+) -> dict[str, Any]:
     """Add its accuracy to a run, and give it."""
     asked = None if labels is None else str(labels)
     with _working(progress) as console:
