@@ -28,7 +28,7 @@ def open_labelled(path: Path) -> xarray.Dataset:
     """Open a store lazily, in dask's blocks of whole shards, with a coordinate on every axis.
 
     ``y`` and ``x`` are in metres where the store lies on a map (its CRS in ``spatial_ref``), else tangents of the angle
-    from the undeflected direction [rad], else pixels. Of bands ``wavelength`` [nm] is an index as well. Numbers are
+    from the undeflected direction [rad], else pixels; ``band`` and ``wavelength`` are in nm, both an index. Numbers are
     those of the store: no class becomes a float, whatever stands for none. Raises IncompleteStoreError: there is no
     such store, or its metadata is damaged.
     """
@@ -51,7 +51,9 @@ def in_shards(opened: xarray.Dataset) -> xarray.Dataset:
 
 
 def on_axes(opened: xarray.Dataset, about: Mapping[Hashable, Any]) -> xarray.Dataset:
-    """Give each axis without a coordinate one: places by the transform in ``about``, or numbers without one."""
+    """Give each axis without a coordinate one: places by the transform in ``about``, wavelengths, else numbers."""
+    if "band" in opened.dims and "band" not in opened.variables and "wavelength" in opened.variables:
+        opened = opened.assign_coords(band=("band", opened["wavelength"].values, opened["wavelength"].attrs))
     place = about.get("spatial:transform")
     missing = {str(name): size for name, size in opened.sizes.items() if name not in opened.variables}
     return opened.assign_coords({name: (name, *_labels(name, size, place)) for name, size in missing.items()})
