@@ -77,6 +77,10 @@ class PoseError(PipelineError, ValueError):
     """A direction or mirror position out of reach, or not finite."""
 
 
+class ZoneError(PipelineError, ValueError):
+    """Polygons of an area, of zones or plots cannot be used, or do not lie on the field."""
+
+
 class WeightsError(PipelineError, ValueError):
     """Model weights that are damaged or do not fit."""
 

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from flows.archive.field_figures import field_figures, figure_lines
 from flows.cli.app import AsJson
 from flows.cli.survey_verbs import NO_FLAGS, SurveyFlags, by_setting
 from flows.settings.load import load_settings
@@ -21,32 +23,45 @@ from flows.survey.extent import PastCosts
 from flows.survey.run import SurveyRun, open_run
 from flows.survey.scan_choice import ScanChoice, as_told
 from flows.survey.stage import Stage, Wanted
+from flows.survey.stages.attention import load_plan
 from flows.survey.survey import STAGES, judge, survey
 from flows.terminal.figures import format_bytes, format_points, format_seconds
 from flows.terminal.processes import DONE
 from flows.terminal.progress import put_out
 from pipeline.errors import IncompleteStoreError, PipelineError
+from pipeline.lazy import deferred
 from pipeline.planning.plain_scans import scan_words
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef, plain, store_at
 from storage.archive.lineage import Catalogue, Change, changes_between
 from storage.archive.records import Store
+from storage.archive.staging import refusals
+from storage.arrays.class_maps import ClassMap, load_class_map
 from storage.remote.opening import is_archive, open_archive
+
+if TYPE_CHECKING:
+    import flows.archive.plan_preview as plan_preview
+else:
+    plan_preview = deferred("flows.archive.plan_preview")  # matplotlib, for pictures alone
 
 State = Literal["cached", "to run", "blocked", "skipped"]
 
 
-def plan(settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = False) -> int:
+def plan(
+    settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, preview: Path | None = None, as_json: AsJson = False
+) -> int:
     """Tell what a survey would run: what is stored, what is to be made and why, and about how long it takes.
 
-    Nothing is captured, started or written. Give the settings that you would give to `survey`.
+    Nothing is captured, started or written, but for the preview. Give the settings that you would give to `survey`.
 
     Parameters
     ----------
     settings
         A survey's TOML file; flags win over it.
+    preview
+        A PNG to write: the sweeps over the field's last map, or over its outline where there is none, with zones.
     """
-    put_out(plan_content(load_settings(settings, by_setting(flags))), show_plan, as_json=as_json)
+    put_out(plan_content(load_settings(settings, by_setting(flags)), preview), show_plan, as_json=as_json)
     return DONE
 
 
@@ -88,18 +103,44 @@ class Forecast:
     stages: list[StageForecast]
     refused: str | None = None
     scans: ScanChoice = field(default_factory=ScanChoice)
+    figures: Mapping[str, Any] = field(default_factory=dict)  # see `flows.archive.field_figures`
 
 
-def forecast(settings: Settings) -> Forecast:
-    """What a survey would do, stage by stage; writes nothing. PipelineError: what a survey would refuse, but size."""
+def forecast(settings: Settings, preview: Path | None = None) -> Forecast:
+    """What a survey would do, stage by stage; writes nothing but the ``preview``, where one is asked for.
+
+    Raises PipelineError: what a survey would refuse, but size; ArchiveError: the preview cannot be written.
+    """
     with tempfile.TemporaryDirectory(prefix="spectralzoom-plan-") as empty:
         archive = Archive(Path(empty), writes=False)  # where there is none yet
         if is_archive(settings.out):
             archive = open_archive(settings.out, create=False, write=False)
         run = open_run(settings, planning=True, archive=archive)
-        planner = Planner(run, Catalogue.read(archive.root))
-        judge(planner, survey(planner))
-    return Forecast(planner.rows, run.refused, run.scans)
+        catalogue = Catalogue.read(archive.root)
+        planner = Planner(run, catalogue)
+        products = survey(planner)
+        judge(planner, products)
+        attention = products["attend"]
+        fine = None if attention is None or isinstance(attention, _Awaited) else load_plan(attention)
+        figures = field_figures(run, fine)
+        if preview is not None:
+            shown = plan_preview.PlanPicture(run, fine, _last_map(run, catalogue), figure_lines(figures))
+            with refusals(preview.parent, "write the preview"):
+                plan_preview.draw_preview(preview, shown)
+    return Forecast(planner.rows, run.refused, run.scans, figures)
+
+
+def _last_map(run: SurveyRun, catalogue: Catalogue) -> ClassMap | None:
+    """The newest map of the field that is of its size and can be read; None where there is none."""
+    for one in reversed(catalogue.runs):
+        parts = one.products.get("class_map", "").split("/")
+        if one.receipt.get("survey") == run.name and len(parts) > 3:
+            with suppress(PipelineError, OSError):
+                store = run.archive.find(parts[1], parts[2])
+                found = None if store is None else load_class_map(store.path / "class_map.zarr")
+                if found is not None and found.classes.shape == run.scene.shape:
+                    return found
+    return None
 
 
 @dataclass
@@ -181,9 +222,9 @@ MOST_LETTERS = 250  # of a reason
 COLOURS = {"cached": "green", "to run": "bold", "blocked": "yellow", "skipped": "dim"}
 
 
-def plan_content(settings: Settings) -> dict[str, Any]:
+def plan_content(settings: Settings, preview: Path | None = None) -> dict[str, Any]:
     """The forecast as plain tables, with sums of what is known; ``refused``: why this machine would not begin."""
-    found = forecast(settings)
+    found = forecast(settings, preview)
     rows = found.stages
     ahead = [row for row in rows if row.state in ("to run", "blocked")]
     return {
@@ -195,6 +236,8 @@ def plan_content(settings: Settings) -> dict[str, Any]:
         "bytes": _sum(ahead, "size"),
         "refused": found.refused,
         "scans": scans_content(found.scans),
+        "field": found.figures,
+        **({} if preview is None else {"preview": str(preview)}),
     }
 
 
@@ -234,9 +277,13 @@ def show_plan(content: dict[str, Any], console: Console) -> None:
             *figures,
         )
     console.print(table)
+    for line in figure_lines(content["field"]):
+        console.print(escape(line), soft_wrap=True)
     console.print(escape(_sentence(content)), soft_wrap=True)
     if content["scans"]["frontier"]:
         _show_scans(content["scans"], console)
+    if "preview" in content:
+        console.print(f"preview: {escape(content['preview'])}", soft_wrap=True)
     if content["refused"] is not None:
         console.print(f"[yellow]refused here[/]: {escape(content['refused'])}", soft_wrap=True)
 

@@ -30,8 +30,10 @@ else:
     rig_emulation = deferred("flows.simulate.rig_emulation")
 
 removed.update(REPLACED)
-IN_TABLES = {"exposure_ms": "camera.exposure_ms"}  # flags of what a settings file has in a table
-_DECLARED = SURVEY | {name: TABLES["camera"][name] for name in IN_TABLES}
+OF_ZONES = ("area", "no_go", "plots", "plots_name")
+# flags of what a settings file has in a table
+IN_TABLES = {"exposure_ms": "camera.exposure_ms", **{name: f"zones.{name}" for name in OF_ZONES}}
+_DECLARED = SURVEY | {name: TABLES[place.partition(".")[0]][name] for name, place in IN_TABLES.items()}
 
 
 def _flags(names: Iterable[str]) -> Any:

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 from numpy.typing import NDArray
 
-from flows.publish.receipt_table import area_words
+from flows.terminal.figures import area_words
 from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.ground_maps import GroundMap
 from storage.arrays.quicklooks import stretch

@@ -204,7 +204,7 @@ def _draw_truth(axes: Axes, data: QuicklookData) -> None:
     """Panel 4: the truth, without it the confidence, without both a word that there is neither."""
     if data.truth is not None:
         _show(axes, class_rgb(data.truth, _palette(data)), interpolation="nearest")
-        labelled = data.truth != UNLABELLED
+        labelled = (data.truth != UNLABELLED) & (data.class_map != UNLABELLED)
         right = float(np.mean(data.truth[labelled] == data.class_map[labelled])) if labelled.any() else float("nan")
         words = f"{100 * right:.1f} % of the labelled pixels agree" if labelled.any() else "no pixel is labelled"
         draw_scale(axes, data.truth.shape, data.pixel_mrad)
@@ -227,7 +227,8 @@ def _draw_confidence(axes: Axes, confidence: NDArray[np.floating] | None, title:
 
 def _draw_legend(figure: Figure, data: QuicklookData, columns: int) -> None:
     palette = _palette(data)
-    shares = np.bincount(data.class_map.ravel(), minlength=256)[: len(data.class_names)] / max(data.class_map.size, 1)
+    counts = np.bincount(data.class_map.ravel(), minlength=256)[: len(data.class_names)]
+    shares = counts / max(int(counts.sum()), 1)
     marks = [Patch(facecolor=tuple(colour), edgecolor="#555555", linewidth=0.6) for colour in palette]
     words = ["< 0.1 %" if 0 < share < 0.001 else f"{100 * share:.1f} %" for share in shares]
     names = [f"{name.replace('_', ' ')}  {share}" for name, share in zip(data.class_names, words, strict=True)]

@@ -12,8 +12,17 @@ from rich.markup import escape
 from rich.table import Table
 
 from flows.publish.receipt import Accuracy, Receipt, Savings, is_pending
+from flows.publish.zone_findings import plot_rows, zone_words
 from flows.survey.scores import SHOWN, SHOWN_WORDS, definitions_differ, false_class_words, worst_class_words
-from flows.terminal.figures import DASH, format_bytes, format_count, format_percent, format_points, format_seconds
+from flows.terminal.figures import (
+    DASH,
+    area_words,
+    format_bytes,
+    format_count,
+    format_percent,
+    format_points,
+    format_seconds,
+)
 from pipeline.planning.plain_scans import scan_words
 from pipeline.simulator.selection.choice import UNIT_WORDS
 
@@ -84,6 +93,11 @@ def print_table(receipt: Receipt, console: Console) -> None:
     console.print(table)
     if "accuracy" in receipt:
         console.print(_accuracy_table(receipt["accuracy"]))
+    if "plots" in receipt:
+        table = _table("Plots", "plot", "area", "classes", "confidence")
+        for plot in plot_rows(receipt["plots"]):
+            table.add_row(*(escape(cell) for cell in plot.values()))
+        console.print(table)
     table = _table("Stages", "stage", "state", "wall", "peak memory", "written")
     colours = {"ran": "green", "cached": "cyan", "skipped": "dim", "failed": "bold red"}
     for stage in receipt["stages"]:
@@ -129,9 +143,6 @@ def control_seats(accuracy: Mapping[str, Any]) -> str:
     return "other seats," if share is None else f"{format_percent(share)} of the seats, free,"
 
 
-LEAST_HECTARES = 0.1  # smaller areas are told in square metres
-
-
 def sentences(found: Mapping[str, Any]) -> list[str]:
     """The findings in words, for the terminal and the report."""
     words = []
@@ -158,6 +169,8 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
     for sweep, facts in found.get("lines", {}).items():
         told = ", ".join(f"{count} {what}" for what, count in facts.items() if count)
         words.append(f"Sweep {sweep}: lines {told}; what they would have shown is left out.")
+    if "zones" in found:
+        words.append(zone_words(found["zones"]))
     if "ground" in found:
         ground = found["ground"]
         areas = [f"{name.replace('_', ' ')} {area_words(area)}" for name, area in ground["areas_ha"].items() if area]
@@ -243,11 +256,6 @@ def _pointing_words(name: str, one: Mapping[str, Any]) -> str:
             f"look."
         )
     return text.strip()
-
-
-def area_words(hectares: float) -> str:
-    """An area in hectares, small ones in square metres."""
-    return f"{hectares:.3g} ha" if hectares >= LEAST_HECTARES else f"{hectares * 1e4:.3g} m²"
 
 
 WIDE = 100  # characters, from which words fit into the table

@@ -17,6 +17,7 @@ from markupsafe import Markup
 
 from flows.publish.receipt import Accuracy, Receipt
 from flows.publish.receipt_table import control_seats, cost_rows, format_change, headline, sentences, total_words
+from flows.publish.zone_findings import plot_rows
 from flows.survey.scores import SHOWN, SHOWN_WORDS, definitions_differ, false_class_words
 from flows.terminal.figures import format_bytes, format_percent, format_points, format_seconds
 from pipeline.errors import visible
@@ -93,6 +94,7 @@ def render_report(
         costs=cost_rows(receipt["savings"]),
         shares={name: split[name] / split["done"] for name in parts},
         findings=sentences(receipt),
+        plots=plot_rows(receipt.get("plots", [])),
         **_scores(receipt.get("accuracy")),
         total_words="" if total is None else " ".join(total_words(total)),
         details={

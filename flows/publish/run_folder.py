@@ -20,6 +20,7 @@ from flows.publish.panels import draw_ground
 from flows.publish.quicklook import QuicklookData, draw_quicklook
 from flows.publish.receipt import AccuracyIs, Header, Receipt, build_receipt, check_receipt, with_accuracy
 from flows.publish.report import Picture, render_report
+from flows.publish.zone_findings import PLOTS_FILE, find_zones, plots_csv
 from flows.settings.load import anchor_paths
 from flows.survey.extent import work_done, work_of_map
 from flows.survey.run import SurveyRun, now
@@ -103,6 +104,8 @@ def _publish(run: SurveyRun, draft: RunDraft, products: Products, plan: FinePlan
     looked_twice = None if run.plan.plain else float(seen_shares(run, products.of("cut_patches")).sum()) / seats
     draw_quicklook(draft.folder / "quicklook.png", quicklook_data(run, products, plan, receipt))
     draft.write_file("receipt.json", to_json(receipt))
+    if "plots" in receipt:
+        draft.write_file(PLOTS_FILE, plots_csv(receipt["plots"]))
     picture = (draft.folder / "quicklook.png").read_bytes()
     maps = (load_ground_map(ref.path / STORE) for ref in products.there(["ground"]))
     pictures = [Picture(draw_ground(drawn), "The map on the ground, north up.") for drawn in maps]
@@ -125,6 +128,7 @@ def make_receipt(runner: StageRunner, products: Products, plan: FinePlan, starte
     stores: dict[str, str] = {}
     for name, ref in products.items():
         stores |= {} if ref is None else STAGES[name].addresses(ref)
+    files = ("receipt.json", "quicklook.png", "report.html", *([PLOTS_FILE] if run.zones.plots is not None else []))
     unjudged: AccuracyIs = "pending" if run.settings.accuracy else "left out"
     accuracy_is = "judged" if accuracy is not None else unjudged if run.scene.labelled else "without labels"
     versions = {"python": platform.python_version()}
@@ -138,7 +142,7 @@ def make_receipt(runner: StageRunner, products: Products, plan: FinePlan, starte
         header,
         runner.records.values(),
         savings,
-        {**stores, **{name: f"{folder}/{name}" for name in ("receipt.json", "quicklook.png", "report.html")}},
+        {**stores, **{name: f"{folder}/{name}" for name in files}},
         accuracy=accuracy,
         accuracy_is=accuracy_is,
         judged=None if accuracy is None else now(),
@@ -268,7 +272,7 @@ def scans_told(run: SurveyRun, seconds: float) -> dict[str, Any]:
 
 
 def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
-    """``plan``, and what not every survey has: ``pointing``, ``ground``, ``pixels`` and ``lines``."""
+    """``plan``, and what not every survey has: see `flows.publish.receipt.FINDINGS`."""
     plan = load_plan(products.of("attend"))
     told: dict[str, Any] = {
         "kind": plan.kind,
@@ -306,13 +310,17 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
             "areas_ha": {name: area["ha"] for name, area in drawn.areas.items()},
         }
     class_map = products.of("draw_map")
-    classes = load_class_map(class_map.path / "class_map.zarr").classes
+    drawn_map = load_class_map(class_map.path / "class_map.zarr")
+    unclassed = drawn_map.classes == UNLABELLED
+    if run.zones.left_out is not None:
+        unclassed &= ~run.zones.left_out
+    found |= find_zones(run, drawn_map)
     pixels = {
         "scene_without_a_value": run.scene.filled_px,
         "coarse_px_no_reading": 0,
         "fine_px_no_reading": 0,
         **{f"{name}_no_reading": count for name, count in strange_pixels(class_map).items()},
-        "map_without_a_class": int(np.count_nonzero(classes == UNLABELLED)),
+        "map_without_a_class": int(np.count_nonzero(unclassed)),
     }
     if any(pixels.values()):
         found["pixels"] = pixels

@@ -15,13 +15,12 @@ from rich.markup import escape
 from flows.archive.stale_runs import called
 from flows.cli.app import ArchiveName, AsJson, OutFile, check_outside, stderr
 from flows.publish.receipt import areas_on_ground
-from flows.publish.receipt_table import LEAST_HECTARES, area_words
 from flows.publish.report import render_page
 from flows.schedule.date_charts import Chart, line_chart
 from flows.schedule.field_schedule import ENDINGS, read_moment
 from flows.schedule.visit_pictures import VisitPicture, visit_pictures
 from flows.survey.scores import score_of
-from flows.terminal.figures import DASH, counted, format_percent, known_number
+from flows.terminal.figures import DASH, LEAST_HECTARES, area_words, counted, format_percent, known_number
 from flows.terminal.processes import DONE
 from flows.terminal.progress import print_json
 from pipeline.errors import ArchiveError, SettingsError

@@ -230,9 +230,12 @@ def anchor_paths(table: dict[str, object], folder: Path) -> dict[str, object]:
     named = {*BUILT_IN_SCENES, REMOVED_LAW, RIG_FIELD}
     anchored = dict(table)
     for key in PATHS:
-        value = table.get(key)
+        head, _, tail = key.rpartition(".")
+        inner = anchored.get(head) if head else anchored
+        value = inner.get(tail) if isinstance(inner, Mapping) else None
         if isinstance(value, str) and value and value not in named and "://" not in value:
-            anchored[key] = str(folder / Path(value).expanduser())
+            path = str(folder / Path(value).expanduser())
+            anchored |= {head: {**inner, tail: path}} if head and isinstance(inner, Mapping) else {tail: path}
     return anchored
 
 
@@ -300,6 +303,9 @@ def _wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]:
     pairs = settings.cost.vector_pairs
     if settings.source == "rig" and not 2 <= pairs <= MOST_PAIRS:
         yield f"cost.vector_pairs = {pairs}: the mirror's vector memory takes 2 to {MOST_PAIRS} pairs; give what it has"
+    if settings.zones.plots_name is not None and settings.zones.plots is None:
+        place = place_of("zones.plots_name", origin.get("zones.plots_name"))
+        yield f"{place} = {settings.zones.plots_name!r} names plots, and there are none: give --plots FILE too"
     if settings.pose is None and settings.map != MapChoice():
         yield "[map] says how to draw the ground, which needs to know where the rig stands: give [pose]"
 

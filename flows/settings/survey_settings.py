@@ -44,7 +44,7 @@ RIG_FIELD = "field"  # the scene of which only the rig knows more than size and 
 OF_THE_MACHINE = ("scheduler", "workers")  # no byte depends on them; a cluster of that day need not be there today
 PLAIN = ("seconds", "bytes_raw", "goal", "scan_step")  # settings of which one asks for a plain scan
 OF_TWO_PASSES = ("budget", "coarse_exposure_ms", "policy", "threshold", "mask", "vgg")  # and of which none may
-PATHS = ("scene", "labels", "out", "mask", "vgg", "weights")
+PATHS = ("scene", "labels", "out", "mask", "vgg", "weights", "zones.area", "zones.no_go", "zones.plots")
 INSTEAD = "leave it out for a survey in two passes"
 WORKERS = "one process or thread each; leave it out for one a core"
 EPSG = "the number after EPSG:, such as 32632"
@@ -63,6 +63,27 @@ class MapChoice:
     )
     resolution_m: float | None = stated(
         None, "By default the median footprint of a pixel", "m", 1e-4, 1000, example=0.01
+    )
+
+
+@dataclass(frozen=True)
+class ZoneChoice:
+    """Files of polygons that a survey keeps to, or tells of."""
+
+    area: str | None = stated(
+        None,
+        "Area of interest, polygons as GeoJSON, GeoPackage (FILE.gpkg:LAYER) or shapefile: lines, scores, map, accuracy"
+        " and areas keep to it",
+        example="area.geojson",
+    )
+    no_go: str | None = stated(
+        None, "Zones that are left out: no detail is asked for there, and no map drawn", example="no_go.geojson"
+    )
+    plots: str | None = stated(
+        None, "Plots with names: area, classes and confidence of each are told", example="plots.gpkg:plots"
+    )
+    plots_name: str | None = stated(
+        None, "Attribute that names the plots; name, plot, plot_id, id or label by default", example="name"
     )
 
 
@@ -203,6 +224,10 @@ class Settings:
         "Where the rig stands: with it the map is also drawn on the ground, with hectares of each class.", None
     )
     map: MapChoice = table("What map to draw on the ground, for a survey with [pose].", MapChoice)
+    zones: ZoneChoice = table(
+        "Polygons on the field, in any CRS where the survey has a [pose] or a georeferenced scene, else in pixels.",
+        ZoneChoice,
+    )
 
     @property
     def plain(self) -> bool:

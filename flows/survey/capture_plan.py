@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from flows.settings.survey_settings import Settings
 from pipeline.errors import SettingsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, Sweep
+from pipeline.planning.area_cover import sweeps_over
 from pipeline.planning.coverage import cheapest_full, coarse_sweeps, plain_sweeps, with_margin
 from pipeline.planning.prices import check_budget
 from pipeline.rectify.registration.overlaps import LEAST_OVERLAP_PX
@@ -31,30 +35,38 @@ class CapturePlan:
     plain: bool = False  # one scan of everything, read whole
 
 
-def plan_capture(settings: Settings, grid: SceneGrid) -> CapturePlan:
+def plan_capture(settings: Settings, grid: SceneGrid, shown: NDArray[np.bool_] | None = None) -> CapturePlan:
     """Lay out coarse and full sweeps; where the mirror may look beside the plan, with overlaps and margins.
 
     Either pass overlaps by what its own registration needs. Its map lies as the sweep that is held does, which another
-    may lie beside by twice the mirror's error: so much earlier sweeps begin, and later they end. Raises SettingsError:
-    the mirror may be so far off that overlaps take whole lines; BudgetError: the budget does not pay for the coarse
-    pass; PoseError: the field is beyond the mirror's range.
+    may lie beside by twice the mirror's error: so much earlier sweeps begin, and later they end. Lines show the
+    ``shown`` (seat,) seats, all of them where it is None. Raises SettingsError: the mirror may be so far off that
+    overlaps take whole lines; BudgetError: the budget does not pay for the coarse pass; PoseError: the field is beyond
+    the mirror's range.
     """
     camera, cost = settings.camera, settings.cost
-    along, coarse, full = lay_out_sweeps(settings, grid)
+    along, coarse, full = lay_out_sweeps(settings, grid, shown)
     full_s, coarse_s = cost.seconds(full, camera), cost.seconds(coarse, camera)
     fine_s = 0.0 if settings.plain else check_budget(settings.budget, coarse_s, full_s)
     overlap = _overlap(settings, settings.scan_step or grid.factor)
     return CapturePlan(along, coarse, full, coarse_s, full_s, fine_s, overlap, 2 * settings.pointing_px, settings.plain)
 
 
-def lay_out_sweeps(settings: Settings, grid: SceneGrid) -> tuple[Axis, list[Sweep], list[Sweep]]:
+def lay_out_sweeps(
+    settings: Settings, grid: SceneGrid, shown: NDArray[np.bool_] | None = None
+) -> tuple[Axis, list[Sweep], list[Sweep]]:
     """Give the axis that lines lie along, the coarse sweeps or those of a plain scan, and those of the full scan.
 
-    Raises SettingsError: the mirror may be so far off that overlaps take whole lines; PoseError: the field is beyond
-    the mirror's range.
+    Lines that show none of the ``shown`` (seat,) seats are left out, but for a mirror that may look beside the plan:
+    its sweeps are tied together by what they share. Raises SettingsError: the mirror may be so far off that overlaps
+    take whole lines; PoseError: the field is beyond the mirror's range.
     """
     camera, cost, apart = settings.camera, settings.cost, 2 * settings.pointing_px
-    along, full, _ = cheapest_full(grid, camera, cost, overlap_px=_overlap(settings, 1))
+
+    def cut(sweeps: list[Sweep]) -> list[Sweep]:
+        return sweeps if shown is None or apart else sweeps_over(sweeps, grid, camera, shown)
+
+    along, full, _ = cheapest_full(grid, camera, cost, overlap_px=_overlap(settings, 1), cut=cut)
     if settings.scan_step is not None:
         step, overlap = settings.scan_step, _overlap(settings, settings.scan_step)
         exposure_ms = settings.scan_exposure_ms
@@ -62,7 +74,7 @@ def lay_out_sweeps(settings: Settings, grid: SceneGrid) -> tuple[Axis, list[Swee
     else:
         overlap, exposure_ms = _overlap(settings, grid.factor), settings.coarse_exposure_ms
         looks = coarse_sweeps(grid, camera, along, overlap_px=overlap, exposure_ms=exposure_ms)
-    return along, with_margin(looks, camera, apart), with_margin(full, camera, apart)
+    return along, with_margin(cut(looks), camera, apart), with_margin(full, camera, apart)
 
 
 def _overlap(settings: Settings, step: int) -> float:

@@ -52,6 +52,7 @@ class Drawing:
     light: float  # exposure of a line that is read in detail, as a share of the reference
     step: int  # pixels from such a line to the next
     memory: FieldMemory | None = None  # what is remembered of the field
+    left_out: Path | None = None  # (y, x) pixels of which zones have no map drawn
 
     def __call__(self, region: Region) -> Drawn:
         """Read what was seen of the region coarsely and finely, and store the part of the map that is kept."""
@@ -63,7 +64,7 @@ class Drawing:
         drawn = segment(weights, seen, columns, seats, every_class=True)
         del columns  # a memory takes their room
         assert drawn.log_probability is not None
-        looked = self._looked(region, drawn.log_probability, seats, seen)
+        looked = self._looked(region, self._within_zones(region, drawn.log_probability), seats, seen)
         classes, confidence = drawn.classes, drawn.confidence
         comparison, changed = None, None
         if self.memory is None:
@@ -79,6 +80,13 @@ class Drawing:
         write_belief_tile(self.belief, origin, *map(region.crop, (after.log_probability, after.age_days, after.light)))
         coarse = 0 if seen.strange is None else int(np.count_nonzero(region.crop_coarse(seen.strange)))
         return Drawn((coarse, int(region.crop_seats(strange).sum())), comparison, changed)
+
+    def _within_zones(self, region: Region, log_probability: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Today's look, (y, x, class), with nothing said of pixels that zones leave out: a memory of them stays."""
+        if self.left_out is None:
+            return log_probability
+        away = np.load(self.left_out, mmap_mode="r")[region.read.rows, region.read.columns]
+        return np.where(away[..., None], np.float32(np.nan), log_probability)
 
     def _looked(
         self, region: Region, log_probability: NDArray[np.float32], seats: NDArray[np.int64], seen: CoarseLook

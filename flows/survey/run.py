@@ -27,6 +27,7 @@ from flows.survey.scene import (
     judged_labels,
     open_scene,
 )
+from flows.survey.zones import SurveyZones, open_zones, place_of_field
 from models.policies.vgg_file import VggFile
 from models.weights.files import (
     Description,
@@ -42,8 +43,6 @@ from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
-from pipeline.ground.map_grid import ground_grid
-from pipeline.ground.view import GroundView
 from pipeline.lazy import Once
 from pipeline.rectify.placed import PixelGrid, place
 from pipeline.rectify.region import plan_tiles
@@ -126,6 +125,7 @@ class SurveyRun(CaptureRun):
     grid: SceneGrid
     plan: CapturePlan
     scans: ScanChoice
+    zones: SurveyZones  # what the survey keeps to, and plots
     prior: Prior | None = None  # the run whose belief is gone on from
     reader: ReaderFile | None = None  # the reader of memories beside the weights, where there is one
     notes: tuple[str, ...] = ()
@@ -183,8 +183,9 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
         scene.light()
     label_notes = check_labels(scene, described)
     grid = SceneGrid(*scene.shape, described.config.patch, described.config.factor)
-    settings, scans = choose_plain_scan(settings, described, path, grid, len(scene.wavelength_nm))
-    plan = plan_capture(settings, grid)
+    zones = open_zones(settings, place_of_field(settings, scene), grid)
+    settings, scans = choose_plain_scan(settings, described, path, grid, len(scene.wavelength_nm), zones.shown)
+    plan = plan_capture(settings, grid, zones.shown)
     band_notes = _check_bands(scene, described, path)
     if settings.mask is not None:
         check_mask(settings.mask, scene.shape)
@@ -200,9 +201,6 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     simulated, planned = make_source(scene, settings), (*plan.coarse, *plan.full)
     source = field_source(scene, settings, simulated, planned)
     check_memory(settings, simulated, grid, plan)
-    if settings.pose is not None:  # one from which there is ground to map
-        view = GroundView(settings.pose, settings.camera.ifov_rad)
-        ground_grid(view, scene.shape, epsg=settings.map.epsg, resolution_m=settings.map.resolution_m)
     key, archive = content_key(path), open_archive(settings.out) if archive is None else archive
     name = settings.name or Path(scene.name).stem
     prior, prior_notes = find_prior(archive, settings, name, grid, described.class_names)
@@ -221,9 +219,10 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
         grid=grid,
         plan=plan,
         scans=scans,
+        zones=zones,
         prior=prior,
         reader=reader,
-        notes=(*notes, *prior_notes, *sealing, *band_notes, *vgg_notes, *label_notes),
+        notes=(*notes, *zones.notes, *prior_notes, *sealing, *band_notes, *vgg_notes, *label_notes),
         refused=refused,
     )
 

@@ -7,6 +7,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from flows.settings.survey_settings import Settings
 from flows.settings.values import parse_goals
 from flows.survey.capture_plan import lay_out_sweeps
@@ -52,15 +55,20 @@ class ScanChoice:
 
 
 def choose_plain_scan(
-    settings: Settings, weights: Description, path: Path, grid: SceneGrid, bands: int
+    settings: Settings,
+    weights: Description,
+    path: Path,
+    grid: SceneGrid,
+    bands: int,
+    shown: NDArray[np.bool_] | None = None,
 ) -> tuple[Settings, ScanChoice]:
     """Settings with step and exposure of the plain scan that is asked for, and the choice that there was.
 
-    What was chosen once stands in the settings, and is kept when an archive is read again with other weights. Raises
-    WeightsError: the choice is left to weights without a record of scans; BudgetError: no scan costs as little, or
-    reaches the goals; SettingsError: a goal of a class that the weights lack, or a camera that exposes shorter than the
-    record knows; PoseError: the field is beyond the
-    mirror's range.
+    Lines show the ``shown`` (seat,) seats, all of them where it is None. What was chosen once stands in the settings,
+    and is kept when an archive is read again with other weights. Raises WeightsError: the choice is left to weights
+    without a record of scans; BudgetError: no scan costs as little, or reaches the goals; SettingsError: a goal of a
+    class that the weights lack, or a camera that exposes shorter than the record knows; PoseError: the field is beyond
+    the mirror's range.
     """
     content = weights.record.get("scans")
     if content is None:
@@ -77,7 +85,7 @@ def choose_plain_scan(
             known = ", ".join(one for one in record.scores if one != MIOU)
             raise SettingsError(f"--goal {name}={100 * goals[name]:g}: the weights tell apart {known}")
     camera, cost = settings.camera, settings.cost
-    sweeps = {step: lay_out_sweeps(replace(settings, scan_step=step), grid)[1] for step in record.steps}
+    sweeps = {step: lay_out_sweeps(replace(settings, scan_step=step), grid, shown)[1] for step in record.steps}
     scans = plain_scans(record, sweeps, camera, cost, bands, seconds=settings.seconds)
     chosen, exposure_ms = None, settings.scan_exposure_ms or camera.exposure_ms
     if settings.scan_step in sweeps and record.knows(exposure_ms):

@@ -6,6 +6,7 @@ import math
 from typing import TypeGuard
 
 DASH = "–"  # noqa: RUF001
+LEAST_HECTARES = 0.1  # smaller areas are told in square metres
 
 
 def format_seconds(seconds: float | None) -> str:
@@ -47,6 +48,11 @@ def format_percent(share: float | None) -> str:
     if not _known(share):
         return DASH
     return f"{100 * share:.1f} %" if abs(share) < 0.0995 else f"{100 * share:.0f} %"
+
+
+def area_words(hectares: float) -> str:
+    """An area in hectares, small ones in square metres."""
+    return f"{hectares:.3g} ha" if hectares >= LEAST_HECTARES else f"{hectares * 1e4:.3g} m²"
 
 
 def format_points(score: float | None) -> str:

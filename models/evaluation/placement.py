@@ -153,14 +153,16 @@ def run_controls(
     share: float,
     seed: int,
     policies: tuple[str, ...] = ("gain", "entropy", "sobel"),
+    among: NDArray[np.bool_] | None = None,
     report: Callable[[str], None] = lambda row: None,
 ) -> Controls:
     """Segment with no seat, every seat, and ``share`` of the valid seats placed by each policy and at random.
 
     ``fine`` (seat, p, p, column) are normalised columns of every seat of the padded grid, ``labels`` (y, x) class
-    indices, 255 unlabelled.
+    indices, 255 unlabelled. ``among`` are the seats (seat,) that may be chosen, None for all.
     """
     valid = seen.grid.valid_share().ravel() > 0
+    valid = valid if among is None else valid & among
 
     def counts(row: str, seats: NDArray[np.integer]) -> Counts:
         report(row)

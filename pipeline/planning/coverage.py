@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -85,9 +85,16 @@ def plain_sweeps(
 
 
 def cheapest_full(
-    grid: SceneGrid, camera: LineCamera, cost: CostModel, *, overlap_px: float = 0
+    grid: SceneGrid,
+    camera: LineCamera,
+    cost: CostModel,
+    *,
+    overlap_px: float = 0,
+    cut: Callable[[list[Sweep]], list[Sweep]] = lambda sweeps: sweeps,
 ) -> tuple[Axis, list[Sweep], float]:
     """Choose the orientation of the full scan that takes the least time: axis of the lines, sweeps, seconds.
+
+    ``cut`` leaves of the sweeps what is to be captured, where that is not all.
 
     Raises PoseError: neither orientation is within the mirror's range.
     """
@@ -95,7 +102,7 @@ def cheapest_full(
     axes: tuple[Axis, Axis] = ("x", "y")
     for along in axes:
         try:
-            sweeps = full_sweeps(grid, camera, along, overlap_px=overlap_px)
+            sweeps = cut(full_sweeps(grid, camera, along, overlap_px=overlap_px))
         except PoseError:
             if along == axes[-1] and not found:
                 raise
@@ -132,6 +139,15 @@ def on_scene(shape: tuple[int, int], camera: LineCamera, sweep: Sweep) -> NDArra
         pixel = np.floor(place + size / 2 + ROUNDING_PX)
         inside &= (pixel >= 0) & (pixel < size)
     return inside
+
+
+def sweep_outline(sweep: Sweep, camera: LineCamera, *, parts: int = 32) -> NDArray[np.float64]:
+    """Give what a sweep's lines show as a polygon, (point, 2) x and y from the scene's centre [px]."""
+    scan = np.linspace(sweep.start_px - 0.5, sweep.start_px + sweep.lines * sweep.step - 0.5, parts + 1)
+    edges = np.array([-camera.samples / 2, camera.samples / 2]) * camera.ifov_rad
+    along, across = points_of_scan(sweep.strip_px, camera, scan[:, None], edges)
+    sides = np.stack([along, across] if sweep.along == "x" else [across, along], axis=-1)
+    return np.concatenate([sides[:, 0], sides[::-1, 1]])
 
 
 def field_px(grid: SceneGrid, along: Axis) -> tuple[int, int]:

@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from pipeline.errors import PoseError, ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import Axis, CostModel
-from pipeline.planning.coverage import coarse_sweeps, with_margin
+from pipeline.geometry.scan import Axis, CostModel, Sweep
+from pipeline.planning.area_cover import sweeps_over
+from pipeline.planning.coverage import coarse_sweeps, full_sweeps, with_margin
 from pipeline.planning.fine_pass import FinePlan, plan_fine
 
 Floats = NDArray[np.float64]
@@ -155,24 +156,31 @@ def compare_orientations(
     margin_px: float = 0,
     threshold: float | None = None,
     coarse_exposure_ms: float | None = None,
+    shown: NDArray[np.bool_] | None = None,
 ) -> OrientationReport:
     """Plan the same scores with lines along the other axis, for the seconds that both passes have here.
 
     Scores, budget, margin and threshold are those of :func:`pipeline.planning.fine_pass.plan_fine`, ``overlap_px`` and
     ``coarse_exposure_ms`` those of the coarse pass; its sweeps begin earlier and end later by the margin. ``plan`` is
     the plan with lines along ``along`` where it is made already, ``rows`` the crop rows of the coarse image, for the
-    sentence.
+    sentence. ``shown`` are the seats (seat,) that lines have to show, None for all.
 
     Raises PoseError: the field is beyond the mirror's range with lines along ``along``; the other axis is only
     reported.
     """
 
+    def cut(sweeps: list[Sweep]) -> list[Sweep]:
+        return sweeps if shown is None else sweeps_over(sweeps, grid, camera, shown)
+
     def coarse_seconds(axis: Axis) -> float:
-        sweeps = coarse_sweeps(grid, camera, axis, overlap_px=overlap_px, exposure_ms=coarse_exposure_ms)
+        sweeps = cut(coarse_sweeps(grid, camera, axis, overlap_px=overlap_px, exposure_ms=coarse_exposure_ms))
         return cost.seconds(with_margin(sweeps, camera, margin_px), camera)
 
     def fine(axis: Axis, seconds: float) -> FinePlan:
-        return plan_fine(grid, camera, cost, axis, scores, budget_s=seconds, margin_px=margin_px, threshold=threshold)
+        full = None if shown is None else cut(full_sweeps(grid, camera, axis))
+        return plan_fine(
+            grid, camera, cost, axis, scores, budget_s=seconds, margin_px=margin_px, full=full, threshold=threshold
+        )
 
     def outcome(axis: Axis, coarse_s: float, plan: FinePlan) -> OrientationOutcome:
         share = plan.worth / plan.wanted_worth if plan.wanted_worth else None

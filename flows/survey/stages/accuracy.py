@@ -147,8 +147,9 @@ def _controls(
         rows += 1
         run.report(0.6 + 0.035 * rows)
 
+    among = None if run.zones.shares is None else run.zones.shares > 0
     controls = run_controls(
-        run.weights, seen, columns, labels, share=CONTROL_SHARE, seed=run.settings.seed, report=report
+        run.weights, seen, columns, labels, share=CONTROL_SHARE, seed=run.settings.seed, among=among, report=report
     )
     figures = _figures(run, controls.every)
     return {
@@ -162,8 +163,8 @@ def _controls(
 
 def _controls_mode(run: SurveyRun, seen: Glance, controls: Controls) -> dict[str, Any]:
     """What the controls' seats are, and what those of most gain would cost the rig: seats are not lines."""
-    grid, share = run.grid, run.grid.valid_share().ravel()
-    seats = frame_seats(score_seats("gain", seen), controls.share, share > 0).seats
+    grid, share, shares = run.grid, run.grid.valid_share().ravel(), run.zones.shares
+    seats = frame_seats(score_seats("gain", seen), controls.share, (share if shares is None else shares) > 0).seats
     fine = share[seats].sum() * grid.patch**2  # samples beside the scene do not count
     price = price_of_seats(grid, run.camera, run.settings.cost, run.plan.along, seats)
     coarse_lines, full_lines = count_lines(run.plan.coarse), count_lines(run.plan.full)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -58,13 +58,19 @@ def attend(run: SurveyRun, mosaic: StageRef) -> Wanted:
         **({} if run.vgg is None else {"vgg": run.vgg.key}),
         **({} if settings.threshold is None else {"threshold": settings.threshold}),
         **({"plain": True} if run.plan.plain else {}),
+        **run.zones.key,
     }
     return Wanted(build, params, [mosaic])
 
 
 def _scored(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> tuple[NDArray[np.float64], FinePlan]:
-    """Scores of the seats, and the runs of lines that show most of them in the time left."""
-    scores = _scores(run, work, mosaic)
+    """Scores of the seats, and the runs of lines that show most of them in the time left.
+
+    A seat counts by the share of it that zones leave; what is seen of the others beside it is not asked for.
+    """
+    scores, shares = _scores(run, work, mosaic), run.zones.shares
+    if shares is not None:
+        scores = np.where(shares > 0, scores, 0.0) * shares
     plan = plan_fine(
         run.grid,
         run.camera,
@@ -76,7 +82,13 @@ def _scored(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> tuple[NDArray[
         full=run.plan.full,
         threshold=run.settings.threshold,
     )
-    return scores, plan
+    return scores, _kept_seats(run, plan)
+
+
+def _kept_seats(run: SurveyRun, plan: FinePlan) -> FinePlan:
+    """The plan with the seats alone of which zones leave something."""
+    shares = run.zones.shares
+    return plan if shares is None else replace(plan, seats=plan.seats[shares[plan.seats] > 0])
 
 
 def _whole_field(run: SurveyRun) -> tuple[NDArray[np.float64], FinePlan]:
@@ -84,7 +96,7 @@ def _whole_field(run: SurveyRun) -> tuple[NDArray[np.float64], FinePlan]:
     sweep = run.plan.coarse[0]
     words = scan_words(sweep.step, exposing(run.camera, sweep).exposure_ms)
     plan = FinePlan([], run.grid.valid_seats(), 0.0, 0.0, "scan", f"the field was scanned once: {words}")
-    return np.zeros(int(np.prod(run.grid.seat_shape))), plan
+    return np.zeros(int(np.prod(run.grid.seat_shape))), _kept_seats(run, plan)
 
 
 def _scores(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> NDArray[np.float64]:
@@ -135,6 +147,7 @@ def compare_turned(run: SurveyRun, mosaic: StageRef, attention: StageRef) -> Wan
             margin_px=run.plan.margin_px,
             threshold=settings.threshold,
             coarse_exposure_ms=settings.coarse_exposure_ms,
+            shown=None if settings.pointing_px else run.zones.shown,
         )
         write_table(path / FILE, asdict(turned) | {"sentence": turned.sentence})
 

@@ -31,6 +31,7 @@ from storage.arrays.quicklooks import choose_bands, develop, stretch
 
 CLASS_MAP = Product("segment", version=6, files=("class_map.zarr", "belief.zarr"), by_weights=True)
 STRANGE = "strange.json"  # beside a map, where values were no readings
+LEFT_OUT = "left_out.npy"  # beside a map while it is drawn: the pixels of which none is
 MOST_TURN_PX = 12.0  # that a field's corners may lie off by, as it is turned, so that its memory is of use
 MEMORY = "memory.json"  # beside a map that goes on from an earlier one: what became of the memory
 
@@ -43,6 +44,8 @@ def draw_map(run: SurveyRun, mosaic: StageRef, patches: StageRef) -> Wanted:
         work, out = FieldWork.of(run), path / "class_map.zarr"
         lies = _memory_lies(run, mosaic)
         drawing = _drawing(run, work, mosaic, patches, path, lies)
+        if run.zones.left_out is not None:
+            np.save(path / LEFT_OUT, run.zones.left_out)
         drawn = draw_field(work, drawing, run.report)
         if run.prior is not None:
             told = _memory_told(run, lies, drawn.comparison)
@@ -53,8 +56,10 @@ def draw_map(run: SurveyRun, mosaic: StageRef, patches: StageRef) -> Wanted:
             write_changes(path / "belief.zarr", drawn.changed, run.grid.patch)
         if any(drawn.strange):
             write_table(path / STRANGE, dict(zip(("coarse_px", "fine_px"), drawn.strange, strict=True)))
-        if run.scene.missing is not None:
-            clear_classes(out, run.scene.missing)
+        nothing = [where for where in (run.scene.missing, run.zones.left_out) if where is not None]
+        if nothing:
+            clear_classes(out, np.any(nothing, axis=0))
+        (path / LEFT_OUT).unlink(missing_ok=True)
 
     prior = run.prior
     params = {
@@ -62,6 +67,7 @@ def draw_map(run: SurveyRun, mosaic: StageRef, patches: StageRef) -> Wanted:
         "grid": asdict(run.grid),
         **region_params(run.grid),
         **({} if run.scene.missing is None else {"missing": array_digest(run.scene.missing)}),
+        **run.zones.key,
     }
     if prior is not None:
         reader = None if run.reader is None else run.reader.key
@@ -95,7 +101,8 @@ def _drawing(
     seen = (mosaic.path / "mosaic.zarr").resolve(), (patches.path / "patches.zarr").resolve()
     made = (path / "class_map.zarr").resolve(), (path / "belief.zarr").resolve()
     light, step = _light(run)
-    return Drawing(work.weights, *seen, *made, light, step, memory)
+    left_out = None if run.zones.left_out is None else (path / LEFT_OUT).resolve()
+    return Drawing(work.weights, *seen, *made, light, step, memory, left_out)
 
 
 def _light(run: SurveyRun) -> tuple[float, int]:

@@ -12,9 +12,10 @@ import pytest
 from rich.console import Console
 
 from flows.publish.receipt import COSTS, Header, Receipt, build_receipt, check_receipt, comparable
-from flows.publish.receipt_table import area_words, headline, print_table
+from flows.publish.receipt_table import headline, print_table
 from flows.publish.report import Picture, render_report
 from flows.settings.survey_settings import Settings
+from flows.terminal.figures import area_words
 from pipeline.errors import ShapeError
 from storage.archive.records import StageRecord
 from storage.archive.whole_files import to_json

@@ -1,0 +1,173 @@
+"""Area of interest, no-go zones and plots of a survey: read from their files and brought onto the field's pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.settings.survey_settings import Settings
+from pipeline.errors import ZoneError
+from pipeline.geometry.grid import SceneGrid
+from pipeline.ground.field_places import FieldPlace, NoPlace, PlacedPicture, PosedField
+from pipeline.ground.map_grid import ground_grid
+from pipeline.ground.view import GroundView
+from pipeline.ground.zones import FieldZones, extent_deg, field_zones, on_field, pixels_inside
+from pipeline.lazy import deferred
+from pipeline.simulator.scenes.scene import RasterScene
+from storage.archive.keys import array_digest
+from storage.readers.zone_files import GEOJSON, ZoneFile, read_zones
+
+if TYPE_CHECKING:
+    import pyproj
+    from shapely.geometry.base import BaseGeometry
+else:
+    pyproj = deferred("pyproj")
+
+WGS84 = 4326  # what GeoJSON without a CRS is in (RFC 7946), on a field of which the place is known
+
+
+@dataclass(frozen=True)
+class SurveyZones:
+    """What a survey keeps to, and the plots that it tells of, on the pixels of its field."""
+
+    place: FieldPlace
+    grid: SceneGrid
+    kept: FieldZones | None = None  # None: all of the field
+    area: tuple[BaseGeometry, ...] = ()  # in pixels, for pictures
+    no_go: tuple[BaseGeometry, ...] = ()
+    plots: Mapping[str, BaseGeometry] | None = None  # by name, in pixels; None where there are none
+    notes: tuple[str, ...] = ()
+
+    @cached_property
+    def shown(self) -> NDArray[np.bool_] | None:
+        """(seat,) that lines have to show; None for all."""
+        return None if self.kept is None else self.kept.shown_seats(self.grid)
+
+    @cached_property
+    def shares(self) -> NDArray[np.float64] | None:
+        """(seat,) share of what a fine look at each seat is worth; None: all of it."""
+        return None if self.kept is None else self.kept.seat_shares(self.grid)
+
+    @cached_property
+    def left_out(self) -> NDArray[np.bool_] | None:
+        """(y, x) pixels of which no map is drawn; None where all are."""
+        return None if self.kept is None else self.kept.left_out
+
+    @cached_property
+    def key(self) -> dict[str, str]:
+        """What results depend on, for the keys of stages; nothing where nothing is left out."""
+        if self.kept is None:
+            return {}
+        no_go = {} if self.kept.no_go is None else {"no_go": array_digest(self.kept.no_go)}
+        return {"zones": array_digest(self.kept.kept), **no_go}
+
+
+def place_of_field(settings: Settings, scene: RasterScene) -> FieldPlace:
+    """Where the field lies: before a rig with a pose, on the grid of a georeferenced scene, or nobody knows where.
+
+    Raises PoseError: from the pose no ground is seen, or the map's CRS does not suit it.
+    """
+    if settings.pose is None:
+        return NoPlace(scene.shape) if scene.geobox is None else PlacedPicture(scene.geobox)
+    view = GroundView(settings.pose, settings.camera.ifov_rad)
+    return PosedField(ground_grid(view, scene.shape, epsg=settings.map.epsg, resolution_m=settings.map.resolution_m))
+
+
+def open_zones(settings: Settings, place: FieldPlace, grid: SceneGrid) -> SurveyZones:
+    """Read the files that the settings name, and bring their polygons onto the field.
+
+    Raises ZoneError: a file cannot be used, its area or its plots do not lie on the field, or zones leave nothing.
+    """
+    files = settings.zones
+    if files.area is None and files.no_go is None and files.plots is None:
+        return SurveyZones(place, grid)
+    notes: list[str] = []
+    shape = grid.height, grid.width
+
+    def placed(source: str, *, named_by: str | None = None, needed: bool = True) -> dict[str, BaseGeometry]:
+        found = _read(source, place, notes, named_by)
+        shapes = {name: on_field(one, found.crs, place) for name, one in found.shapes.items()}
+        if all(one.is_empty for one in shapes.values()):
+            if needed:
+                raise ZoneError(_beside_words(found, place))
+            notes.append(_beside_words(found, place))
+        return shapes
+
+    area = None if files.area is None else tuple(placed(files.area).values())
+    no_go = None if files.no_go is None else tuple(placed(files.no_go, needed=False).values())
+    plots = None if files.plots is None else placed(files.plots, named_by=files.plots_name)
+    inside = None if area is None else pixels_inside(area, shape)
+    if inside is not None and not inside.any():
+        raise ZoneError(
+            f"the area of {files.area} holds no pixel's centre: it is smaller than a pixel of this field"
+            f"{_pixel_words(place)}; give a larger one, or leave it out"
+        )
+    kept = field_zones(inside, None if no_go is None else pixels_inside(no_go, shape, touched=True))
+    if kept is not None and not kept.kept.any():
+        all_of_it = "all of the field" if files.area is None else f"all of the area of {files.area}"
+        raise ZoneError(f"the no-go zones of {files.no_go} cover {all_of_it}: nothing is left to survey")
+    return SurveyZones(place, grid, kept, area or (), no_go or (), plots, tuple(notes))
+
+
+def _read(source: str, place: FieldPlace, notes: list[str], named_by: str | None) -> ZoneFile:
+    """Read a file of polygons with the CRS that they are meant in; pixels where nothing else is known."""
+    found = read_zones(source, named_by=named_by)
+    notes += found.notes
+    if place.crs is None and found.crs is not None:
+        raise ZoneError(
+            f"{source} is in {found.crs.name}, and nobody said where this field lies: give the rig's [pose], a "
+            "georeferenced scene, or polygons in pixels of the scene as GeoJSON without a CRS"
+        )
+    if place.crs is None:
+        notes.append(f"{source} is taken in pixels of the scene, x to the right and y down from its upper left corner")
+    elif found.crs is None and not source.lower().endswith(GEOJSON):
+        raise ZoneError(f"{source} does not say its CRS; save it with one (a shapefile has it in a .prj beside it)")
+    elif found.crs is None:
+        return ZoneFile(source, pyproj.CRS.from_epsg(WGS84), found.shapes, found.notes)
+    return found
+
+
+def _beside_words(found: ZoneFile, place: FieldPlace) -> str:
+    """Where polygons and field lie, of which none lies on it."""
+    if found.crs is None or place.crs is None:
+        unit, here, there = "px", _bounds(found), place.outline.bounds
+        spans = [
+            f"x {west:g} to {east:g}, y {south:g} to {north:g} {unit}" for west, south, east, north in (there, here)
+        ]
+        hint = "are they degrees? then the survey needs a [pose] or a georeferenced scene"
+    else:
+        corners = extent_deg(place.outline, place.crs), _extent(found)
+        spans = [
+            f"longitude {west:.6g} to {east:.6g}, latitude {south:.6g} to {north:.6g}"
+            for west, south, east, north in corners
+        ]
+        hint = f"is {found.crs.name} their CRS, and the place of the field right?"
+    return f"the polygons of {found.path} do not lie on the field: expected some in {spans[0]}, got {spans[1]}; {hint}"
+
+
+def _bounds(found: ZoneFile) -> tuple[float, float, float, float]:
+    """West, south, east and north of all polygons of a file, in its own coordinates."""
+    each = np.array([one.bounds for one in found.shapes.values()])
+    west, south = each[:, :2].min(axis=0).tolist()
+    east, north = each[:, 2:].max(axis=0).tolist()
+    return west, south, east, north
+
+
+def _extent(found: ZoneFile) -> tuple[float, float, float, float]:
+    assert found.crs is not None
+    each = np.array([extent_deg(one, found.crs) for one in found.shapes.values()])
+    west, south = each[:, :2].min(axis=0).tolist()
+    east, north = each[:, 2:].max(axis=0).tolist()
+    return west, south, east, north
+
+
+def _pixel_words(place: FieldPlace) -> str:
+    """How large a pixel is, where somebody knows."""
+    rows, columns = place.shape
+    middle = place.pixel_areas_m2(slice(rows // 2, rows // 2 + 1), slice(columns // 2, columns // 2 + 1))
+    return "" if middle is None else f" ({float(np.sqrt(middle[0, 0])):.3g} m)"

@@ -1,0 +1,195 @@
+"""Where a field lies, for polygons: from map coordinates to the pixels of the scene, and the outline that it shows.
+
+Polygons in pixels count from the scene's upper left corner, x to the right and y down; the first goes from 0
+to 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.ground.field_scale import FieldScale, scale_of_angles, scale_of_pixels, scale_of_view
+from pipeline.ground.map_grid import GroundGrid
+from pipeline.ground.view import GroundView, pixel_places
+from pipeline.lazy import deferred
+
+if TYPE_CHECKING:
+    import pyproj
+    import shapely
+    import shapely.affinity
+    from odc.geo.geobox import GeoBox
+    from shapely.geometry.base import BaseGeometry
+else:
+    pyproj = deferred("pyproj")
+    shapely = deferred("shapely")
+
+Floats = NDArray[np.float64]
+BORDER_PX = 4.0  # beside the field up to which polygons are followed, so that its outermost pixels are right
+EDGE_PARTS = 64  # of a side of the outline: straight on the ground, bent on a map
+
+
+class FieldPlace(Protocol):
+    """Where a field lies."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Its size (y, x) [px]."""
+
+    @property
+    def crs(self) -> pyproj.CRS | None:
+        """Of the coordinates that polygons are given in; None where they are pixels."""
+
+    @property
+    def outline(self) -> BaseGeometry:
+        """What the field shows, in these coordinates."""
+
+    def to_pixels(self, shape: BaseGeometry) -> BaseGeometry:
+        """Bring a polygon from these coordinates to the scene's pixels."""
+
+    def pixel_areas_m2(self, rows: slice, columns: slice) -> Floats | None:
+        """The ground under some pixels (row, column) [m2], NaN where they show none; None where nobody knows."""
+
+    def scale(self, ifov_rad: float) -> FieldScale:
+        """Tell how large the field is and how finely it is seen."""
+
+
+@dataclass(frozen=True)
+class NoPlace:
+    """A field of which nobody said where it lies: polygons are in pixels."""
+
+    shape: tuple[int, int]
+    crs = None
+
+    @property
+    def outline(self) -> BaseGeometry:
+        return shapely.box(0, 0, self.shape[1], self.shape[0])
+
+    def to_pixels(self, shape: BaseGeometry) -> BaseGeometry:
+        return shape
+
+    def pixel_areas_m2(self, rows: slice, columns: slice) -> Floats | None:
+        return None
+
+    def scale(self, ifov_rad: float) -> FieldScale:
+        return scale_of_angles(self.shape, ifov_rad)
+
+
+@dataclass(frozen=True)
+class PlacedPicture:
+    """A georeferenced scene: its pixels are those of a grid on the map."""
+
+    geobox: GeoBox
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        rows, columns = self.geobox.shape
+        return int(rows), int(columns)
+
+    @cached_property
+    def crs(self) -> pyproj.CRS:
+        assert self.geobox.crs is not None
+        return pyproj.CRS.from_wkt(self.geobox.crs.to_wkt())
+
+    @property
+    def outline(self) -> BaseGeometry:
+        corners = shapely.box(0, 0, self.shape[1], self.shape[0])
+        return self._on_map(shapely.segmentize(corners, max(self.shape) / EDGE_PARTS))
+
+    def _on_map(self, pixels: BaseGeometry) -> BaseGeometry:
+        return shapely.affinity.affine_transform(pixels, self.geobox.affine.to_shapely())
+
+    def to_pixels(self, shape: BaseGeometry) -> BaseGeometry:
+        return shapely.affinity.affine_transform(shape, (~self.geobox.affine).to_shapely())
+
+    def pixel_areas_m2(self, rows: slice, columns: slice) -> Floats | None:
+        """The same for all where the CRS is projected; of degrees by row, on the ellipsoid."""
+        size = rows.stop - rows.start, columns.stop - columns.start
+        if not self.crs.is_geographic:
+            metres = self.crs.axis_info[0].unit_conversion_factor
+            return np.full(size, abs(self.geobox.affine.determinant) * metres**2)
+        geod, row = self.crs.get_geod(), np.arange(rows.start, rows.stop)
+        assert geod is not None
+        cells = [self._on_map(shapely.box(columns.start, one, columns.start + 1, one + 1)) for one in row]
+        areas = np.array([abs(geod.geometry_area_perimeter(cell)[0]) for cell in cells])
+        return np.broadcast_to(areas[:, None], size).copy()
+
+    def scale(self, ifov_rad: float) -> FieldScale:
+        rows, columns = self.shape
+        middle = self.pixel_areas_m2(slice(rows // 2, rows // 2 + 1), slice(columns // 2, columns // 2 + 1))
+        assert middle is not None
+        return scale_of_pixels(self.shape, ifov_rad, float(np.sqrt(middle[0, 0])))
+
+
+@dataclass(frozen=True)
+class PosedField:
+    """A field before a rig of which the place is known."""
+
+    grid: GroundGrid
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.grid.scene_shape
+
+    @property
+    def view(self) -> GroundView:
+        return self.grid.frame.view
+
+    @property
+    def crs(self) -> pyproj.CRS:
+        return self.grid.frame.crs
+
+    @property
+    def outline(self) -> BaseGeometry:
+        seen = shapely.segmentize(self._seen(0.0), max(self.shape) / EDGE_PARTS)
+        frame = self.grid.frame
+        return shapely.transform(seen, lambda points: frame.ground_to_map(self.view.scene_to_ground(points[:, ::-1])))
+
+    def _seen(self, border_px: float) -> BaseGeometry:
+        """The part of the field that the map reaches, (x, y) from its centre [px]."""
+        rows, columns = self.shape
+        size = rows + 2 * round(border_px), columns + 2 * round(border_px)
+        return shapely.Polygon(self.view.outline_px(size, self.grid.least_sink)[:, ::-1])
+
+    def to_pixels(self, shape: BaseGeometry) -> BaseGeometry:
+        """By the ground's plane, and of that the part which the field shows: what lies behind the rig has no pixels."""
+        shown = shapely.transform(
+            self._seen(BORDER_PX), lambda points: self.view.scene_to_ground(points[:, ::-1])[:, :2]
+        )
+        on_plane = shapely.transform(shape, lambda places: self.grid.frame.map_to_ground(places)[:, :2])
+        return shapely.transform(shapely.intersection(shapely.make_valid(on_plane), shown), self._pixels)
+
+    def ground_points(self, pixels: Floats) -> Floats:
+        """Metres east and north of the rig's foot (..., 2) under places x, y in pixels; NaN where the map ends."""
+        points = pixels[..., ::-1] - np.array(self.shape) / 2
+        reached = self.view.sink(points) >= self.grid.least_sink
+        ground: Floats = np.where(reached[..., None], self.view.scene_to_ground(points)[..., :2], np.nan)
+        return ground
+
+    def on_ground(self, shape: BaseGeometry) -> BaseGeometry:
+        """Bring a polygon from pixels to metres east and north of the rig's foot, as far as the map reaches."""
+        reached = shapely.affinity.translate(self._seen(0.0), self.shape[1] / 2, self.shape[0] / 2)
+        half = np.array(self.shape) / 2
+        return shapely.transform(
+            shapely.intersection(shape, reached), lambda at: self.view.scene_to_ground(at[:, ::-1] - half)[:, :2]
+        )
+
+    def _pixels(self, plane: Floats) -> Floats:
+        normal = self.view.normal
+        ground = np.column_stack([plane, -(plane @ normal[:2]) / normal[2]])
+        seen = self.view.ground_to_scene(ground)
+        pixels: Floats = seen[:, ::-1] + np.array([self.shape[1] / 2, self.shape[0] / 2])
+        return pixels
+
+    def pixel_areas_m2(self, rows: slice, columns: slice) -> Floats | None:
+        y, x = pixel_places(self.shape)
+        points = np.stack(np.meshgrid(y[rows], x[columns], indexing="ij"), axis=-1)
+        areas: Floats = np.where(self.view.sink(points) > self.grid.least_sink, self.view.area_m2(points), np.nan)
+        return areas
+
+    def scale(self, ifov_rad: float) -> FieldScale:
+        return scale_of_view(self.view, self.shape)

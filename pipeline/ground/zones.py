@@ -1,0 +1,151 @@
+"""Polygons on a field, brought there from any coordinates: which pixels they hold, and which a survey keeps to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.geometry.grid import SceneGrid
+from pipeline.ground.field_places import BORDER_PX, FieldPlace
+from pipeline.lazy import deferred
+
+if TYPE_CHECKING:
+    import pyproj
+    import rasterio
+    import rasterio.features as rasterio_features
+    import shapely
+    from shapely.geometry.base import BaseGeometry
+else:
+    pyproj = deferred("pyproj")
+    rasterio = deferred("rasterio")
+    rasterio_features = deferred("rasterio.features")
+    shapely = deferred("shapely")
+
+Mask = NDArray[np.bool_]
+Floats = NDArray[np.float64]
+WGS84 = 4326
+ROUND_THE_FIELD = 1.0  # times its size, on every side, up to which polygons are followed
+EDGE_PARTS = 256  # of that: a straight edge of one map is bent on another
+FAR_EAST_DEG = 90.0  # beyond this longitude of the field, those of polygons are told from it and not from Greenwich
+
+
+def on_field(shape: BaseGeometry, crs: pyproj.CRS | None, place: FieldPlace) -> BaseGeometry:
+    """Bring a polygon to the pixels of a field, as far as it lies there or near; empty where it does not.
+
+    ``crs`` is that of the polygon, x before y, None where it is in pixels already. Edges are straight in ``crs``.
+    """
+    if crs is None or place.crs is None:
+        return shapely.intersection(shape, _grown(shapely.box(*place.outline.bounds), BORDER_PX))
+    to_place = pyproj.Transformer.from_crs(crs, place.crs, always_xy=True)
+    middle = _middle_deg(place) if crs.is_geographic else None
+    there, given = (_told_from(one, middle) for one in (_there(place, crs), shape))
+    around = _grown(there, ROUND_THE_FIELD * max(np.ptp(np.reshape(there.bounds, (2, 2)), axis=0)))
+    near = shapely.intersection(given, around)
+    if near.is_empty:
+        return near
+    fine = shapely.segmentize(near, max(np.ptp(np.reshape(around.bounds, (2, 2)), axis=0)) / EDGE_PARTS)
+    moved = shapely.transform(fine, lambda places: np.stack(to_place.transform(places[:, 0], places[:, 1]), axis=-1))
+    return place.to_pixels(shapely.make_valid(moved))
+
+
+def extent_deg(shape: BaseGeometry, crs: pyproj.CRS) -> tuple[float, float, float, float]:
+    """West, south, east and north of a polygon [deg], for messages."""
+    to_globe = pyproj.Transformer.from_crs(crs, WGS84, always_xy=True)
+    places = shapely.get_coordinates(shape)
+    lon, lat = to_globe.transform(places[:, 0], places[:, 1])
+    return float(np.min(lon)), float(np.min(lat)), float(np.max(lon)), float(np.max(lat))
+
+
+def _there(place: FieldPlace, crs: pyproj.CRS) -> BaseGeometry:
+    """The outline of a field in the coordinates of polygons."""
+    back = pyproj.Transformer.from_crs(place.crs, crs, always_xy=True)
+    return shapely.transform(place.outline, lambda at: np.stack(back.transform(at[:, 0], at[:, 1]), axis=-1))
+
+
+def _middle_deg(place: FieldPlace) -> float | None:
+    """Longitude of a field that lies so near 180 degrees that polygons may cross it; None of one that does not."""
+    assert place.crs is not None
+    west, _, east, _ = extent_deg(place.outline, place.crs)
+    middle = east if east - west > 180 else (west + east) / 2
+    return middle if abs(middle) > FAR_EAST_DEG else None
+
+
+def _told_from(shape: BaseGeometry, middle_deg: float | None) -> BaseGeometry:
+    """A polygon with longitudes that lie within 180 degrees of ``middle_deg``; as it is where that is None."""
+    if middle_deg is None:
+        return shape
+
+    def wrapped(places: Floats) -> Floats:
+        lon = (places[:, 0] - middle_deg + 180) % 360 - 180 + middle_deg
+        return np.column_stack([lon, places[:, 1:]])
+
+    return shapely.make_valid(shapely.transform(shape, wrapped))
+
+
+def _grown(shape: BaseGeometry, by: float) -> BaseGeometry:
+    west, south, east, north = shape.bounds
+    return shapely.box(west - by, south - by, east + by, north + by)
+
+
+def pixels_inside(
+    shapes: Sequence[BaseGeometry], size: tuple[int, int], *, origin: tuple[int, int] = (0, 0), touched: bool = False
+) -> Mask:
+    """Tell which of (y, x) ``size`` pixels from row and column ``origin`` on lie in polygons given in pixels.
+
+    A pixel belongs where its centre lies; with ``touched`` every pixel that a polygon touches does.
+    """
+    given = [one for one in shapes if not one.is_empty]
+    if not given:
+        return np.zeros(size, bool)
+    place = rasterio.Affine.translation(origin[1], origin[0])
+    found = rasterio_features.rasterize(given, out_shape=size, transform=place, all_touched=touched, dtype="uint8")
+    return np.asarray(found, np.bool_)
+
+
+@dataclass(frozen=True)
+class FieldZones:
+    """Which pixels a survey keeps to: those inside the area, where one is given, and in no zone that is left out."""
+
+    kept: Mask  # (y, x)
+    no_go: Mask | None = None  # (y, x), every pixel touched
+
+    @property
+    def left_out(self) -> Mask:
+        """(y, x) pixels of which no map is drawn."""
+        return ~self.kept
+
+    def seat_shares(self, grid: SceneGrid) -> Floats:
+        """Share of each seat's pixels that are kept, (seat,) 0..1; 0 of every seat that a no-go zone touches."""
+        shares = _seat_means(self.kept, grid)
+        return shares if self.no_go is None else np.where(_seat_means(self.no_go, grid) > 0, 0.0, shares)
+
+    def shown_seats(self, grid: SceneGrid) -> Mask:
+        """Seats (seat,) of the patches that are read at once and hold a pixel that is kept: what lines have to show."""
+        rows, columns = grid.seat_shape
+        kept = _seat_means(self.kept, grid).reshape(rows // grid.factor, grid.factor, columns // grid.factor, -1) > 0
+        shown: Mask = np.repeat(np.repeat(kept.any(axis=(1, 3)), grid.factor, axis=0), grid.factor, axis=1)
+        return (shown & (grid.valid_share() > 0)).ravel()
+
+
+def field_zones(area: Mask | None, no_go: Mask | None) -> FieldZones | None:
+    """Put an area and no-go zones together; None where they leave nothing out, so that nothing changes."""
+    kept = np.ones_like(no_go) if area is None and no_go is not None else area
+    if kept is None:
+        return None
+    kept = kept if no_go is None else kept & ~no_go
+    return None if kept.all() else FieldZones(kept, no_go if no_go is not None and no_go.any() else None)
+
+
+def _seat_means(mask: Mask, grid: SceneGrid) -> Floats:
+    """Mean over the pixels of each seat that lie on the scene, (seat,)."""
+    padded = np.zeros(grid.padded_shape, bool)
+    padded[: grid.height, : grid.width] = mask
+    rows, columns = grid.seat_shape
+    total = padded.reshape(rows, grid.patch, columns, grid.patch).sum(axis=(1, 3)) / grid.patch**2
+    share = grid.valid_share()
+    means: Floats = np.divide(total, share, out=np.zeros(share.shape), where=share > 0)
+    return means.ravel()

@@ -1,0 +1,50 @@
+"""Sweeps of a whole field cut down to what shows a part of it: an area of interest, or what zones leave of a field."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import Sweep, scene_to_sweep
+from pipeline.planning.coverage import ROUNDING_PX, TAPS_AFTER, TAPS_BEFORE
+
+
+def sweeps_over(sweeps: Sequence[Sweep], grid: SceneGrid, camera: LineCamera, shown: NDArray[np.bool_]) -> list[Sweep]:
+    """Give the lines of sweeps that show some of the ``shown`` (seat,) seats; sweeps that show none are left out.
+
+    Lines stay where they lie and keep their order, between the first and the last that is needed none is left out, and
+    the lines that resampling reads beside a pixel are among them. Of a sweep with all its lines nothing changes.
+    """
+    cut = ((sweep, _needed(sweep, grid, camera, np.flatnonzero(shown))) for sweep in sweeps)
+    return [_part(sweep, lines) for sweep, lines in cut if lines is not None]
+
+
+def _part(sweep: Sweep, lines: tuple[int, int]) -> Sweep:
+    first, stop = lines
+    return replace(sweep, start_px=sweep.start_px + first * sweep.step, lines=stop - first)
+
+
+def _needed(sweep: Sweep, grid: SceneGrid, camera: LineCamera, seats: NDArray[np.intp]) -> tuple[int, int] | None:
+    """First line that shows something of the seats and the one after the last; None where none does."""
+    origin, size = grid.seat_origin(seats), np.array([grid.height, grid.width])
+    low, high = origin - size / 2, np.minimum(origin + grid.patch, size) - size / 2
+    along, scan = (1, 0) if sweep.along == "x" else (0, 1)
+    # Line and sample of a point are monotone in either coordinate, so a rectangle's corners hold the extremes.
+    corners_along, corners_scan = (
+        np.stack([low, low, high, high])[..., along],
+        np.stack([low, high, low, high])[..., scan],
+    )
+    at = scene_to_sweep(sweep, camera, corners_along, corners_scan)
+    ends = -0.5 - TAPS_BEFORE, camera.samples // sweep.binning - 0.5 + TAPS_AFTER
+    seen = (at[..., 1].max(axis=0) >= ends[0]) & (at[..., 1].min(axis=0) <= ends[1])
+    if not seen.any():
+        return None
+    lines = at[:, seen, 0]
+    first = max(int(np.floor(lines.min() + ROUNDING_PX)) - TAPS_BEFORE, 0)
+    stop = min(int(np.floor(lines.max() + ROUNDING_PX)) + TAPS_AFTER + 1, sweep.lines)
+    return (first, stop) if first < stop else None
