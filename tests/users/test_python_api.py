@@ -112,8 +112,11 @@ def test_a_coarse_pixel_lies_on_its_fine_ones(run: OpenedRun) -> None:
         middle = fine[axis].values.reshape(-1, 4).mean(axis=1)
         np.testing.assert_allclose(coarse[axis].values, middle, atol=1e-12)
         assert coarse[axis].attrs["units"] == "rad"
-    nearest = fine.sel(y=coarse.y, x=coarse.x, method="nearest")
-    assert nearest.shape == coarse.shape[:2]
+    under = fine.reindex_like(coarse, method="nearest")
+    assert under.dtype == np.uint8
+    joined = coarse.where(under == int(under[0, 0]))  # by coordinates: what has others is left out
+    assert joined.shape == coarse.shape
+    assert np.isfinite(joined.values[0, 0]).all()
 
 
 def test_a_band_is_found_by_its_wavelength(run: OpenedRun) -> None:
