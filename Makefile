@@ -1,4 +1,4 @@
-# SpectralZoom: setup, survey, survey-rig, test, lint, docs, bench, faults, soak, lock.
+# SpectralZoom: setup, survey, survey-rig, test, lint, docs, notebooks, bench, faults, soak, lock.
 #   make survey ARCHIVE=/data/field7    make test PY=python3.12 VENV=/tmp/venv    make test PYTEST_ARGS="-x tests/pipeline"
 PY ?= python3
 VENV ?= .venv
@@ -12,7 +12,7 @@ BIN := $(VENV)/bin
 # The tools beneath are asked to send no analytics.
 export DO_NOT_TRACK = 1
 
-.PHONY: setup survey survey-rig test lint docs bench faults soak lock
+.PHONY: setup survey survey-rig test lint docs notebooks bench faults soak lock
 .DEFAULT_GOAL := setup
 
 setup: $(BIN)/.ok
@@ -45,6 +45,11 @@ lint: $(BIN)/.ok
 docs: $(BIN)/.ok
 	$(BIN)/python -m sphinx -q -E -W --keep-going -n -d docs/_build/.doctrees docs docs/_build
 
+# The notebooks of docs/, run from top to bottom and kept with what they gave. The tests run them without a kernel.
+notebooks: $(BIN)/.ok
+	$(BIN)/python -m pip install -q --no-compile --disable-pip-version-check -c constraints.txt nbclient ipykernel
+	$(BIN)/jupyter-execute --inplace --NotebookClient.record_timing=False docs/notebooks/*.ipynb
+
 # Every goal with the peers beside it (BENCH="geometry lookup" for some), then what accuracy costs in time.
 bench: $(BIN)/.ok
 	OMP_NUM_THREADS=1 $(BIN)/python tests/benchmarks $(BENCH); crashed=$$?; \
@@ -68,7 +73,7 @@ soak: $(BIN)/.ok
 lock:
 	$(PY) -m venv $(VENV)-lock 2>/dev/null || { $(PY) -m venv --without-pip $(VENV)-lock \
 		&& $(PY) -m pip --python $(VENV)-lock/bin/python install -q pip; }
-	$(VENV)-lock/bin/python -m pip install -q --dry-run --ignore-installed --report $(VENV)-lock/report.json '.[dev,s3,bench]'
+	$(VENV)-lock/bin/python -m pip install -q --dry-run --ignore-installed --report $(VENV)-lock/report.json '.[dev,s3,notebooks,bench]'
 	$(VENV)-lock/bin/python -c "$$LOCK" $(VENV)-lock/report.json constraints.txt
 	rm -rf $(VENV)-lock
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from flows.survey.run import SurveyRun
-from flows.terminal.figures import area_words, format_count, format_percent, format_seconds
+from flows.terminal.figures import area_words, format_count, format_metres, format_percent, format_seconds
 from pipeline.ground.field_scale import FieldScale
 from pipeline.planning.fine_pass import FinePlan
 
@@ -67,7 +67,7 @@ def figure_lines(figures: Mapping[str, Any]) -> list[str]:
     if figures["ground_pixel_m"] is None:
         lines.append(NO_METRES)
     else:
-        lines.append(f"ground: {_metres(figures['ground_pixel_m'])} a pixel{_range_words(figures)}")
+        lines.append(f"ground: {format_metres(figures['ground_pixel_m'])} a pixel{_range_words(figures)}")
     known = "" if figures["fine_planned"] else " at most, chosen once the coarse pass was looked at"
     parts = f"coarse {format_seconds(camera['coarse'])}, fine {format_seconds(camera['fine'])}{known}"
     lines.append(
@@ -88,7 +88,11 @@ def _ground_words(figures: Mapping[str, Any]) -> str:
     if figures["hectares"] is None:
         return ""
     footprint = figures["footprint_m"]
-    size = "" if footprint is None else f", {_metres(footprint['width'])} wide and {_metres(footprint['depth'])} deep"
+    size = (
+        ""
+        if footprint is None
+        else f", {format_metres(footprint['width'])} wide and {format_metres(footprint['depth'])} deep"
+    )
     ground = area_words(figures["hectares"])
     return f"{size}; {ground}{' kept to' if figures['kept_share'] is not None else ''}"
 
@@ -96,13 +100,5 @@ def _ground_words(figures: Mapping[str, Any]) -> str:
 def _range_words(figures: Mapping[str, Any]) -> str:
     if figures["range_m"] is None:
         return ""
-    nearest, median, farthest = (_metres(figures["range_m"][name]) for name in ("nearest", "median", "farthest"))
+    nearest, median, farthest = (format_metres(figures["range_m"][name]) for name in ("nearest", "median", "farthest"))
     return f" in the middle, seen from {median} away ({nearest} to {farthest})"
-
-
-def _metres(length: float) -> str:
-    """A length with three figures, below a metre in cm, below a cm in mm."""
-    for unit, size in (("m", 1.0), ("cm", 0.01)):
-        if length >= size:
-            return f"{length / size:.3g} {unit}"
-    return f"{length / 0.001:.3g} mm"

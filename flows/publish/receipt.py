@@ -99,6 +99,7 @@ class Receipt(TypedDict):
     accuracy: NotRequired[Accuracy]
     effects: NotRequired[list[dict[str, Any]]]
     effects_total: NotRequired[dict[str, Any]]  # sum of the bounds beside the tolerance, and seconds saved
+    field: NotRequired[dict[str, Any]]  # its size, field of view, ground pixel and range, hectares an hour
     plan: NotRequired[dict[str, Any]]  # how the fine pass was laid out, and what the other orientation would cost
     scans: NotRequired[dict[str, dict[str, Any]]]  # plain ones by the weights' record, where there is one
     memory: NotRequired[dict[str, Any]]  # what became of what was remembered, where the map goes on from an earlier run
@@ -126,7 +127,7 @@ class Header:
 
 
 COSTS = ("lines", "samples", "bytes_raw", "bytes_stored", "capture_s", "tokens", "multiply_adds")
-FINDINGS = ("plan", "scans", "memory", "pointing", "lines", "ground", "zones", "plots", "pixels")
+FINDINGS = ("field", "plan", "scans", "memory", "pointing", "lines", "ground", "zones", "plots", "pixels")
 _SAVING_FIELDS = ("done", "full", "ratio", "full_is")
 _SPLIT_FIELDS = ("glance", "score", "encode", "decode")
 _STAGE_FIELDS = ("name", "key", "state", "wall_s", "cpu_s", "peak_rss_bytes", "bytes_in", "bytes_out")

@@ -19,10 +19,12 @@ from flows.terminal.figures import (
     area_words,
     format_bytes,
     format_count,
+    format_metres,
     format_percent,
     format_points,
     format_seconds,
 )
+from pipeline.ground.field_scale import SECONDS_PER_HOUR
 from pipeline.planning.plain_scans import scan_words
 from pipeline.simulator.selection.choice import UNIT_WORDS
 
@@ -146,6 +148,8 @@ def control_seats(accuracy: Mapping[str, Any]) -> str:
 def sentences(found: Mapping[str, Any]) -> list[str]:
     """The findings in words, for the terminal and the report."""
     words = []
+    if field := found.get("field"):
+        words.append(_field_words(field))
     if plan := found.get("plan"):
         if plan["kind"] in ("full", "scan") and plan["reason"]:
             words.append(_sentence(plan["reason"]))
@@ -177,6 +181,20 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
         place = f"{ground['crs']}, {ground['resolution_m']:.4g} m a pixel"
         words.append(f"On the ground ({place}) the classes cover {', '.join(areas)}.")
     return words
+
+
+def _field_words(field: Mapping[str, Any]) -> str:
+    """How large the field is and how finely it was seen; in metres and hectares where something says how large."""
+    across, down = field["view_deg"]
+    view = f"The field is {across:.3g} x {down:.3g} degrees of the view"
+    if field["ground_pixel_m"] is None:
+        return f"{view}."
+    away = "" if field["range_m"] is None else f", {format_metres(field['range_m']['median'])} away in the middle"
+    pace = field["hectares_per_hour"]
+    return (
+        f"{view}{away}: {area_words(field['hectares'])} at {format_metres(field['ground_pixel_m'])} a pixel, {pace:.3g}"
+        f" ha an hour of the camera ({SECONDS_PER_HOUR / pace:.3g} s a hectare)."
+    )
 
 
 MOST_CHANGES = 4  # told in words

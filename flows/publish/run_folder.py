@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flows.archive.field_figures import field_figures
 from flows.publish.change_picture import change_pictures
 from flows.publish.ground_findings import placed_findings, posed_findings
 from flows.publish.panels import draw_ground
@@ -293,7 +294,7 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
             "spared_share": None if plan.spared_s is None else plan.spared_s / run.plan.full_s,
             "spared_score": plan.wanted_worth - plan.worth,
         }
-    found: dict[str, Any] = {"plan": told}
+    found: dict[str, Any] = {"field": field_figures(run, plan), "plan": told}
     if (memory := memory_told(products.of("draw_map"))) is not None:
         found["memory"] = memory
     passes = {"coarse": products.get("register_coarse"), "fine": products.get("register_fine")}

@@ -122,12 +122,17 @@ TABLES = {
 }
 
 
-def load_settings(path: str | Path | None = None, flags: Mapping[str, object] | None = None) -> Settings:
+def load_settings(
+    path: str | Path | None = None,
+    flags: Mapping[str, object] | None = None,
+    *,
+    usual: Mapping[str, object] | None = None,
+) -> Settings:
     """Read the TOML file (None: defaults and flags alone), lay the flags over it and check the whole.
 
     Relative paths in the file start at its folder, those of flags at the current one. Flags are keys as in the file,
-    ``camera.exposure_ms`` for one in a table; None means not given. Raises SettingsError, BudgetError: the first key
-    that cannot be used, with its place and what it should be.
+    ``camera.exposure_ms`` for one in a table; None means not given. ``usual`` are defaults of the caller's own. Raises
+    SettingsError, BudgetError: the first key that cannot be used, with its place and what it should be.
     """
     try:
         table = {} if path is None else anchor_paths(read_toml(Path(path)), Path(path).parent)
@@ -147,7 +152,7 @@ def load_settings(path: str | Path | None = None, flags: Mapping[str, object] | 
             origin[key] = "flag"
     for wrong in _contradictions({key for key, value in table.items() if value is not None}, origin):
         raise SettingsError(wrong)
-    return parse_settings(table, origin)
+    return parse_settings({**(usual or {}), **table}, origin)
 
 
 def parse_settings(table: Mapping[str, object], origin: Mapping[str, str] | None = None) -> Settings:

@@ -62,7 +62,7 @@ class MapChoice:
         None, "Projected CRS in metres; the rig's UTM zone by default", "", 1024, 32_767, example=32632, why=EPSG
     )
     resolution_m: float | None = stated(
-        None, "By default the median footprint of a pixel", "m", 1e-4, 1000, example=0.01
+        None, "By default the median footprint of a pixel", "m", 1e-4, 1000, example=0.12
     )
 
 

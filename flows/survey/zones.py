@@ -73,7 +73,7 @@ def place_of_field(settings: Settings, scene: RasterScene) -> FieldPlace:
     Raises PoseError: from the pose no ground is seen, or the map's CRS does not suit it.
     """
     if settings.pose is None:
-        return NoPlace(scene.shape) if scene.geobox is None else PlacedPicture(scene.geobox)
+        return NoPlace(scene.shape, scene.pixel_m) if scene.geobox is None else PlacedPicture(scene.geobox)
     view = GroundView(settings.pose, settings.camera.ifov_rad)
     return PosedField(ground_grid(view, scene.shape, epsg=settings.map.epsg, resolution_m=settings.map.resolution_m))
 

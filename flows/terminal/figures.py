@@ -55,6 +55,14 @@ def area_words(hectares: float) -> str:
     return f"{hectares:.3g} ha" if hectares >= LEAST_HECTARES else f"{hectares * 1e4:.3g} m²"
 
 
+def format_metres(length: float) -> str:
+    """A length with three figures, below a metre in cm, below a cm in mm."""
+    for unit, size in (("m", 1.0), ("cm", 0.01)):
+        if length >= size:
+            return f"{length / size:.3g} {unit}"
+    return f"{length / 0.001:.3g} mm"
+
+
 def format_points(score: float | None) -> str:
     """A score of 0..1 as points of 100 with one decimal."""
     return f"{100 * score:.1f}" if _known(score) else DASH

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from types import TracebackType
 from typing import Any
 
@@ -56,6 +58,20 @@ def put_out(content: dict[str, Any], show: Callable[[dict[str, Any], Console], N
         show(content, on_stdout())
 
 
+Listener = Callable[[str, float, float], None]  # the stage, how much is done, of how much
+_listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
+
+
+@contextmanager
+def heard_by(listener: Listener | None) -> Iterator[None]:
+    """Have ``listener`` told, besides the terminal, how far each stage is that the block runs; None: nobody."""
+    before = _listener.set(listener)
+    try:
+        yield
+    finally:
+        _listener.reset(before)
+
+
 LINE_EVERY_S = 30.0
 TITLE, NARROW = 34, 110  # columns of a title; a console of fewer is narrow
 BARS = (8, 24)  # columns of a bar: narrow, wide
@@ -78,6 +94,7 @@ class StageProgress:
         self._tasks: dict[str, TaskID] = {}
         self._said: dict[str, float] = {}
         self._now: tuple[str, float] | None = None  # the stage that runs, and how far it is
+        self._listener = _listener.get()
         bar = BARS[console.width >= NARROW]
         room = max(console.width - TITLE - bar - TIME - 3, TIME)
         self._bars = Progress(
@@ -103,6 +120,8 @@ class StageProgress:
     def show(self, stage: str, done: float, words: str = "", *, ended: bool = False) -> None:
         """Say how far a stage is, 0..1, with a word or figure beside it; ``ended`` also where it failed half-way."""
         self._now = None if ended else (stage, done)
+        if self._listener is not None:
+            self._listener(stage, done, 1.0)
         title = self.titles.get(stage, stage)
         if stage not in self._tasks:
             self._tasks[stage] = self._bars.add_task(title, total=1.0, words="")

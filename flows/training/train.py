@@ -306,7 +306,7 @@ def print_start(begun: Mapping[str, Any], console: Console) -> None:
 def run_train(request: TrainRequest, console: Console) -> dict[str, Any]:
     """Train with a progress bar on ``console``; give the record kept in the weights."""
     _check_counts(request)
-    request = replace(request, command=asked_command())
+    request = replace(request, command=request.command or asked_command())
     last = ""
     with StageProgress(console) as progress:
 

@@ -60,9 +60,10 @@ class FieldPlace(Protocol):
 
 @dataclass(frozen=True)
 class NoPlace:
-    """A field of which nobody said where it lies: polygons are in pixels."""
+    """A field of which nobody said where it lies: polygons are in pixels. It may be known how large one is."""
 
     shape: tuple[int, int]
+    pixel_m: float | None = None
     crs = None
 
     @property
@@ -73,10 +74,13 @@ class NoPlace:
         return shape
 
     def pixel_areas_m2(self, rows: slice, columns: slice) -> Floats | None:
-        return None
+        size = rows.stop - rows.start, columns.stop - columns.start
+        return None if self.pixel_m is None else np.full(size, self.pixel_m**2)
 
     def scale(self, ifov_rad: float) -> FieldScale:
-        return scale_of_angles(self.shape, ifov_rad)
+        if self.pixel_m is None:
+            return scale_of_angles(self.shape, ifov_rad)
+        return scale_of_pixels(self.shape, ifov_rad, self.pixel_m)
 
 
 @dataclass(frozen=True)

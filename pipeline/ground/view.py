@@ -48,17 +48,17 @@ class RigPose:
     heading_deg: float = stated(
         MISSING, "Azimuth of the undeflected view direction, clockwise from north", "deg", -360, 360, example=30.0
     )
-    tilt_deg: float = stated(MISSING, "Angle below the horizon; 90 looks straight down", "deg", -90, 90, example=40.0)
+    tilt_deg: float = stated(MISSING, "Angle below the horizon; 90 looks straight down", "deg", -90, 90, example=35.0)
     height_m: float | None = stated(
         None,
         "Height of the mirror's pivot above the ground below it; or instead range_m",
         "m",
         0.01,
         20_000,
-        example=12.0,
+        example=493.0,
     )
     range_m: float | None = stated(
-        None, "Distance to the ground along the undeflected direction; or height_m", "m", 0.01, 50_000, example=18.7
+        None, "Distance to the ground along the undeflected direction; or height_m", "m", 0.01, 50_000, example=860.0
     )
     roll_deg: float = stated(0.0, "Turn about the view direction; positive turns the right side down", "deg", -180, 180)
     slope_deg: float = stated(0.0, "Slope of the ground", "deg", 0, 80)

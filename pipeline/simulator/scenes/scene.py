@@ -116,7 +116,8 @@ class RasterScene:
     band; ``missing`` (y, x) are those without one in most bands, of which nothing is known (None: no such pixel).
     ``panel`` is the scene value of the white panel, ``wavelength_nm`` and ``fwhm_nm`` are centres and widths of the
     bands, all (band,); widths are None where not known. Equal keys give equal light.
-    ``geobox`` is where the pixels lie on the earth, as the scene's file says (None: it does not).
+    ``geobox`` is where the pixels lie on the earth, as the scene's file says (None: it does not); ``pixel_m`` is how
+    large a pixel of a scene without one is on the ground, where the scene's own law says so.
     Planes, labels and electrons may be made when they are first asked for; all else is known at once.
     """
 
@@ -132,6 +133,7 @@ class RasterScene:
     filled_px: int = 0
     missing: NDArray[np.bool_] | None = None
     geobox: GeoBox | None = None
+    pixel_m: float | None = None
 
     def __post_init__(self) -> None:
         if self.light.is_made():

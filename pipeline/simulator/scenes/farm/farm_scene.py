@@ -58,6 +58,7 @@ from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 # A law is what a seed is drawn by; it stands first in a scene's key, and one that is out there never changes.
 FARM_LAW, REMOVED_LAW = "farm@2", "farm@1"
 FARM_NAMES = ("farm", FARM_LAW)
+PIXEL_M = 0.12  # on the ground
 FARM_SHAPE = (1024, 1280)  # (y, x) unless another is asked for [px]
 USUAL_DAY, USUAL_HOUR = 172, 11.0  # the 21st of June, an hour before noon
 WIDTHS = {"margin": (2.0, 4.5), "hedge": (4.5, 6.5), "ditch": (1.3, 2.2), "road": (3.0, 5.0)}  # half, px
@@ -120,6 +121,7 @@ def farm_scene(
         fwhm_nm=fwhm,
         class_names=CLASSES,
         class_colours=CLASS_COLOURS.copy(),
+        pixel_m=PIXEL_M,
     )
 
 

@@ -1,0 +1,185 @@
+"""An archive opened to look at: its runs by name, and what each left, as xarray."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.errors import ArchiveError, IncompleteStoreError
+from pipeline.lazy import deferred
+from storage.archive.archive import Archive
+from storage.archive.records import Run, read_run
+
+if TYPE_CHECKING:
+    import xarray
+
+    import storage.arrays.labelled_stores as labelled_stores
+    import storage.remote.opening as opening
+else:
+    labelled_stores = deferred("storage.arrays.labelled_stores")
+    opening = deferred("storage.remote.opening")
+
+LATEST = "latest"
+
+
+def open(archive: str | Path) -> OpenedArchive:
+    """Open an archive to look at: a folder, or s3://bucket/prefix. Nothing is written to it.
+
+    Raises ArchiveError: there is none, or it cannot be read.
+    """
+    return OpenedArchive(opening.open_archive(archive, create=False, write=False))
+
+
+class OpenedArchive(Mapping[str, "OpenedRun"]):
+    """The published runs of an archive by their names, the latest first; `latest` is a name of the first as well."""
+
+    def __init__(self, archive: Archive) -> None:
+        self._archive = archive
+
+    @property
+    def name(self) -> str:
+        """What was given to open it."""
+        return self._archive.name
+
+    @property
+    def runs(self) -> Mapping[str, OpenedRun]:
+        """The runs, by their names, the latest first: the archive itself."""
+        return self
+
+    @property
+    def latest(self) -> OpenedRun:
+        """The run published last. Raises ArchiveError where there is none."""
+        return self[LATEST]
+
+    def __getitem__(self, name: str) -> OpenedRun:
+        folders = {folder.name: folder for folder in self._archive.runs()}
+        if not folders:
+            raise ArchiveError(f"{self.name} has no published run; survey into it first")
+        called = next(reversed(folders)) if name == LATEST else name.removeprefix("runs/").rstrip("/")
+        if called not in folders:
+            known = ", ".join(list(folders)[-5:])
+            raise NoRunError(f"{self.name} has no run {name!r}; its latest are {known}")
+        return OpenedRun(self._archive, folders[called])
+
+    def __iter__(self) -> Iterator[str]:
+        return (folder.name for folder in reversed(self._archive.runs()))
+
+    def __len__(self) -> int:
+        return len(self._archive.runs())
+
+    def __repr__(self) -> str:
+        lines = [f"spectralzoom archive {self.name}, {len(self)} runs", *(f"  {name}" for name in self)]
+        return "\n".join(lines)
+
+
+class NoRunError(ArchiveError, KeyError):
+    """An archive has no run of a name."""
+
+
+class OpenedRun:
+    """One published run. Arrays are read when they are used; see `OpenedArchive` for how to come by one.
+
+    What lies on the scene's own grid (class map, confidence, mosaic, beliefs) has the scene's CRS where it had one, and
+    directions seen from the rig [rad] where it had none. A run with a ``[pose]`` has a ``ground_map`` besides.
+    """
+
+    def __init__(self, archive: Archive, folder: Path) -> None:
+        self._archive = archive
+        self.folder = folder  # on this machine
+
+    @property
+    def name(self) -> str:
+        """Its name in the archive: when its survey began, and of what field."""
+        return self.folder.name
+
+    @property
+    def archive_name(self) -> str:
+        """What to give to open its archive."""
+        return self._archive.name
+
+    @cached_property
+    def receipt(self) -> Mapping[str, Any]:
+        """What it says for itself: settings, stages, savings, accuracy, products.
+
+        Raises IncompleteStoreError: it is damaged.
+        """
+        found: Run = read_run(self.folder, {})
+        if found.problem is not None:
+            raise IncompleteStoreError(f"{found.uri} of {self._archive.name}: {found.problem}; run verify --repair")
+        return found.receipt
+
+    @property
+    def report(self) -> Path:
+        """The page for people: one file, opens in any browser."""
+        return self.folder / "report.html"
+
+    @property
+    def quicklook(self) -> Path:
+        """Four panels in one picture."""
+        return self.folder / "quicklook.png"
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """What the numbers of its class map mean."""
+        return tuple(self.dataset("class_map").attrs["class_names"])
+
+    @property
+    def class_map(self) -> xarray.DataArray:
+        """(y, x) uint8 number of each pixel's class, 255 where there is none; names in ``flag_meanings``."""
+        return self.dataset("class_map")["classes"]
+
+    @property
+    def confidence(self) -> xarray.DataArray:
+        """(y, x) float32 probability of the class given, 0 to 1; NaN where there is none."""
+        return self.dataset("class_map")["confidence"]
+
+    @property
+    def mosaic(self) -> xarray.DataArray:
+        """(y, x, band) float32 values of the coarse look, NaN where nothing was seen; indexed by ``wavelength`` too."""
+        return self.dataset("mosaic")["values"]
+
+    @property
+    def patches(self) -> xarray.Dataset:
+        """Fine patches: ``values`` (patch, y, x, band), ``valid`` (patch, y, x), and the pixel where each begins."""
+        return self.dataset("patches")
+
+    @property
+    def attention(self) -> xarray.Dataset:
+        """Worth (``score``) and order (``rank``, -1 not looked at) of every seat, (seat_y, seat_x)."""
+        return self.dataset("attention")
+
+    @property
+    def ground_map(self) -> xarray.Dataset:
+        """Classes, confidence and picture on the map, where the survey had a ``[pose]``; its CRS in ``spatial_ref``."""
+        return self.dataset("ground_map")
+
+    @property
+    def sweeps(self) -> dict[str, xarray.Dataset]:
+        """Raw lines by the sweep's name: ``dn`` (line, sample, band), with time and mirror of each line."""
+        raw = (self._place(name) for name in ("raw_coarse", "raw_fine") if name in self.receipt["products"])
+        return {one.stem: labelled_stores.open_labelled(one) for folder in raw for one in sorted(folder.glob("*.zarr"))}
+
+    @property
+    def products(self) -> tuple[str, ...]:
+        """Names that `dataset` takes."""
+        return tuple(name for name, where in self.receipt["products"].items() if where.endswith(".zarr"))
+
+    def dataset(self, product: str) -> xarray.Dataset:
+        """Open all arrays of a product, such as ``belief`` or ``lookup``.
+
+        Raises IncompleteStoreError: this run has left no such product, or it is damaged.
+        """
+        return labelled_stores.open_labelled(self._place(product))
+
+    def _place(self, product: str) -> Path:
+        where = self.receipt["products"].get(product)
+        if where is None:
+            raise IncompleteStoreError(f"the run {self.name} left no {product}; it left {', '.join(self.products)}")
+        return self._archive.locate(where)
+
+    def __repr__(self) -> str:
+        score = (self.receipt.get("accuracy") or {}).get("miou")
+        known = "" if score is None else f", mIoU {100 * score:.1f}"
+        return f"<run {self.name} of {self._archive.name}{known}>"

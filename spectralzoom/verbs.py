@@ -1,0 +1,239 @@
+"""What the command line does, as functions: quiet, with settings as keywords, told of by a callback, raising errors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.errors import SettingsError
+from pipeline.lazy import deferred
+from spectralzoom.opened import OpenedRun
+
+if TYPE_CHECKING:
+    import threadpoolctl
+    from rich.console import Console
+
+    import flows.archive.plan_command as plan_command
+    import flows.archive.reprocess_command as reprocess_command
+    import flows.evaluate.command as evaluate_command
+    import flows.evaluate.frames as evaluate_frames
+    import flows.publish.survey_command as survey_command
+    import flows.schedule.rig_lock as rig_lock
+    import flows.settings.load as settings_load
+    import flows.terminal.processes as processes
+    import flows.terminal.progress as terminal_progress
+    import flows.training.train as training
+    import models.training.train as models_training
+    import spectralzoom.opened as opened
+    from flows.settings.survey_settings import Settings
+else:
+    threadpoolctl = deferred("threadpoolctl")
+    plan_command = deferred("flows.archive.plan_command")
+    reprocess_command = deferred("flows.archive.reprocess_command")
+    evaluate_command = deferred("flows.evaluate.command")
+    evaluate_frames = deferred("flows.evaluate.frames")
+    survey_command = deferred("flows.publish.survey_command")
+    rig_lock = deferred("flows.schedule.rig_lock")
+    settings_load = deferred("flows.settings.load")
+    processes = deferred("flows.terminal.processes")
+    terminal_progress = deferred("flows.terminal.progress")
+    training = deferred("flows.training.train")
+    models_training = deferred("models.training.train")
+    opened = deferred("spectralzoom.opened")
+
+Asked = str | Path | Mapping[str, Any] | None  # a settings file, a table of settings, or keywords alone
+Told = Callable[[str, float, float], None]
+USUAL = {"engine": "plain"}  # a server of Prefect's is started where it is asked for
+TOKENS = ("dim", "layers", "heads", "mlp_ratio")
+MADE_HERE = ("dataset", "choices", "tokens", "settings", "command", "camera")  # of requests
+FILES = ("weights", "controls")
+LISTS = (*FILES, "shares", "policies", "frames")
+OF_ONE_SCENE = ("labels", "bands", "wavelengths", "train_mask", "mask_classes")
+
+
+def survey(settings: Asked = None, *, progress: Told | None = None, quiet: bool = True, **flags: Any) -> OpenedRun:
+    """Survey a field as `spectralzoom survey` does, publish the run and give it.
+
+    What is in the archive already is not made again: the same call goes on where one was stopped.
+
+    Parameters
+    ----------
+    settings
+        A settings file (TOML), or its content as a dictionary. Keywords win over it.
+    progress
+        Called as ``progress(stage, done, total)`` whenever a stage has come further; ``done / total`` is its share.
+    quiet
+        False prints on stderr what the command would.
+    flags
+        Every setting by its name: ``budget=0.5``, ``camera={"exposure_ms": 50}``. ``engine`` is ``"plain"`` unless
+        asked for otherwise.
+
+    Raises
+    ------
+    Error
+        What was expected, what came, where, and what to do; nothing that was captured is lost.
+    """
+    asked = _settings(settings, flags)
+    with _working(progress, quiet=quiet) as console, rig_lock.rig_to_oneself(asked, "a survey from Python"):
+        published = survey_command.run_survey(asked, console)
+    return opened.open(asked.out)[published.folder.name]
+
+
+def plan(settings: Asked = None, **flags: Any) -> dict[str, Any]:
+    """Tell what `survey` with the same arguments would make, and how long it takes; nothing is captured or written.
+
+    Gives what `spectralzoom plan --json` prints: ``stages``, each with its state, reason, seconds and bytes, their
+    sums, and the plain ``scans`` of the weights' record. Raises Error where a survey could not be.
+    """
+    asked = _settings(settings, flags)
+    with _working(None):
+        content: dict[str, Any] = plan_command.plan_content(asked)
+    return content
+
+
+def evaluate(dataset: str | Path | OpenedRun, *, progress: Told | None = None, **flags: Any) -> dict[str, Any]:
+    """Judge weights on scenes that they were not trained on, or the map of a run against labels; give the scores.
+
+    Parameters
+    ----------
+    dataset
+        A data set as `spectralzoom evaluate` takes it, with ``weights`` (a file or several); or a run, whose accuracy
+        is added to it, with ``labels`` and ``controls`` where other than its survey's are meant.
+    progress
+        As for `survey`.
+    flags
+        Those of `spectralzoom evaluate`, lists as Python's: ``shares=[0.1, 0.2]``, ``out="judged"``.
+
+    Returns
+    -------
+    Of weights what `spectralzoom evaluate --json` prints; of a run the ``accuracy`` of its receipt.
+
+    Raises
+    ------
+    Error
+        What was expected, what came, where, and what to do.
+    """
+    if isinstance(dataset, OpenedRun):
+        return _judge(dataset, progress, **flags)
+    kind, asked = evaluate_frames.EvaluateRequest, {**flags}
+    if "control" in asked:
+        asked["controls"] = asked.pop("control")
+    choices = _taken(asked, OF_ONE_SCENE)
+    _check_known(asked, kind, "evaluate", also=[])
+    if "weights" not in asked:
+        raise SettingsError("evaluate needs weights=FILE to judge them on a data set, or a run to judge its map")
+    for name in LISTS:
+        if name in asked:
+            asked[name] = tuple(Path(one) if name in FILES else one for one in _several(asked[name]))
+    if asked.get("out") is not None:
+        asked["out"] = Path(asked["out"])
+    with _working(progress):
+        request = kind(str(dataset), **asked, choices=choices)
+        content: dict[str, Any] = evaluate_command.evaluate_weights(
+            request, lambda what, done, words: _tell(progress, what, done)
+        )
+    return content
+
+
+def train(
+    dataset: str | Path, out: str | Path, *, progress: Told | None = None, quiet: bool = True, **flags: Any
+) -> Path:
+    """Train weights on a data set as `spectralzoom train` does; give the file of weights.
+
+    The state of the training is kept beside the weights: the same call goes on where one was stopped.
+
+    Parameters
+    ----------
+    dataset
+        ``farm``, a folder with images, labels and a scene.toml, or one scene file.
+    out
+        File of weights to write (.safetensors).
+    progress, quiet
+        As for `survey`.
+    flags
+        Those of `spectralzoom train`, lists as Python's: ``steps=500``, ``hold_out=["059"]``, ``dim=64``.
+
+    Raises
+    ------
+    Error
+        What was expected, what came, where, and what to do.
+    """
+    kind, how, asked = training.TrainRequest, models_training.TrainingSettings, {**flags}
+    command = f"spectralzoom.train({', '.join([repr(Path(dataset).name), *(f'{k}={v!r}' for k, v in asked.items())])})"
+    sizes, choices = _taken(asked, TOKENS), _taken(asked, OF_ONE_SCENE)
+    own = _taken(asked, [one.name for one in fields(how)])
+    own.setdefault("crop", training.usual_crop(str(dataset), asked.get("preset", "two-scale")))
+    if "hold_out" in asked:
+        asked["hold_out"] = tuple(_several(asked["hold_out"]))
+    if asked.get("init") is not None:
+        asked["init"] = Path(asked["init"])
+    _check_known(asked, kind, "train", also=[*(one.name for one in fields(how)), *TOKENS])
+    request = kind(
+        str(dataset), Path(out), **asked, tokens=sizes, choices=choices, settings=how(**own), command=command
+    )
+    with _working(progress, quiet=quiet) as console:
+        training.run_train(request, console)
+    return Path(out)
+
+
+def _settings(given: Asked, flags: Mapping[str, Any]) -> Settings:
+    """The settings of a file or a table, with keywords laid over them."""
+    path = None if given is None or isinstance(given, Mapping) else given
+    table = _by_key(given) if isinstance(given, Mapping) else {}
+    return settings_load.load_settings(path, table | _by_key(flags), usual=USUAL)
+
+
+def _by_key(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings by their keys, those in tables as ``camera.exposure_ms``; paths as text, lists as they are written."""
+    found: dict[str, Any] = {}
+    for name, value in table.items():
+        inner = {f"{name}.{key}": one for key, one in value.items()} if isinstance(value, Mapping) else {name: value}
+        found |= {key: str(one) if isinstance(one, Path) else one for key, one in inner.items()}
+    return found
+
+
+@contextmanager
+def _working(progress: Told | None, *, quiet: bool = True) -> Iterator[Console]:
+    """Work as a command does: told to ``progress``, on one thread of BLAS, caches where they can be kept."""
+    processes.place_caches()
+    console = terminal_progress.on_stderr()
+    console.quiet = quiet
+    # Split among threads, sums are rounded otherwise: what lies behind one key would differ with the number of cores.
+    with terminal_progress.heard_by(progress), threadpoolctl.threadpool_limits(1, user_api="blas"):
+        yield console
+
+
+def _judge(
+    run: OpenedRun, progress: Told | None, labels: str | Path | None = None, controls: bool | None = None
+) -> dict[str, Any]:
+    """Add its accuracy to a run, and give it."""
+    asked = None if labels is None else str(labels)
+    with _working(progress) as console:
+        receipt = reprocess_command.run_judge(run.archive_name, run.name, console, controls=controls, labels=asked)
+    return dict(receipt["accuracy"])
+
+
+def _tell(progress: Told | None, what: str, done: float) -> None:
+    if progress is not None:
+        progress(what, done, 1.0)
+
+
+def _several(value: Any) -> Sequence[Any]:
+    """One, or as many as there are."""
+    return [value] if isinstance(value, str | Path | float | int) else list(value)
+
+
+def _taken(flags: dict[str, Any], names: Sequence[str]) -> dict[str, Any]:
+    """Take some of the keywords out."""
+    return {name: flags.pop(name) for name in names if name in flags}
+
+
+def _check_known(flags: Mapping[str, Any], kind: Any, verb: str, *, also: Sequence[str]) -> None:
+    """Refuse a keyword that is no field of the request and none of what was taken before (SettingsError)."""
+    own = [one.name for one in fields(kind) if one.name not in MADE_HERE]
+    for name in flags:
+        if name not in own:
+            raise SettingsError(f"{verb} has no {name!r}; it has {', '.join(sorted({*own, *also, *OF_ONE_SCENE}))}")

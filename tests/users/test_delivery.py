@@ -1,0 +1,126 @@
+"""What is delivered works outside of the checkout: a wheel, the same from an sdist, for users without a home."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tarfile
+import tempfile
+import tomllib
+import venv
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import WeightsMaker
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGES = ("spectralzoom", "flows", "models", "storage", "pipeline")
+BESIDE = ("pyproject.toml", "README.md", "LICENSE")
+AS_NOBODY = ("setpriv", "--reuid=12345", "--regid=12345", "--clear-groups")  # a user without a name or a home
+BUILD = "import sys; from setuptools import build_meta; print(getattr(build_meta, sys.argv[1])(sys.argv[2]))"
+USED = """
+import json, sys
+import spectralzoom
+from models.weights.files import load_weights
+run = spectralzoom.survey(scene="field.png", weights="mine.safetensors", budget=0.8, effects="none",
+    camera={"samples": 320}, out=sys.argv[1])
+farm = spectralzoom.plan(scene="farm", size="32x32", budget=0.9, bands=list(range(4, 270, 9)), out=sys.argv[1])
+print(json.dumps([spectralzoom.__version__, spectralzoom.__file__, str(run.report), len(farm["stages"])]))
+"""
+
+
+def run(words: Sequence[str | Path], cwd: Path, environment: Mapping[str, str] | None = None) -> str:
+    """What a command prints; AssertionError with its words where it fails."""
+    given = [str(word) for word in words]
+    ended = subprocess.run(given, cwd=cwd, env=environment, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr[-3000:]
+    return ended.stdout
+
+
+@pytest.fixture(scope="module")
+def ground() -> Iterator[Path]:
+    """A folder that every user of the machine may enter, as pytest's are not."""
+    with tempfile.TemporaryDirectory(prefix="spectralzoom-delivery-") as folder:
+        Path(folder).chmod(0o755)
+        yield Path(folder)
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of what git has of the packages, away from the checkout; what lies beside it is not built from."""
+    copy = tmp_path_factory.mktemp("tree")
+    listed = run(["git", "ls-files", "-co", "--exclude-standard", *PACKAGES, *BESIDE], ROOT).splitlines()
+    for name in filter(lambda one: (ROOT / one).exists(), listed):
+        (copy / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(ROOT / name, copy / name)
+    return copy
+
+
+@pytest.fixture(scope="module")
+def wheel(tree: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel that pip makes of an sdist."""
+    made = tmp_path_factory.mktemp("dist")
+    sdist = run([sys.executable, "-c", BUILD, "build_sdist", made], tree).splitlines()[-1]
+    with tarfile.open(made / sdist) as packed:
+        packed.extractall(made / "unpacked", filter="data")
+    (unpacked,) = (made / "unpacked").iterdir()
+    name = run([sys.executable, "-c", BUILD, "build_wheel", made], unpacked).splitlines()[-1]
+    return made / name
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path, ground: Path) -> Path:
+    """A new environment that has the wheel, and of this one what it depends on: nothing of the checkout."""
+    venv.create(ground / "env", symlinks=True)
+    (packages,) = (ground / "env").glob("lib/python*/site-packages")
+    (packages / "dependencies.pth").write_text(sysconfig.get_path("purelib"))  # whose own .pth files are not read
+    pip = [sys.executable, "-m", "pip", "-q", "--python", ground / "env" / "bin" / "python", "install"]
+    run([*pip, "--no-deps", "--no-compile", "--no-index", "--disable-pip-version-check", wheel], ground)
+    return ground / "env" / "bin"
+
+
+def test_the_wheel_holds_what_the_packages_hold(tree: Path, wheel: Path) -> None:
+    """Every file of the packages, weights and templates too, is in it byte by byte, and nothing else is."""
+    with zipfile.ZipFile(wheel) as packed:
+        found = {name: packed.read(name) for name in packed.namelist() if ".dist-info/" not in name}
+    there = (path for name in PACKAGES for path in (tree / name).rglob("*") if path.is_file())
+    known = {path.relative_to(tree).as_posix(): path.read_bytes() for path in there if "egg-info" not in str(path)}
+    assert set(found) == set(known)
+    assert [name for name in known if found[name] != known[name]] == []
+
+
+def test_the_wheel_is_the_same_from_the_tree(tree: Path, wheel: Path, tmp_path: Path) -> None:
+    """The sdist has all that the wheel is made of."""
+    name = run([sys.executable, "-c", BUILD, "build_wheel", tmp_path], tree).splitlines()[-1]
+    with zipfile.ZipFile(wheel) as one, zipfile.ZipFile(tmp_path / name) as other:
+        assert {item.filename: item.CRC for item in one.infolist()} == {
+            item.filename: item.CRC for item in other.infolist()
+        }
+
+
+def test_the_wheel_works_for_a_user_without_a_home(
+    installed: Path, ground: Path, scene_files: Path, make_weights: WeightsMaker
+) -> None:
+    """Command and package run from it, where nothing but the archive can be written, and no variable is set."""
+    place, archive, temporary = (ground / name for name in ("place", "archive", "tmp"))
+    for folder in (place, archive, temporary):
+        folder.mkdir()
+        folder.chmod(0o755 if folder == place else 0o777)
+    shutil.copyfile(scene_files / "scene.png", place / "field.png")
+    shutil.copyfile(make_weights(), place / "mine.safetensors")
+    nobody = AS_NOBODY if os.geteuid() == 0 and shutil.which("setpriv") else ()
+    bare = {"TMPDIR": str(temporary), "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
+    version = run([*nobody, installed / "spectralzoom", "--version"], place, bare)
+    told, file, report, stages = json.loads(run([*nobody, installed / "python", "-c", USED, archive], place, bare))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert version.strip() == told == project["version"]
+    assert Path(file).is_relative_to(installed.parent)
+    assert Path(report).read_text(encoding="utf-8").lower().startswith("<!doctype html>")
+    assert stages > 10

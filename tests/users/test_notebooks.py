@@ -1,0 +1,62 @@
+"""The notebooks: every cell runs from top to bottom, and what GitHub shows of them is what they are."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import pytest
+
+from tests.remembered_work import without_effects
+
+FOLDER = Path(__file__).parents[2] / "docs" / "notebooks"
+NAMES = ("first_survey", "season")
+MOST_BYTES = 200_000
+
+
+@pytest.fixture
+def drawing() -> Iterator[None]:
+    """No figure is left open."""
+    plt.switch_backend("Agg")
+    yield
+    plt.close("all")
+
+
+def cells(name: str, kind: str) -> list[dict[str, Any]]:
+    """Cells of a notebook, of one kind."""
+    content = json.loads((FOLDER / f"{name}.ipynb").read_text(encoding="utf-8"))
+    return [cell for cell in content["cells"] if cell["cell_type"] == kind]
+
+
+@pytest.mark.usefixtures("drawing")
+@pytest.mark.parametrize("name", NAMES)
+def test_every_cell_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a page's blocks do, in this process: a kernel and all that it loads would cost more than the surveys."""
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {"__name__": name}
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with without_effects():
+        for number, cell in enumerate(cells(name, "code")):
+            exec(compile("".join(cell["source"]), f"{name}.ipynb, cell {number}", "exec", dont_inherit=True), names)
+    drawn = [axes for number in plt.get_fignums() for axes in plt.figure(number).axes]
+    assert all(axes.images or any(len(line.get_xdata()) for line in axes.lines) or axes.collections for axes in drawn)
+    assert len(drawn) >= 3
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_it_is_shown_with_what_it_gave(name: str) -> None:
+    """Rendered by `make notebooks`: small, in order, without an error, with pictures, and links that lead somewhere."""
+    assert (FOLDER / f"{name}.ipynb").stat().st_size < MOST_BYTES
+    code = cells(name, "code")
+    assert [cell["execution_count"] for cell in code] == list(range(1, len(code) + 1))
+    outputs = [output for cell in code for output in cell["outputs"]]
+    assert {output["output_type"] for output in outputs} <= {"stream", "display_data"}
+    assert sum("image/png" in output.get("data", {}) for output in outputs) == 2
+    assert "/tmp/" not in json.dumps(outputs)
+    text = "".join("".join(cell["source"]) for cell in cells(name, "markdown"))
+    targets = re.findall(r"\]\(([^)#]+)", text)
+    assert [one for one in targets if not (FOLDER / one).exists()] == []

@@ -1,0 +1,245 @@
+"""The package spectralzoom: what somebody types first in Python, and what xarray then knows of it."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rioxarray  # noqa: F401 - registers the accessor that users have
+import xarray as xr
+from hypothesis import given
+from hypothesis import strategies as st
+
+import spectralzoom
+from spectralzoom.opened import NoRunError, OpenedRun
+from storage.archive.archive import Archive
+from storage.arrays.class_maps import load_class_map
+from storage.arrays.ground_maps import load_geobox
+from storage.arrays.labelled_stores import by_wavelength, on_axes, open_labelled
+from tests.conftest import WeightsMaker
+from tests.flows.small_fields import write_field
+from tests.remembered_work import without_effects
+
+POSE = {"lon_deg": 7.6, "lat_deg": 51.96, "height_m": 30, "heading_deg": 20, "tilt_deg": 35}
+Heard = dict[str, list[float]]
+
+
+@pytest.fixture(scope="module")
+def asked(scene_files: Path, weights: Path) -> dict[str, object]:
+    """What a small survey is asked for, on a rig that stands somewhere, as a table of settings."""
+    files = {"scene": scene_files / "scene.png", "labels": str(scene_files / "labels.png"), "weights": weights}
+    return {**files, "pose": POSE, "camera": {"samples": 320}, "budget": 0.8, "accuracy": False, "controls": False}
+
+
+@pytest.fixture(scope="module")
+def surveyed(asked: dict[str, object], tmp_path_factory: pytest.TempPathFactory) -> tuple[OpenedRun, Heard]:
+    """A run, and what was heard of its stages."""
+    heard: Heard = defaultdict(list)
+    with without_effects():
+        run = spectralzoom.survey(
+            asked,
+            out=tmp_path_factory.mktemp("api") / "archive",
+            progress=lambda stage, done, total: heard[stage].append(done / total),
+        )
+    return run, heard
+
+
+@pytest.fixture(scope="module")
+def run(surveyed: tuple[OpenedRun, Heard]) -> OpenedRun:
+    """The run alone."""
+    return surveyed[0]
+
+
+def test_importing_it_loads_nothing_of_weight() -> None:
+    """Names are there, what is behind them is loaded when it is called."""
+    code = "import sys, spectralzoom; print(*dir(spectralzoom)); print({'torch', 'numpy', 'xarray'} & set(sys.modules))"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ended.stdout.splitlines() == [" ".join(spectralzoom.__all__), "set()"]
+    assert all(getattr(spectralzoom, name) for name in spectralzoom.__all__)
+
+
+def test_opening_an_archive_takes_no_torch(run: OpenedRun) -> None:
+    """Whoever looks at maps does not wait for a network."""
+    code = (
+        "import sys, spectralzoom; print(spectralzoom.open(sys.argv[1]).latest.class_map.dtype, 'torch' in sys.modules)"
+    )
+    command = [sys.executable, "-W", "error", "-c", code, run.archive_name]
+    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip() == "uint8 False"
+
+
+def test_runs_are_found_by_name_and_the_latest_comes_first(run: OpenedRun, tmp_path: Path) -> None:
+    """A mapping; `latest` is the first of it."""
+    for name in (run.name, "29990101T000000-later"):
+        shutil.copytree(run.folder, tmp_path / "archive" / "runs" / name)
+    (tmp_path / "archive" / "stages").mkdir()
+    archive = spectralzoom.open(tmp_path / "archive")
+    assert list(archive.runs) == ["29990101T000000-later", run.name]
+    assert archive.latest.name == next(iter(archive))
+    assert archive[f"runs/{run.name}"].receipt == run.receipt
+    with pytest.raises(KeyError, match=r"its latest are .*29990101"):
+        archive.runs["no-such"]
+    assert issubclass(NoRunError, spectralzoom.Error)
+
+
+def test_every_axis_of_every_product_has_a_coordinate(run: OpenedRun) -> None:
+    """Whatever a run has left, nothing has to be counted by hand, and nothing warns."""
+    opened = [run.dataset(name) for name in run.products] + list(run.sweeps.values())
+    assert len(opened) > 6
+    for one in opened:
+        assert set(one.sizes) <= set(one.indexes)
+        one.load()
+
+
+def test_classes_are_those_of_the_store(run: OpenedRun) -> None:
+    """Numbers stay uint8 with their meanings, also where there is no class."""
+    found = run.class_map
+    stored = load_class_map(Path(run.archive_name) / run.receipt["products"]["class_map"])
+    assert (found.dtype, found.attrs["_FillValue"]) == (np.uint8, 255)
+    np.testing.assert_array_equal(found, stored.classes)
+    assert found.attrs["flag_meanings"].split() == list(run.class_names) == list(stored.names)
+    np.testing.assert_array_equal(run.confidence, stored.confidence)
+
+
+def test_a_coarse_pixel_lies_on_its_fine_ones(run: OpenedRun) -> None:
+    """Places of mosaic and map are of one grid: the middle of four centres is the coarse centre."""
+    fine, coarse = run.class_map, run.mosaic
+    for axis in ("y", "x"):
+        middle = fine[axis].values.reshape(-1, 4).mean(axis=1)
+        np.testing.assert_allclose(coarse[axis].values, middle, atol=1e-12)
+        assert coarse[axis].attrs["units"] == "rad"
+    under = fine.reindex_like(coarse, method="nearest")
+    assert under.dtype == np.uint8
+    joined = coarse.where(under == int(under[0, 0]))  # by coordinates: what has others is left out
+    assert joined.shape == coarse.shape
+    assert np.isfinite(joined.values[0, 0]).all()
+
+
+def test_a_band_is_found_by_its_wavelength(run: OpenedRun) -> None:
+    """By the nearest, in every product that has bands, and by its number still."""
+    for one in (run.mosaic, run.patches["values"], run.sweeps["coarse-0"]["dn"]):
+        red = one.sel(wavelength=660, method="nearest")
+        assert float(red.wavelength) == 640
+        xr.testing.assert_identical(red, one.isel(band=0))
+
+
+@given(st.lists(st.integers(300, 2500), min_size=1, max_size=8, unique=True), st.integers(300, 2500))
+def test_the_nearest_band_is_found_in_any_order(wavelengths: list[int], wanted: int) -> None:
+    """Also of two spectrometers that overlap, whose wavelengths rise and fall."""
+    names = {"wavelength": ("band", np.array(wavelengths, float))}
+    found = by_wavelength(xr.Dataset({"values": ("band", np.arange(len(wavelengths)))}, names))
+    chosen = found["values"].sel(wavelength=float(wanted), method="nearest")
+    assert abs(float(chosen.wavelength) - wanted) == min(abs(one - wanted) for one in wavelengths)
+    assert float(chosen.wavelength) == wavelengths[int(chosen)]
+
+
+def test_an_axis_without_a_place_counts_pixels() -> None:
+    """Where nothing says where it lies."""
+    found = on_axes(xr.Dataset({"values": (("y", "x"), np.zeros((2, 3)))}), {})
+    assert (found.y.values.tolist(), found.x.attrs["units"]) == ([0, 1], "px")
+
+
+def test_stores_without_coordinates_get_them(run: OpenedRun) -> None:
+    """Stores of before said their transform alone: centres follow from it."""
+    whole = open_labelled(Path(run.archive_name) / run.receipt["products"]["mosaic"])
+    bare = on_axes(whole.drop_vars(["y", "x", "band"]), whole.attrs)
+    for axis in ("y", "x", "band"):
+        np.testing.assert_allclose(bare[axis], whole[axis], atol=1e-12)
+        assert bare[axis].attrs["units"] == whole[axis].attrs["units"]
+
+
+def test_the_map_on_the_ground_has_its_crs(run: OpenedRun) -> None:
+    """By rioxarray's convention, with the transform that the store was written with."""
+    drawn = run.ground_map
+    geobox = load_geobox(Path(run.archive_name) / run.receipt["products"]["ground_map"])
+    assert geobox is not None
+    assert drawn["classes"].dtype == np.uint8
+    assert (drawn["classes"].rio.crs.to_epsg(), drawn["classes"].rio.nodata) == (32632, 255)
+    here = drawn["classes"].rio.transform()
+    assert np.allclose(np.array(here[:6]), np.array(geobox.affine[:6]), atol=0.1 * abs(geobox.affine.a))
+
+
+def test_progress_rises_to_the_end_of_every_stage(surveyed: tuple[OpenedRun, Heard]) -> None:
+    """Each stage that ran is told of, from where it is to all of it, and nothing is printed."""
+    run, heard = surveyed
+    ran = {row["name"] for row in run.receipt["stages"] if row["state"] == "ran"}
+    assert ran <= set(heard)
+    assert all(shares == sorted(shares) and shares[-1] == 1 for shares in heard.values())
+
+
+def test_it_is_quiet(asked: dict[str, object], run: OpenedRun, capfd: pytest.CaptureFixture[str]) -> None:
+    """What is stored is read again, a run is published, and nobody hears of it."""
+    again = spectralzoom.survey(asked, out=run.archive_name)
+    assert {row["state"] for row in again.receipt["stages"]} <= {"cached", "skipped"}
+    assert again.name != run.name
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_plan_knows_what_is_stored(asked: dict[str, object], run: OpenedRun, tmp_path: Path) -> None:
+    """With the arguments of a survey that ran there is nothing to make; elsewhere there is, and nothing is written."""
+    assert spectralzoom.plan(asked, out=run.archive_name)["to_make"] == 0
+    elsewhere = spectralzoom.plan(asked, out=tmp_path / "archive")
+    assert elsewhere["to_make"] > 5
+    assert not (tmp_path / "archive").exists()
+
+
+def test_keywords_win_over_a_file(asked: dict[str, object], tmp_path: Path) -> None:
+    """A table in a keyword changes its own keys alone."""
+    (tmp_path / "survey.toml").write_text("budget = 0.3\nengine = 'plain'\n[camera]\nsamples = 320\nbits = 10\n")
+    same = {"scene": asked["scene"], "weights": asked["weights"], "out": tmp_path / "archive"}
+    with pytest.raises(spectralzoom.Error, match=r"--bits must be a whole number from 8 to 14"):
+        spectralzoom.plan(tmp_path / "survey.toml", **same, camera={"bits": 40})
+    (tmp_path / "survey.toml").write_text("[camera]\nsamples = 3\n")
+    with pytest.raises(spectralzoom.Error, match=r"'camera.samples' in .*survey.toml must be"):
+        spectralzoom.plan(tmp_path / "survey.toml", **same, camera={"bits": 12})
+
+
+def test_a_run_is_judged_when_asked(run: OpenedRun) -> None:
+    """Its scores are given, and stand in its receipt from then on."""
+    assert "accuracy" not in run.receipt
+    scores = spectralzoom.evaluate(run)
+    assert 0 <= scores["overall_accuracy"] <= 1
+    assert OpenedRun(Archive(Path(run.archive_name)), run.folder).receipt["accuracy"] == scores
+
+
+def test_weights_are_trained_and_judged(tmp_path: Path) -> None:
+    """Two steps on three frames make a file that can be judged on the one that it was not trained on."""
+    heard: set[str] = set()
+    small = {"dim": 16, "layers": 1, "heads": 2, "crop": 16, "batch": 1, "patch": 4, "factor": 2}
+    data, told = write_field(tmp_path / "field", (32, 32)), lambda stage, done, total: heard.add(stage)
+    made = spectralzoom.train(
+        data, tmp_path / "mine.safetensors", steps=2, hold_out=["003"], validation=0, **small, progress=told
+    )
+    assert made == tmp_path / "mine.safetensors"
+    quick = {"shares": [0.25], "policies": ["entropy"], "draws": 10, "timed_frames": 0, "rig": False}
+    scores = spectralzoom.evaluate(data, weights=made, **quick, progress=told)
+    assert scores["frames"] == ["003"]
+    assert {"training", "looking at scenes"} <= heard
+
+
+def test_what_cannot_be_is_one_error(make_weights: WeightsMaker, tmp_path: Path) -> None:
+    """Every mistake of a caller raises the one class that the package shows, in the words of the command line."""
+    out = tmp_path / "archive"
+    with pytest.raises(spectralzoom.Error, match="did you mean 'budget'"):
+        spectralzoom.survey(budjet=0.5, out=out)
+    with pytest.raises(spectralzoom.Error, match="is not there"):
+        spectralzoom.open(tmp_path / "nowhere")
+    with pytest.raises(spectralzoom.Error, match=r"train has no 'stepps'; it has .*steps"):
+        spectralzoom.train("farm", tmp_path / "x.safetensors", stepps=2)
+    with pytest.raises(spectralzoom.Error, match="needs weights=FILE"):
+        spectralzoom.evaluate("farm")
+    with pytest.raises(spectralzoom.Error, match="evaluate has no 'share'"):
+        spectralzoom.evaluate("farm", weights=make_weights(), share=[0.1])
+    with pytest.raises(AttributeError, match="it has Error"):
+        _ = spectralzoom.surveys
+    assert not out.exists()
+
+
+def test_a_product_that_a_run_lacks_is_named(run: OpenedRun) -> None:
+    """With those that it has."""
+    with pytest.raises(spectralzoom.Error, match=r"left no no_such; it left .*class_map"):
+        run.dataset("no_such")

@@ -1,0 +1,66 @@
+"""The scale of things: the same ground pixel and hectares in settings, pages, receipts and words."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from flows.publish.receipt_table import sentences
+from flows.settings.load import load_settings
+from flows.survey.zones import place_of_field
+from pipeline.geometry.camera import LineCamera
+from pipeline.ground.field_scale import scale_of_pixels, scale_of_view
+from pipeline.ground.view import GroundView, RigPose
+from pipeline.simulator.scenes.farm.farm_scene import PIXEL_M, farm_scene
+from tests.conftest import Survey
+
+PAGE = Path(__file__).parents[2] / "docs" / "ground.md"
+
+
+def test_the_example_of_a_pose_shows_the_farm_as_large_as_it_says() -> None:
+    """Settings' example, by height and by range, and the page of the ground see the farm's own ground pixel."""
+    shape, camera = (1024, 1280), LineCamera()
+    told = {one.name: one.metadata["json_schema_extra"]["example"] for one in fields(RigPose)}
+    common = {name: told[name] for name in ("lon_deg", "lat_deg", "heading_deg", "tilt_deg")}
+    (block,) = re.findall(r"```toml\n(\[pose\].*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    own = scale_of_pixels(shape, camera.ifov_rad, PIXEL_M)
+    for asked in (
+        {**common, "height_m": told["height_m"]},
+        {**common, "range_m": told["range_m"]},
+        tomllib.loads(block)["pose"],
+    ):
+        seen = scale_of_view(GroundView(RigPose(**asked), camera.ifov_rad), shape)
+        assert seen.pixel_m == pytest.approx(PIXEL_M, rel=0.01)
+        assert seen.hectares == pytest.approx(own.hectares, rel=0.03)
+
+
+def test_the_farm_says_how_large_it_is() -> None:
+    """Without a pose, by its own ground pixel."""
+    scene = farm_scene(1, (20, 50), bands=2)
+    scale = place_of_field(load_settings(), scene).scale(LineCamera().ifov_rad)
+    assert (scale.pixel_m, scale.hectares) == (PIXEL_M, pytest.approx(20 * 50 * PIXEL_M**2 / 1e4))
+
+
+def test_a_receipt_says_no_metres_where_nobody_knows(surveyed_png: Survey, tmp_path: Path) -> None:
+    """A picture without a place is told by its angles alone."""
+    receipt = surveyed_png(tmp_path / "archive").receipt
+    assert receipt["field"]["ground_pixel_m"] is None
+    assert receipt["field"]["size_px"] == [128, 96]
+    assert "The field is 0.775 x 0.581 degrees of the view." in sentences(receipt)
+
+
+def test_words_are_those_of_the_figures() -> None:
+    """Hectares an hour and seconds a hectare are of the same pace."""
+    field = {
+        "view_deg": [7.74, 6.2],
+        "ground_pixel_m": 0.12,
+        "range_m": {"nearest": 799.0, "median": 860.0, "farthest": 935.0},
+        "hectares": 1.887,
+        "hectares_per_hour": 1.887 / 24.5 * 3600,
+    }
+    (said,) = sentences({"field": field})
+    assert "860 m away in the middle: 1.89 ha at 12 cm a pixel, 277 ha an hour of the camera (13 s a hectare)" in said
