@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +13,12 @@ from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import UNLABELLED
+from storage.arrays.georeference import create_placed_group
 from storage.arrays.layout import (
     AngularGrid,
     create_array,
-    create_group,
     damage_named,
     grid_of,
-    grid_record,
     image_spec,
     open_group,
     read_array,
@@ -69,10 +67,8 @@ def create_class_map(
         raise ShapeError(
             f"{len(legend.names)} names and {len(legend.colours)} colours do not fit; give each class both"
         )
-    y, x = shape
-    place = {} if grid is None else grid.attributes((y, x))
     names = {"class_names": list(legend.names), "class_colours": np.asarray(legend.colours).tolist()}
-    group = create_group(path, "class map", {**place, **grid_record(grid), **names})
+    group, place = create_placed_group(path, "class map", grid, shape, names)
     about = {**class_flags(legend.names, legend.colours), **place}
     create_array(group, "classes", image_spec(("y", "x"), shape, "|u1"), about)
     create_array(group, "confidence", image_spec(("y", "x"), shape, "<f4"), {**CONFIDENCE, **place})
@@ -114,29 +110,11 @@ def check_named(classes: NDArray[np.integer], count: int) -> None:
         raise ShapeError(f"class {worst} is in the map, but only {count} classes have names")
 
 
-def clear_classes(path: Path, where: NDArray[np.bool_]) -> None:
-    """Take the class from some pixels of a stored map: 255, and a confidence of NaN.
-
-    ``where`` is (y, x), True for those pixels. Raises IncompleteStoreError where there is no map.
-    """
-    group = open_group(path)
-    array = group["classes"]
-    assert isinstance(array, zarr.Array)
-    steps = array.shards or array.shape
-    rows, columns = (range(0, size, step) for size, step in zip(array.shape, steps, strict=True))
-    for top, left in product(rows, columns):
-        place = np.s_[top : top + steps[0], left : left + steps[1]]
-        if where[place].any():
-            classes = np.where(where[place], UNLABELLED, read_array(group, "classes", place))
-            confidence = np.where(where[place], np.nan, read_array(group, "confidence", place))
-            write_class_tile(path, (top, left), classes, confidence)
-
-
 def class_flags(names: Sequence[str], colours: NDArray[np.uint8]) -> dict[str, Any]:
     """CF's flag attributes of an image of class indices."""
     return {
         "long_name": "class",
-        "_FillValue": UNLABELLED,
+        "nodata": UNLABELLED,  # no _FillValue: xarray would make fractions of the numbers
         "flag_values": list(range(len(names))),
         "flag_meanings": " ".join("_".join(name.split()) for name in names),
         "flag_colors": " ".join("#{:02x}{:02x}{:02x}".format(*colour) for colour in colours.tolist()),

@@ -6,11 +6,12 @@ and a flipped bit is an error instead of a wrong number. Codecs to choose from a
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import zarr
@@ -20,6 +21,9 @@ from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec, ZstdCodec
 from zarr.storage import MemoryStore
 
 from pipeline.errors import ChunkError, IncompleteStoreError, SettingsError, ShapeError, WavelengthError
+
+if TYPE_CHECKING:
+    from odc.geo.geobox import GeoBox
 
 CHUNK_PX = 32
 SHARD_ROWS = 64
@@ -37,11 +41,12 @@ _SPATIAL_CONVENTION = {
 
 @dataclass(frozen=True)
 class AngularGrid:
-    """Where an image's pixels lie: tangents from the undeflected direction, the scene's centre."""
+    """Where an image's pixels lie: tangents from the undeflected direction, the scene's centre; and on the earth."""
 
     ifov_rad: float
     scene_shape: tuple[int, int]  # (y, x) of the fine grid [px]
     factor: int = 1  # fine px a pixel
+    geobox: GeoBox | None = None  # of the fine grid, where the scene's file says it
 
     def attributes(self, shape: tuple[int, int]) -> dict[str, Any]:
         """GeoZarr ``spatial:`` attributes of an image of (y, x) ``shape``; the transform maps pixel corners."""
@@ -58,22 +63,17 @@ class AngularGrid:
         }
 
     def record(self) -> dict[str, Any]:
-        """What is needed to make this grid again."""
+        """What `grid_of` needs to make this grid of angles again."""
         return {"ifov_rad": self.ifov_rad, "scene_shape": list(self.scene_shape), "factor": self.factor}
 
 
 def grid_of(attributes: Mapping[str, Any]) -> AngularGrid | None:
-    """The grid that a group's attributes record, or None."""
+    """The grid of angles that a group's attributes record, or None."""
     record = attributes.get("angular_grid")
     if not isinstance(record, dict):
         return None
     y, x = record["scene_shape"]
     return AngularGrid(float(record["ifov_rad"]), (int(y), int(x)), int(record["factor"]))
-
-
-def grid_record(grid: AngularGrid | None) -> dict[str, Any]:
-    """Attributes from which :func:`grid_of` makes the grid again."""
-    return {} if grid is None else {"angular_grid": grid.record()}
 
 
 def create_group(path: Path, title: str, attributes: Mapping[str, Any]) -> zarr.Group:
@@ -116,10 +116,10 @@ def whole_shards(what: str, place: Sequence[slice], shape: Sequence[int], shards
 
 
 def create_array(group: zarr.Group, name: str, spec: ArraySpec, attributes: Mapping[str, Any]) -> zarr.Array[Any]:
-    """Add an empty array: NaN where floating, 0 or ``_FillValue`` where not; a chunk's checksum comes last."""
+    """Add an empty array: NaN where floating; ``_FillValue``, ``nodata`` or 0 where not; checksums come last."""
     kind = np.dtype(spec.dtype)
     blosc = BloscCodec(cname="zstd", clevel=3, shuffle=BloscShuffle.bitshuffle, typesize=kind.itemsize)
-    fill: Any = np.nan if kind.kind == "f" else attributes.get("_FillValue", 0)
+    fill: Any = np.nan if kind.kind == "f" else attributes.get("_FillValue", attributes.get("nodata", 0))
     return group.create_array(
         name,
         shape=spec.shape,
@@ -143,6 +143,13 @@ def write_small(
         array[...] = values
 
 
+def write_counts(group: zarr.Group, **sizes: int) -> None:
+    """Store coordinates that count along axes from 0, by the axes' names."""
+    for name, size in sizes.items():
+        about = {"long_name": f"number of the {name.replace('_', ' ')}, from 0", "units": "1"}
+        write_small(group, name, (name,), np.arange(size), about)
+
+
 def write_image(
     group: zarr.Group, name: str, dims: Sequence[str], values: NDArray[Any], attributes: Mapping[str, Any]
 ) -> None:
@@ -157,6 +164,8 @@ def write_bands(group: zarr.Group, wavelength_nm: NDArray[np.float64], fwhm_nm: 
         raise WavelengthError(f"wavelengths have shape {centre.shape}, expected (band,) with at least one band")
     about = {"standard_name": "radiation_wavelength", "long_name": "wavelength at the band's centre", "units": "nm"}
     write_small(group, "wavelength", ("band",), centre, about)
+    # the same under the axis's own name: xarray makes an index of it, so that .sel(band=660, method="nearest") works
+    write_small(group, "band", ("band",), centre, about)
     if fwhm_nm is None:
         return "wavelength"
     widths = np.asarray(fwhm_nm, np.float64)
@@ -164,6 +173,18 @@ def write_bands(group: zarr.Group, wavelength_nm: NDArray[np.float64], fwhm_nm: 
         raise ShapeError(f"fwhm has shape {widths.shape}, wavelengths {centre.shape}; give one a band")
     write_small(group, "fwhm", ("band",), widths, {"long_name": "full width at half maximum", "units": "nm"})
     return "wavelength fwhm"
+
+
+def consolidate_stores(folder: Path) -> None:
+    """Put the metadata of all arrays of each store in a folder together, so that it opens at once and without a word.
+
+    After this nothing may be written to the stores' attributes.
+    """
+    for path in sorted(folder.glob("*.zarr")):
+        if (path / "zarr.json").is_file():
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", "Consolidated metadata is currently not part")  # zarr's, of its v3
+                zarr.consolidate_metadata(path)
 
 
 def open_group(path: Path) -> zarr.Group:
