@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.collections import LineCollection
@@ -18,32 +19,58 @@ from flows.survey.memory import Prior
 from flows.terminal.figures import counted
 from pipeline.geometry.grid import UNLABELLED
 from storage.archive.keys import StageRef
-from storage.arrays.beliefs import BeliefStore
+from storage.arrays.beliefs import DAY_STEP, NEVER, BeliefStore
 from storage.arrays.class_maps import ClassMap, load_class_map
+from storage.arrays.layout import open_group, read_array
 
 CHANGED_SHARE = 0.25  # of a seat's pixels, from which it is said to have changed
 WIDTH_IN, DPI, MOST_PX = 9.0, 130, 1200
 CHANGED = "#c4262e"
 
 
-def change_pictures(prior: Prior | None, drawn: StageRef, receipt: Receipt, patch_px: int) -> list[Picture]:
-    """What changed since the run that a map goes on from, with its caption; nothing where it goes on from none.
+@dataclass(frozen=True)
+class EarlierLook:
+    """What a map that goes on from an earlier run remembers of it."""
+
+    run: str
+    days: float  # between that look and this one
+    classes: NDArray[np.uint8]  # (y, x) of that run's map, by the numbers of today's; 255 for those that today has not
+    changed: NDArray[np.float32]  # (seat_y, seat_x) shares of pixels of another class
+    age_days: NDArray[np.float32]  # (y, x) since a pixel was looked at, NaN where it never was
+
+
+def remembered(prior: Prior | None, drawn: StageRef, receipt: Receipt) -> EarlierLook | None:
+    """What is remembered, None where a map goes on from no other run or put its memory aside.
 
     ``drawn`` is the store of the class map and of what is believed.
     """
     memory = receipt.get("memory")
     if memory is None or prior is None or memory["put_aside"]:
-        return []
-    before, now = (load_class_map(path / "class_map.zarr") for path in (prior.belief.path, drawn.path))
-    names = np.full(256, UNLABELLED, np.uint8)  # classes of before by the weights' numbers of today
+        return None
+    names = np.full(256, UNLABELLED, np.uint8)
     for number, earlier in enumerate(prior.classes):
         if earlier >= 0:
             names[earlier] = number
-    changed = BeliefStore(drawn.path / "belief.zarr").changed()
+    belief = drawn.path / "belief.zarr"
+    changed = BeliefStore(belief).changed()
     assert changed is not None
-    seats = changed >= CHANGED_SHARE
-    png = draw_changes(names[before.classes], now, seats, patch_px, days_words(prior.days))
-    caption = f"What changed since {prior.run}: {counted(int(np.count_nonzero(seats)), 'place')} of another class."
+    ages = read_array(open_group(belief), "age")  # packed: all of a belief is many times as much
+    days = np.where(ages == NEVER, np.nan, ages * np.float32(DAY_STEP)).astype(np.float32)
+    before = load_class_map(prior.belief.path / "class_map.zarr").classes
+    return EarlierLook(prior.run, prior.days, names[before], changed, days)
+
+
+def change_pictures(before: EarlierLook | None, drawn: StageRef, patch_px: int) -> list[Picture]:
+    """What changed since the run that a map goes on from, with its caption; nothing where it goes on from none.
+
+    ``drawn`` is the store of the class map.
+    """
+    if before is None:
+        return []
+    now = load_class_map(drawn.path / "class_map.zarr")
+    seats = before.changed >= CHANGED_SHARE
+    png = draw_changes(before.classes, now, seats, patch_px, days_words(before.days))
+    caption = f"What changed since {before.run}: {counted(int(np.count_nonzero(seats)), 'place')} of another class."
     return [Picture(png, caption)]
 
 

@@ -122,7 +122,7 @@ def _arrange(tallness: float) -> tuple[float, list[tuple[float, list[tuple[float
 
 def _draw_raw(axes: Axes, data: QuicklookData) -> None:
     """Panel 1, first half: the sweeps as they came, next to each other, stretched to the field's shape."""
-    sweeps = [_colours(data, np.asarray(sweep)) for sweep in data.raw]
+    sweeps = [colours_of(data, np.asarray(sweep)) for sweep in data.raw]
     tall, gap = max(one.shape[0] for one in sweeps), max(1, sum(one.shape[1] for one in sweeps) // 60)
     image = np.full((tall, sum(one.shape[1] for one in sweeps) + gap * (len(sweeps) - 1), 3), 0.98, np.float32)
     left = 0
@@ -138,12 +138,12 @@ def _draw_raw(axes: Axes, data: QuicklookData) -> None:
 
 def _draw_rectified(axes: Axes, data: QuicklookData) -> None:
     _, words = choose_bands(data.wavelength_nm)
-    _show(axes, _colours(data, data.rectified))
+    _show(axes, colours_of(data, data.rectified))
     draw_scale(axes, data.class_map.shape, data.pixel_mrad)
     _caption(axes, "Rectified", words)
 
 
-def _colours(data: QuicklookData, image: NDArray[np.generic]) -> NDArray[np.float32]:
+def colours_of(data: QuicklookData, image: NDArray[np.generic]) -> NDArray[np.float32]:
     """Three bands of lines or field: true colours on one scale, others stretched band by band."""
     bands, words = choose_bands(data.wavelength_nm)
     chosen = list(bands)

@@ -13,8 +13,11 @@ from functools import cache, partial
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2.utils import htmlsafe_json_dumps
 from markupsafe import Markup
 
+from flows.publish.field_map import FieldMap, map_facts
+from flows.publish.page_parts import LEAFLET, part, policy, scripts
 from flows.publish.receipt import Accuracy, Receipt
 from flows.publish.receipt_table import control_seats, cost_rows, format_change, headline, sentences, total_words
 from flows.publish.zone_findings import plot_rows
@@ -23,11 +26,22 @@ from flows.terminal.figures import format_bytes, format_percent, format_points, 
 from pipeline.errors import visible
 
 _MARKDOWN = "\\`*_{}[]<>#|"
+MAP_SCRIPTS = (
+    f"{LEAFLET}/leaflet.js",
+    "scripts/png.js",
+    "scripts/swipe.js",
+    "scripts/spectrum.js",
+    "scripts/field_map.js",
+)
 
 
-def render_page(template: str, **facts: Any) -> str:
-    """Fill in an HTML template; every word of ``facts`` that is no `Markup` is escaped."""
-    return visible(_environment(markdown=False).get_template(template).render(facts))
+def render_page(template: str, carries: tuple[str, ...] = (), **facts: Any) -> str:
+    """Fill in an HTML template; every word of ``facts`` that is no `Markup` is escaped.
+
+    ``carries`` are the scripts that run in the page, after all of it is there; no others do.
+    """
+    own = {"policy": policy(carries), "scripts": scripts(carries)}
+    return visible(_environment(markdown=False).get_template(template).render(facts | own))
 
 
 def render_markdown(template: str, **facts: Any) -> str:
@@ -53,8 +67,25 @@ def _environment(*, markdown: bool) -> Environment:
         "points": format_points,
         "seconds": format_seconds,
         "json": partial(json.dumps, ensure_ascii=False),
+        "data": _data,
     }
+    found.globals["part"] = lambda name: Markup(part(name))
     return found
+
+
+def _data(content: object) -> Markup:
+    """Content for the scripts of a page, as JSON in which nothing ends a tag; its words are `visible` ones."""
+    return htmlsafe_json_dumps(_visible_words(content), separators=(",", ":"))
+
+
+def _visible_words(content: Any) -> Any:
+    if isinstance(content, str):
+        return visible(content)
+    if isinstance(content, Mapping):
+        return {visible(name): _visible_words(item) for name, item in content.items()}
+    if isinstance(content, list) and not (content and isinstance(content[0], int | float)):
+        return [_visible_words(item) for item in content]
+    return content
 
 
 def _plain(value: object) -> object:
@@ -73,11 +104,17 @@ class Picture:
 
 
 def render_report(
-    receipt: Receipt, quicklook_png: bytes, pictures: Iterable[Picture] = (), *, looked_twice: float | None = None
+    receipt: Receipt,
+    quicklook_png: bytes,
+    pictures: Iterable[Picture] = (),
+    *,
+    looked_twice: float | None = None,
+    field: FieldMap | None = None,
 ) -> str:
-    """The page as text, ``pictures`` below the quicklook; the same receipt and pictures give the same bytes.
+    """The page as text, ``pictures`` below the quicklook; the same receipt, pictures and map give the same bytes.
 
     ``looked_twice`` is the share of the field captured in detail, 0..1, for the first sentence; None leaves it out.
+    ``field`` is the map to move in, above all pictures; None leaves it out, with all scripts.
     """
     shown = [Picture(quicklook_png, "The survey at a glance."), *pictures]
     split: Mapping[str, Any] = receipt["savings"]["multiply_adds"]
@@ -85,11 +122,14 @@ def render_report(
     total = receipt.get("effects_total")  # receipts of before have none
     return render_page(
         "report.html",
+        () if field is None else MAP_SCRIPTS,
         kicker="SpectralZoom survey",
         title=receipt["survey"],
         lead=headline(receipt, looked_twice),
         about=f"{receipt['scene']} seen by {receipt['source']}, seed {receipt['seed']}, finished {receipt['finished']}",
         receipt=receipt,
+        field=None if field is None else map_facts(field),
+        leaflet=LEAFLET,
         pictures=[{"data": base64.b64encode(one.png).decode("ascii"), "caption": one.caption} for one in shown],
         costs=cost_rows(receipt["savings"]),
         shares={name: split[name] / split["done"] for name in parts},

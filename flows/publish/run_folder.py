@@ -16,12 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.archive.field_figures import field_figures
-from flows.publish.change_picture import change_pictures
+from flows.publish.change_picture import change_pictures, remembered
 from flows.publish.ground_findings import placed_findings, posed_findings
 from flows.publish.panels import draw_ground
 from flows.publish.quicklook import QuicklookData, draw_quicklook
 from flows.publish.receipt import AccuracyIs, Header, Receipt, build_receipt, check_receipt, with_accuracy
 from flows.publish.report import Picture, render_report
+from flows.publish.run_layers import block_of, field_map, read_coarse
 from flows.publish.zone_findings import PLOTS_FILE, find_zones, plots_csv
 from flows.settings.load import anchor_paths
 from flows.survey.extent import work_done, work_of_map
@@ -36,7 +37,6 @@ from flows.survey.stages.placement import SEATS_AT_ONCE, line_facts, load_regist
 from flows.survey.survey import STAGES, Products, StageRunner
 from pipeline.errors import IncompleteStoreError
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.geometry.scan import Sweep
 from pipeline.planning.coverage import on_scene
 from pipeline.planning.fine_pass import FinePlan
 from pipeline.planning.plain_scans import scan_words
@@ -48,7 +48,7 @@ from storage.archive.run_folders import RunDraft
 from storage.archive.whole_files import to_json
 from storage.arrays.class_maps import load_class_map
 from storage.arrays.cubes import RawCube
-from storage.arrays.ground_maps import load_ground_map, open_image
+from storage.arrays.ground_maps import load_ground_map
 from storage.arrays.mosaics import load_attention, open_patches
 from storage.arrays.quicklooks import choose_bands
 
@@ -104,15 +104,19 @@ def load_receipt(folder: Path) -> Receipt:
 def _publish(run: SurveyRun, draft: RunDraft, products: Products, plan: FinePlan, receipt: Receipt) -> Published:
     seats = len(run.grid.valid_seats())
     looked_twice = None if run.plan.plain else float(seen_shares(run, products.of("cut_patches")).sum()) / seats
-    draw_quicklook(draft.folder / "quicklook.png", quicklook_data(run, products, plan, receipt))
+    coarse = read_coarse(run, products)
+    glance = quicklook_data(run, products, plan, receipt, coarse.colours)
+    draw_quicklook(draft.folder / "quicklook.png", glance)
     draft.write_file("receipt.json", to_json(receipt))
     if "plots" in receipt:
         draft.write_file(PLOTS_FILE, plots_csv(receipt["plots"]))
     picture = (draft.folder / "quicklook.png").read_bytes()
     maps = (load_ground_map(ref.path / STORE) for ref in products.there(["ground"]))
     pictures = [Picture(draw_ground(drawn), "The map on the ground, north up.") for drawn in maps]
-    pictures += change_pictures(run.prior, products.of("draw_map"), receipt, run.grid.patch)
-    page = render_report(receipt, picture, pictures, looked_twice=looked_twice)
+    before = remembered(run.prior, products.of("draw_map"), receipt)
+    pictures += change_pictures(before, products.of("draw_map"), run.grid.patch)
+    field = field_map(run, products, plan, glance, coarse.spectra, before)
+    page = render_report(receipt, picture, pictures, looked_twice=looked_twice, field=field)
     (draft.folder / "report.html").write_text(page, encoding="utf-8")
     rests_on = run.archive.manifest_hashes(products.there(products))
     folder = draft.publish(survey=receipt["survey"], settings=receipt["settings"], rests_on=rests_on)
@@ -180,8 +184,10 @@ def _savings(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, An
     }
 
 
-def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: Receipt) -> QuicklookData:
-    """Gather what the four panels show, three bands of it."""
+def quicklook_data(
+    run: SurveyRun, products: Products, plan: FinePlan, receipt: Receipt, coarse: NDArray[np.float32]
+) -> QuicklookData:
+    """Gather what the four panels show, three bands of it; ``coarse`` are those of the mosaic, (y, x, 3)."""
     bands, _ = choose_bands(run.scene.wavelength_nm)
     chosen = list(bands)
     attention = load_attention(products.of("attend").path / "attention.zarr")
@@ -200,7 +206,7 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
         policy=None if run.plan.plain else run.settings.policy,
         raw=tuple(_calibrated(run, cube, chosen) for cube in strips),
         raw_lines=sum(cube.sweep.lines for cube in strips),
-        rectified=_both_scales(run, products, chosen),
+        rectified=_both_scales(run, products, chosen, coarse),
         wavelength_nm=run.scene.wavelength_nm[chosen],
         score=attention.score,
         patch_px=run.grid.patch,
@@ -238,10 +244,10 @@ def _calibrated(run: SurveyRun, cube: RawCube, bands: list[int]) -> NDArray[np.f
     return values
 
 
-def _both_scales(run: SurveyRun, products: Products, bands: list[int]) -> NDArray[np.float32]:
+def _both_scales(
+    run: SurveyRun, products: Products, bands: list[int], coarse: NDArray[np.float32]
+) -> NDArray[np.float32]:
     """The coarse mosaic at the scene's size with the fine patches laid in, (y, x, 3)."""
-    rows = open_image(products.of("rectify").path / "mosaic.zarr", "values").rows()
-    coarse = np.concatenate([values[..., bands] for _, values in rows])  # never all bands of all rows at once
     s, p = run.grid.factor, run.grid.patch
     canvas = np.repeat(np.repeat(coarse, s, axis=0), s, axis=1)[: run.grid.height, : run.grid.width].copy()
     store = open_patches(products.of("cut_patches").path / "patches.zarr")
@@ -251,16 +257,6 @@ def _both_scales(run: SurveyRun, products: Products, bands: list[int]) -> NDArra
             place = canvas[y : y + p, x : x + p]
             place[...] = patch[: place.shape[0], : place.shape[1]]
     return canvas
-
-
-def block_of(sweep: Sweep, run: SurveyRun) -> tuple[int, int, int, int]:
-    """Rows and columns (y0, y1, x0, x1) that a fine sweep's line centres and samples span, cut to the scene."""
-    size = (run.grid.width, run.grid.height) if sweep.along == "x" else (run.grid.height, run.grid.width)
-    across = np.array([-0.5, 0.5]) * run.camera.samples + sweep.strip_px + size[0] / 2
-    scan = np.array([0, sweep.lines]) + sweep.start_px + size[1] / 2 - 0.5
-    x0, x1 = np.clip(np.rint(across), 0, size[0]).astype(int).tolist()
-    y0, y1 = np.clip(np.rint(scan), 0, size[1]).astype(int).tolist()
-    return (y0, y1, x0, x1) if sweep.along == "x" else (x0, x1, y0, y1)
 
 
 def scans_told(run: SurveyRun, seconds: float) -> dict[str, Any]:

@@ -17,10 +17,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import Formatter, FuncFormatter, MaxNLocator, StrMethodFormatter
 from numpy.typing import NDArray
 
+from pipeline.errors import visible
+
 COLOURS = ("#2f7d4f", "#c2571a", "#3465a4", "#8e6bb0", "#b58900", "#5b8a8a", "#a04050", "#777777")  # told apart by most
 MOST_DOTS = 500  # of a series; longer ones are a line alone
 _STYLE: Any = {"svg.fonttype": "none", "font.family": "DejaVu Sans", "font.size": 11, "timezone": "UTC"}
-_SIZE_IN, _AXES = (760 / 72, 220 / 72), (0.09, 0.13, 0.89, 0.81)  # the page scales it; left, bottom, width, height of 1
+# the page scales it; left, bottom, width, height of 1
+_SIZE_IN, _AXES = (760 / 72, 220 / 72), (0.09, 0.13, 0.89, 0.81)
+_SMALL_IN, _SMALL_AXES = (360 / 72, 150 / 72), (0.17, 0.18, 0.78, 0.74)
 _MOST = 1e100  # that can be drawn; receipts may claim anything
 _DAYS = (-719_160.0, 2_932_890.0)  # since 1970, of years 1 to 9999: what dates can be written of
 
@@ -37,9 +41,18 @@ class Chart:
 
 
 def line_chart(
-    series: Mapping[str, Points], title: str, unit: str = "", colours: Mapping[str, str] | None = None
+    series: Mapping[str, Points],
+    title: str,
+    unit: str = "",
+    colours: Mapping[str, str] | None = None,
+    *,
+    small: bool = False,
+    span: tuple[float, float] | None = None,
 ) -> Chart:
-    """Draw series from 0 up, "%" as shares; same points, same bytes. ``colours`` by name, others in turn."""
+    """Draw series from 0 up, "%" as shares; same points, same bytes. ``colours`` by name, others in turn.
+
+    A ``small`` chart stands beside others; ``span`` are the moments from which and to which their dates go together.
+    """
     legend = {name: COLOURS[number % len(COLOURS)] for number, name in enumerate(series)}
     legend |= {name: colour for name, colour in (colours or {}).items() if name in series}
     lines = {name: np.array(sorted(points)).reshape(-1, 2) for name, points in series.items()}
@@ -47,24 +60,25 @@ def line_chart(
     every = np.concatenate([np.empty((0, 2)), *lines.values()])
     if not len(every):
         return Chart(title, legend, None)
-    with mpl.rc_context({**_STYLE, "svg.hashsalt": title}):
-        figure = Figure(figsize=_SIZE_IN)
+    with mpl.rc_context({**_STYLE, "svg.hashsalt": visible(title)}):
+        figure = Figure(figsize=_SMALL_IN if small else _SIZE_IN)
         FigureCanvasSVG(figure)
-        axes = figure.add_axes(_AXES, frameon=False)
+        axes = figure.add_axes(_SMALL_AXES if small else _AXES, frameon=False)
         for name, line in lines.items():
             dots = "o" if len(line) <= MOST_DOTS else "none"
             axes.plot(_days(line), line[:, 1], marker=dots, ms=5, lw=1.8, color=legend[name], clip_on=False)
-        first, last, most = _days(every).min(), _days(every).max(), every[:, 1].max()
+        ends = every if span is None else np.array([(moment, 0.0) for moment in span])
+        first, last, most = _days(ends).min(), _days(ends).max(), every[:, 1].max()
         around = 2.0 if first == last else 0.0
         axes.set(xlim=(first - around, last + around), ylim=(0, most if most > 1e-9 else 1))
-        locator = AutoDateLocator(minticks=3, maxticks=7)  # type: ignore[no-untyped-call]
+        locator = AutoDateLocator(minticks=2, maxticks=4 if small else 7)  # type: ignore[no-untyped-call]
         dates = AutoDateFormatter(locator)  # type: ignore[no-untyped-call]
         dates.scaled |= dict.fromkeys((1 / 24, 1 / 1440), "%m-%d %H:%M")
         axes.xaxis.set(major_locator=locator, major_formatter=dates)
         values: Formatter = StrMethodFormatter(f"{{x:.3g}} {unit}".strip())
         if unit == "%":
             values = FuncFormatter(lambda share, place: f"{100 * share:.3g} %")
-        axes.yaxis.set(major_locator=MaxNLocator(4, steps=[1, 2, 2.5, 5, 10]), major_formatter=values)
+        axes.yaxis.set(major_locator=MaxNLocator(3 if small else 4, steps=[1, 2, 2.5, 5, 10]), major_formatter=values)
         axes.grid(axis="y", color="#88888855", clip_on=False)
         axes.tick_params(length=0, pad=8)
         figure.patch.set_visible(False)

@@ -17,7 +17,8 @@ from flows.cli.app import ArchiveName, AsJson, OutFile, check_outside, stderr
 from flows.publish.receipt import areas_on_ground
 from flows.publish.report import render_page
 from flows.schedule.date_charts import Chart, line_chart
-from flows.schedule.field_schedule import ENDINGS, read_moment
+from flows.schedule.field_schedule import ENDINGS, moment_words, read_moment
+from flows.schedule.look_dates import look_of
 from flows.schedule.visit_pictures import VisitPicture, visit_pictures
 from flows.survey.scores import score_of
 from flows.terminal.figures import DASH, LEAST_HECTARES, area_words, counted, format_percent, known_number
@@ -82,10 +83,16 @@ def _history(archive: Archive, catalogue: Catalogue, name: str, ledger: Ledger |
     by_run = {line["run"]: line for line in events if isinstance(line.get("run"), str)}
     own = [run for run in catalogue.runs if run.uri in by_run or called(run) == name]
     rows = [_row(archive, catalogue, run, by_run.get(run.uri, {})) for run in own]
-    looked = [
-        (run, _short(str(row["visit"] or row["due"] or row["created"]))) for run, row in zip(own, rows, strict=True)
-    ]
-    return FieldHistory(name, archive.name, rows, events, visit_pictures(archive, looked))
+    found = sorted(zip(own, rows, strict=True), key=lambda one: day_of(one[1]) or 0.0)
+    looked = [(run, _called(row)) for run, row in found]
+    return FieldHistory(name, archive.name, [row for _, row in found], events, visit_pictures(archive, looked))
+
+
+def _called(row: Mapping[str, Any]) -> str:
+    """What a visit is called, and when it was where its name does not say so."""
+    when = _short(str(row["looked"] or row["created"]))
+    visit = str(row["visit"] or "")
+    return when if not visit or read_moment(visit) is not None else f"{visit}, {when}"
 
 
 def _row(archive: Archive, catalogue: Catalogue, run: Run, line: Mapping[str, Any]) -> dict[str, Any]:
@@ -103,6 +110,7 @@ def _row(archive: Archive, catalogue: Catalogue, run: Run, line: Mapping[str, An
         "created": run.created,
         "due": line.get("due"),
         "visit": run.settings.get("visit"),
+        "looked": None if (at := look_of(run, line.get("due"))) is None else moment_words(at),
         "attempts": line.get("attempts"),
         "capture_seconds": _seconds(savings),
         **score_of(receipt),
@@ -143,12 +151,13 @@ def _covered(archive: Archive, catalogue: Catalogue, run: Run) -> tuple[dict[str
 
 
 def day_of(row: Mapping[str, Any]) -> float | None:
-    """When a row's run looked, was due or else published, in seconds since 1970; None where that is not known."""
-    moment = next((at for name in ("visit", "due", "created") if (at := read_moment(row.get(name))) is not None), None)
+    """When a row's run looked or else was published, in seconds since 1970; None where that is not known."""
+    moment = next((at for name in ("looked", "created") if (at := read_moment(row.get(name))) is not None), None)
     return None if moment is None else moment.timestamp()
 
 
 MOST_ROWS = 1000  # of each table; older ones are counted
+PLAYER_SCRIPTS = ("scripts/swipe.js", "scripts/player.js")
 SAVINGS = {"capture_s": "time at the camera", "lines": "lines", "bytes_stored": "stored data", "multiply_adds": "model"}
 SCORES = {"miou": "mIoU", "overall_accuracy": "overall"}
 Rows = Sequence[Mapping[str, Any]]
@@ -195,6 +204,7 @@ def render_history(history: FieldHistory, runs_at: str) -> str:
     troubles = [event for event in history.events if event["event"] != "done"]
     return render_page(
         "history.html",
+        PLAYER_SCRIPTS if history.visits else (),
         kicker="SpectralZoom field",
         title=history.field,
         lead=f"{counted(len(history.runs), 'run')} in the archive. Of what was due on schedule: {counts}.",
@@ -233,21 +243,37 @@ def render_index(histories: Sequence[FieldHistory], archive: str, pages: Mapping
     )
 
 
-def _areas(runs: Rows) -> list[Chart]:
+@dataclass(frozen=True)
+class ClassCharts:
+    """Charts of the classes' areas, one each with a scale of its own: a class of few pixels is seen too."""
+
+    title: str
+    charts: Sequence[Chart]
+
+
+def _areas(runs: Rows) -> list[ClassCharts]:
     """Areas on the ground in hectares, small ones in square metres; else shares of the map. Colours are the map's."""
     colours = {name.replace("_", " "): rgb for row in runs for name, rgb in row["colours"].items()}
-    charts = []
+    found = []
     for unit in sorted({str(row["unit"]) for row in runs if row["areas"]}):
         series = _by_class(runs, unit)
         most = max((value for points in series.values() for _, value in points), default=1.0)
-        if unit == "share":
-            charts.append(line_chart(series, "Share of the map of each class", "%", colours))
-        elif most >= LEAST_HECTARES:
-            charts.append(line_chart(series, "Hectares of each class", "ha", colours))
-        else:
-            small = {name: [(moment, value * 1e4) for moment, value in points] for name, points in series.items()}
-            charts.append(line_chart(small, "Square metres of each class", "m²", colours))
-    return charts
+        title, shown, times = "Share of the map of each class", "%", 1.0
+        if unit != "share":
+            small = most < LEAST_HECTARES
+            title, shown, times = (
+                ("Square metres of each class", "m²", 1e4) if small else ("Hectares of each class", "ha", 1.0)
+            )
+        moments = [moment for points in series.values() for moment, _ in points]
+        span = (min(moments, default=0.0), max(moments, default=0.0))
+        charts = [
+            line_chart(
+                {name: [(at, times * value) for at, value in points]}, name, shown, colours, small=True, span=span
+            )
+            for name, points in series.items()
+        ]
+        found.append(ClassCharts(title, charts))
+    return found
 
 
 def _by_class(runs: Rows, unit: str) -> dict[str, list[tuple[float, float]]]:
@@ -301,6 +327,7 @@ def _run(row: Mapping[str, Any], runs_at: str) -> dict[str, Any]:
     again = f" (attempt {row['attempts']})" if (row["attempts"] or 1) > 1 else ""
     name = quote(str(row["run"]).removeprefix("runs/"), errors="surrogateescape")
     return {
+        "looked": _short(str(row.get("looked") or "")) or DASH,
         "published": _short(str(row["created"])),
         "report": f"{runs_at}/runs/{name}/report.html" if runs_at else "",
         "due": (_short(str(row["due"] or "")) or DASH) + again,

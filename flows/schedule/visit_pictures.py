@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import io
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -11,10 +9,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from flows.publish.change_picture import CHANGED_SHARE
-from flows.publish.panels import class_palette, class_rgb
+from flows.publish.page_pictures import in_base64, indexed_png
+from flows.publish.panels import UNLABELLED_COLOUR, class_palette
 from flows.publish.receipt_table import days_words
 from flows.terminal.figures import format_percent, format_points, format_seconds, known_number
 from storage.archive.archive import Archive
@@ -23,17 +21,18 @@ from storage.arrays.beliefs import BeliefStore
 from storage.arrays.class_maps import ClassMap, load_class_map
 
 MOST_VISITS = 60  # that a page plays: the newest
-MOST_PX = 360  # of a picture's longer side
+MOST_PX = 400  # of a picture's longer side
 PALE = 0.8  # of what did not change
-GAP_PX = 6
+MOST_CLASSES = 128  # that are told apart, the last of them standing for none
 
 
 @dataclass(frozen=True)
 class VisitPicture:
-    """One visit: when, its picture as PNG in base64, and what is said of it."""
+    """One visit: when, its map and what changed of it as PNG in base64, and what is said of it."""
 
     when: str
-    png: str
+    map: str
+    changes: str  # all else pale; empty of a first look
     words: str
 
 
@@ -46,7 +45,7 @@ def visit_pictures(archive: Archive, runs: Sequence[tuple[Run, str]]) -> list[Vi
             with suppress(OSError, LookupError, ValueError):
                 shown = load_class_map(archive.locate(address))
                 changed = _changed_pixels(archive, run, shown.classes.shape)
-                found.append(VisitPicture(when, _drawn(shown, changed), _words(run.receipt)))
+                found.append(VisitPicture(when, *_drawn(shown, changed), _words(run.receipt)))
     return found
 
 
@@ -61,18 +60,19 @@ def _changed_pixels(archive: Archive, run: Run, shape: tuple[int, ...]) -> NDArr
     return seats.repeat(store.patch_px, axis=0).repeat(store.patch_px, axis=1)[: shape[0], : shape[1]]
 
 
-def _drawn(shown: ClassMap, changed: NDArray[np.bool_] | None) -> str:
-    """The map beside what changed of it, all else pale."""
+def _drawn(shown: ClassMap, changed: NDArray[np.bool_] | None) -> tuple[str, str]:
+    """The map, and what changed of it among pale colours."""
     thin = -(-max(shown.classes.shape) // MOST_PX)
-    colours = class_rgb(shown.classes[::thin, ::thin], class_palette(len(shown.names), shown.colours))
-    picture = colours
-    if changed is not None:
-        fine = changed[::thin, ::thin]
-        changes = np.where(fine[..., None], colours, PALE + (1 - PALE) * colours)
-        picture = np.concatenate([colours, np.ones((len(colours), GAP_PX, 3)), changes], axis=1)
-    buffer = io.BytesIO()
-    Image.fromarray(np.rint(255 * picture).astype(np.uint8)).quantize(64).save(buffer, "PNG", optimize=True)
-    return base64.b64encode(buffer.getvalue()).decode("ascii")
+    palette = np.tile(np.asarray(UNLABELLED_COLOUR, np.float32), (MOST_CLASSES, 1))
+    known = class_palette(len(shown.names), shown.colours)[: MOST_CLASSES - 1]
+    palette[: len(known)] = known
+    table = np.rint(255 * np.concatenate([palette, PALE + (1 - PALE) * palette])).astype(np.uint8)
+    numbers = np.minimum(shown.classes[::thin, ::thin], MOST_CLASSES - 1)
+    drawn = in_base64(indexed_png(numbers, table))
+    if changed is None:
+        return drawn, ""
+    pale = np.where(changed[::thin, ::thin], 0, MOST_CLASSES).astype(np.uint8)
+    return drawn, in_base64(indexed_png(numbers + pale, table))
 
 
 def _words(receipt: Mapping[str, Any]) -> str:

@@ -71,13 +71,14 @@ class Page(HTMLParser):
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         """Remember addresses; tags without an end are not open, frames and scripts of elsewhere are none of ours."""
         assert tag not in ("link", "iframe")
-        assert tag != "script" or not attrs
+        data = tag == "script" and ("type", "application/json") in attrs  # which does not run
+        assert tag != "script" or data or not attrs
         found = [str(value) for name, value in attrs if name in ("src", "href", "srcset", "action", "xlink:href")]
         if tag == "a":
             self.links += found
         self.loaded += [one for one in found if tag != "a" and not one.startswith("#")]  # but for parts of the page
         if tag not in ("meta", "img", "input"):
-            self.open.append(tag)
+            self.open.append("data" if data else tag)
 
     def handle_data(self, data: str) -> None:
         """Keep what runs."""
@@ -92,7 +93,7 @@ class Page(HTMLParser):
 
     def handle_endtag(self, tag: str) -> None:
         """The innermost open tag closes."""
-        assert self.open.pop() == tag
+        assert self.open.pop() in (tag, "data" if tag == "script" else tag)
 
 
 def turned(scene: Path, to: Path) -> Path:

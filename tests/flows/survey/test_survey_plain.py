@@ -33,7 +33,7 @@ from storage.archive.archive import Archive
 from storage.arrays.class_maps import ClassMap, load_class_map
 from storage.remote.opening import verify_archive
 from tests.conftest import CLASSES, RGB_NM, patchy_scene, random_weights
-from tests.flows.conftest import FEW_BANDS
+from tests.flows.conftest import FEW_BANDS, Page
 from tests.remembered_work import with_effects
 
 STAGES = [
@@ -252,7 +252,9 @@ def test_products_are_where_the_receipt_says_and_open_from_disk(farm: Done) -> N
     assert (farm.published.folder / "receipt.json").read_text().startswith('{\n  "survey": "farm"')
     folder = farm.archive / farm.receipt["products"]["report.html"]
     html = folder.read_text(encoding="utf-8")
-    assert not re.search(r"https?://|src=['\"]//|@import", html)
+    page = Page(html)
+    assert all(one.startswith("data:image/") for one in page.loaded)
+    assert not re.search(r"https?://|src=['\"]//|@import|url\(", html.partition("<script>")[0])
     assert "data:image/png;base64," in html
     with Image.open(farm.archive / farm.receipt["products"]["quicklook.png"]) as image:
         assert image.format == "PNG"
