@@ -20,7 +20,8 @@ from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.archive.records import RECEIPT, read_run
 from storage.arrays.class_maps import ClassNames
-from storage.arrays.ground_maps import StoredImage, load_geobox, open_image
+from storage.arrays.georeference import load_geobox
+from storage.arrays.ground_maps import StoredImage, open_image
 from storage.arrays.layout import grid_of
 from storage.export.image_files import ANGULAR, CogImage, Place
 from storage.export.stac_items import classes

@@ -158,7 +158,7 @@ class SurveyRun(CaptureRun):
 
     def angular_grid(self, factor: int = 1) -> AngularGrid:
         """Where pixels of ``factor`` fine px lie."""
-        return AngularGrid(self.camera.ifov_rad, self.scene.shape, factor)
+        return AngularGrid(self.camera.ifov_rad, self.scene.shape, factor, self.scene.geobox)
 
 
 def open_run(settings: Settings, *, planning: bool = False, archive: Archive | None = None) -> SurveyRun:

@@ -15,13 +15,12 @@ from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
 from storage.arrays.class_maps import ClassNames, legend_of
+from storage.arrays.georeference import create_placed_group
 from storage.arrays.layout import (
     SHARD_ROWS,
     AngularGrid,
     create_array,
-    create_group,
     damage_named,
-    grid_record,
     image_spec,
     open_group,
     read_array,
@@ -37,9 +36,8 @@ Floats = NDArray[np.float32]
 
 def create_belief(path: Path, shape: tuple[int, int], legend: ClassNames, *, grid: AngularGrid | None = None) -> None:
     """Begin a store for a field of (y, x) ``shape`` of which nothing is known yet."""
-    place = {} if grid is None else grid.attributes(shape)
     names = {"class_names": list(legend.names), "class_colours": np.asarray(legend.colours).tolist()}
-    group = create_group(path, "belief", {**place, **grid_record(grid), **names})
+    group, place = create_placed_group(path, "belief", grid, shape, names)
     about: dict[str, Any] = {
         "long_name": "natural logarithm of the probability of each class",
         "units": "1",

@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import UNLABELLED
+from storage.arrays.georeference import create_placed_group
 from storage.arrays.layout import (
     AngularGrid,
     create_array,
-    create_group,
     damage_named,
     grid_of,
-    grid_record,
     image_spec,
     open_group,
     read_array,
@@ -69,10 +68,8 @@ def create_class_map(
         raise ShapeError(
             f"{len(legend.names)} names and {len(legend.colours)} colours do not fit; give each class both"
         )
-    y, x = shape
-    place = {} if grid is None else grid.attributes((y, x))
     names = {"class_names": list(legend.names), "class_colours": np.asarray(legend.colours).tolist()}
-    group = create_group(path, "class map", {**place, **grid_record(grid), **names})
+    group, place = create_placed_group(path, "class map", grid, shape, names)
     about = {**class_flags(legend.names, legend.colours), **place}
     create_array(group, "classes", image_spec(("y", "x"), shape, "|u1"), about)
     create_array(group, "confidence", image_spec(("y", "x"), shape, "<f4"), {**CONFIDENCE, **place})

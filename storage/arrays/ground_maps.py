@@ -1,7 +1,6 @@
-"""Images on the ground: where they lie on the earth, and maps of classes there with a picture and each class's area.
+"""Images on the ground: maps of classes there with a picture and each class's area, and any stored image by its rows.
 
-The place is said by CF's grid mapping and coordinates and by GeoZarr's attributes; images too large for the memory are
-read some rows at a time.
+Images too large for the memory are read some rows at a time.
 """
 
 from __future__ import annotations
@@ -15,9 +14,9 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from pipeline.errors import IncompleteStoreError, PoseError, ShapeError
-from pipeline.lazy import deferred
+from pipeline.errors import IncompleteStoreError, ShapeError
 from storage.arrays.class_maps import CONFIDENCE, ClassNames, check_named, class_flags, legend_of
+from storage.arrays.georeference import GRID_MAPPING, ON_THE_MAP, load_geobox, map_attributes, write_map_coordinates
 from storage.arrays.layout import (
     SHARD_COLUMNS,
     SHARD_ROWS,
@@ -29,91 +28,13 @@ from storage.arrays.layout import (
     read_array,
     read_bands,
     whole_shards,
-    write_small,
 )
 
 if TYPE_CHECKING:
-    import odc.geo.xr as odc_geo_xr
-    from odc.geo.crs import CRS
     from odc.geo.geobox import GeoBox
-else:
-    odc_geo_xr = deferred("odc.geo.xr")
 
 BLOCK = (4 * SHARD_ROWS, 2 * SHARD_COLUMNS)  # (y, x) px to write at a time: whole shards
 M2_PER_HECTARE = 10_000.0
-GRID_MAPPING = "spatial_ref"
-# on every image: CF's link to the grid mapping, and the same as a coordinate, so that plain xarray takes it for one
-ON_THE_MAP = {"grid_mapping": GRID_MAPPING, "coordinates": GRID_MAPPING}
-_CONVENTIONS = [
-    {
-        "uuid": uuid,
-        "name": name,
-        "schema_url": f"https://raw.githubusercontent.com/zarr-conventions/{name}/refs/tags/v0.1/schema.json",
-        "spec_url": f"https://github.com/zarr-conventions/{name}/blob/v0.1/README.md",
-        "description": description,
-    }
-    for uuid, name, description in (
-        ("f17cb550-5864-4468-aeb7-f3180cfb622f", "proj", "Coordinate reference system of the map"),
-        ("689b58e2-cf7b-45e0-9fff-9cfc0883d6b4", "spatial", "Relation of array indices to the map's coordinates"),
-    )
-]
-
-
-def map_attributes(geobox: GeoBox) -> dict[str, Any]:
-    """GeoZarr ``proj:`` and ``spatial:`` attributes of a map; the transform maps pixel corners.
-
-    Raises PoseError: the grid has no CRS, or does not lie along its axes.
-    """
-    crs = _crs_of(geobox)
-    code = {} if crs.epsg is None else {"proj:code": f"EPSG:{crs.epsg}"}
-    return {
-        **code,
-        "proj:wkt2": crs.to_wkt(),
-        "spatial:dimensions": ["y", "x"],
-        "spatial:shape": list(geobox.shape),
-        "spatial:transform_type": "affine",
-        "spatial:transform": [float(number) for number in geobox.affine[:6]],
-        "spatial:bbox": [float(number) for number in geobox.boundingbox.bbox],
-        "spatial:registration": "pixel",
-        "zarr_conventions": _CONVENTIONS,
-    }
-
-
-def write_map_coordinates(group: zarr.Group, geobox: GeoBox) -> None:
-    """Store ``x``, ``y`` and the grid mapping ``spatial_ref`` of a map, as CF wants them."""
-    for name in ("x", "y"):
-        about = {
-            "standard_name": f"projection_{name}_coordinate",
-            "long_name": f"{name} of the pixel's centre on the map",
-            "units": "m",
-            "axis": name.upper(),
-        }
-        write_small(group, name, (name,), np.asarray(geobox.coordinates[name].values, np.float64), about)
-    mapping = odc_geo_xr.xr_crs_coord(_crs_of(geobox), transform=geobox.transform)
-    write_small(group, GRID_MAPPING, (), np.asarray(mapping.values, np.int32), dict(mapping.attrs))
-
-
-def _crs_of(geobox: GeoBox) -> CRS:
-    if geobox.crs is None or not geobox.axis_aligned:
-        raise PoseError(f"a map needs a CRS and a grid along its axes, got {geobox!r}")
-    return geobox.crs
-
-
-def load_geobox(path: Path) -> GeoBox | None:
-    """Read the grid of a stored map; None where the store lies on an angular grid.
-
-    Raises IncompleteStoreError: the store is missing, or what says its grid is damaged.
-    """
-    if GRID_MAPPING not in open_group(path):
-        return None
-    import odc.geo.xr  # noqa: F401 - registers the accessor
-    import xarray as xr
-
-    with damage_named(f"the grid of {path}"), xr.open_zarr(path, consolidated=False) as content:
-        geobox: GeoBox | None = content.odc.geobox
-        if geobox is None or geobox.crs is None:
-            raise KeyError(f"{GRID_MAPPING}, x and y give none")
-    return geobox
 
 
 @dataclass(frozen=True)

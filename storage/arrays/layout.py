@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import zarr
@@ -20,6 +20,9 @@ from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec, ZstdCodec
 from zarr.storage import MemoryStore
 
 from pipeline.errors import ChunkError, IncompleteStoreError, SettingsError, ShapeError, WavelengthError
+
+if TYPE_CHECKING:
+    from odc.geo.geobox import GeoBox
 
 CHUNK_PX = 32
 SHARD_ROWS = 64
@@ -37,11 +40,12 @@ _SPATIAL_CONVENTION = {
 
 @dataclass(frozen=True)
 class AngularGrid:
-    """Where an image's pixels lie: tangents from the undeflected direction, the scene's centre."""
+    """Where an image's pixels lie: tangents from the undeflected direction, the scene's centre; and on the earth."""
 
     ifov_rad: float
     scene_shape: tuple[int, int]  # (y, x) of the fine grid [px]
     factor: int = 1  # fine px a pixel
+    geobox: GeoBox | None = None  # of the fine grid, where the scene's file says it
 
     def attributes(self, shape: tuple[int, int]) -> dict[str, Any]:
         """GeoZarr ``spatial:`` attributes of an image of (y, x) ``shape``; the transform maps pixel corners."""
@@ -58,22 +62,17 @@ class AngularGrid:
         }
 
     def record(self) -> dict[str, Any]:
-        """What is needed to make this grid again."""
+        """What `grid_of` needs to make this grid of angles again."""
         return {"ifov_rad": self.ifov_rad, "scene_shape": list(self.scene_shape), "factor": self.factor}
 
 
 def grid_of(attributes: Mapping[str, Any]) -> AngularGrid | None:
-    """The grid that a group's attributes record, or None."""
+    """The grid of angles that a group's attributes record, or None."""
     record = attributes.get("angular_grid")
     if not isinstance(record, dict):
         return None
     y, x = record["scene_shape"]
     return AngularGrid(float(record["ifov_rad"]), (int(y), int(x)), int(record["factor"]))
-
-
-def grid_record(grid: AngularGrid | None) -> dict[str, Any]:
-    """Attributes from which :func:`grid_of` makes the grid again."""
-    return {} if grid is None else {"angular_grid": grid.record()}
 
 
 def create_group(path: Path, title: str, attributes: Mapping[str, Any]) -> zarr.Group:
@@ -157,6 +156,8 @@ def write_bands(group: zarr.Group, wavelength_nm: NDArray[np.float64], fwhm_nm: 
         raise WavelengthError(f"wavelengths have shape {centre.shape}, expected (band,) with at least one band")
     about = {"standard_name": "radiation_wavelength", "long_name": "wavelength at the band's centre", "units": "nm"}
     write_small(group, "wavelength", ("band",), centre, about)
+    # the same under the axis's own name: xarray makes an index of it, so that .sel(band=660, method="nearest") works
+    write_small(group, "band", ("band",), centre, about)
     if fwhm_nm is None:
         return "wavelength"
     widths = np.asarray(fwhm_nm, np.float64)

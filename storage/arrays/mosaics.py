@@ -12,6 +12,7 @@ import zarr
 from numpy.typing import NDArray
 
 from pipeline.errors import ChunkError, ShapeError
+from storage.arrays.georeference import create_placed_group, write_corners
 from storage.arrays.layout import (
     SHARD_ROWS,
     AngularGrid,
@@ -20,7 +21,6 @@ from storage.arrays.layout import (
     create_group,
     damage_named,
     grid_of,
-    grid_record,
     image_spec,
     open_group,
     read_array,
@@ -64,13 +64,12 @@ class MosaicWriter:
         grid: AngularGrid | None = None,
         simulation: Mapping[str, Any] | None = None,
     ) -> None:
-        place = {} if grid is None else grid.attributes(shape)
         simulated = {} if simulation is None else {"simulation": dict(simulation)}
         self.path = path
-        self.group = create_group(path, "mosaic", {**place, **grid_record(grid), **simulated})
-        bands = write_bands(self.group, wavelength_nm, fwhm_nm)
+        self.group, place = create_placed_group(path, "mosaic", grid, shape, simulated)
+        bands = " ".join(filter(None, [write_bands(self.group, wavelength_nm, fwhm_nm), place.get("coordinates")]))
         self._shape = (*shape, len(wavelength_nm))
-        about = {"long_name": "scene value", "units": "1", "coordinates": bands, **place}
+        about = {"long_name": "scene value", "units": "1", **place, "coordinates": bands}
         self._values = create_array(self.group, "values", image_spec(("y", "x", "band"), self._shape, "<f4"), about)
         about = {"long_name": "weight of the samples seen", "units": "1", **place}
         self._coverage = create_array(self.group, "coverage", image_spec(("y", "x"), shape, "<f4"), about)
@@ -187,7 +186,7 @@ class PatchWriter:
         count, bands = len(seats), len(wavelength_nm)
         if seats.shape != (count,) or origin_px.shape != (count, 2):
             raise ShapeError(f"seats {seats.shape} and origins {origin_px.shape} must be (patch,) and (patch, 2)")
-        group = create_group(path, "fine patches", grid_record(grid))
+        group = create_group(path, "fine patches", {} if grid is None else {"angular_grid": grid.record()})
         names = write_bands(group, wavelength_nm, fwhm_nm)
         for name, values, meaning in (
             ("seat", seats, "number of the seat on the padded grid"),
@@ -195,7 +194,9 @@ class PatchWriter:
             ("seat_x", origin_px[:, 1], "column of the patch's first pixel"),
         ):
             write_small(group, name, ("patch",), np.asarray(values, np.int64), {"long_name": meaning, "units": "1"})
-        coordinates = "seat seat_y seat_x"
+        for name, meaning in (("y", "row within the patch"), ("x", "column within the patch")):
+            write_small(group, name, (name,), np.arange(patch_px), {"long_name": meaning, "units": "1"})
+        coordinates = " ".join(["seat seat_y seat_x", *write_corners(group, grid, origin_px)])
         self._count = count
         shape = (count, patch_px, patch_px)
         about = {"long_name": "scene value", "units": "1", "coordinates": f"{names} {coordinates}"}

@@ -20,7 +20,7 @@ from odc.geo.geobox import GeoBox
 from pipeline.errors import ArchiveError, PoseError, ShapeError
 from storage.archive.whole_files import written_aside
 from storage.arrays.class_maps import ClassNames
-from storage.arrays.ground_maps import map_attributes
+from storage.arrays.georeference import map_attributes
 from storage.arrays.layout import AngularGrid
 from storage.readers.envi_cubes import DATA_TYPES, INTERLEAVES
 

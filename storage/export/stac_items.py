@@ -23,7 +23,7 @@ from odc.geo.geom import multipoint
 from pipeline.errors import ArchiveError
 from storage.archive.whole_files import write_whole
 from storage.arrays.class_maps import ClassNames
-from storage.arrays.ground_maps import map_attributes
+from storage.arrays.georeference import map_attributes
 
 COG = "image/tiff; application=geotiff; profile=cloud-optimized"
 ZARR = "application/vnd.zarr; version=3"

@@ -30,7 +30,14 @@ from storage.readers.cube_sources import BLOCK_LINES, Bands, CubeSource, LineFac
 from storage.readers.envi_cubes import DATA_ENDINGS, find_envi_pair, open_envi_cube
 from storage.readers.headwall_folders import find_reference, open_envi_source, open_headwall_cube
 from storage.readers.labels import load_frame_or_raster
-from storage.readers.raster_files import SCENE_ENDINGS, TIFF_ENDINGS, load_raster, open_tiff_rows, split_variable
+from storage.readers.raster_files import (
+    SCENE_ENDINGS,
+    TIFF_ENDINGS,
+    TiffRows,
+    load_raster,
+    open_tiff_rows,
+    split_variable,
+)
 from storage.readers.scene_toml import BandWavelengths, SceneSettings, find_scene_settings, settle_wavelengths
 from storage.readers.zarr_scenes import find_zarr_store, open_zarr_cube
 
@@ -123,21 +130,12 @@ def load_frame(address: str | Path) -> tuple[NDArray[np.float32], tuple[Path, ..
 
 def _raster_source(address: str | Path) -> CubeSource:
     path, _ = split_variable(address)
-    rows = open_tiff_rows(path) if path.suffix.lower() in TIFF_ENDINGS else None
-    if rows is not None:
-        return CubeSource(
-            name=path.name,
-            shape=rows.shape,
-            dtype=rows.dtype,
-            read=rows.read,
-            files=(path,),
-            lines=LineFacts(np.ones(rows.shape[0], np.bool_)),
-            bands=_raster_bands(path, rows.assumed_nm, None, rows.shape[2]),
-            nodata=rows.nodata,
-            notes=rows.notes,
-        )
+    if path.suffix.lower() in TIFF_ENDINGS:
+        return _tiff_source(path, open_tiff_rows(path))
     raster, _ = load_frame_or_raster(address)
     values = raster.three_axes(path)
+    if raster.void is not None and raster.void.any():
+        values = _with_gaps(values, raster.void)
     native = values.dtype.newbyteorder("=")
     return CubeSource(
         name=path.name,
@@ -148,8 +146,41 @@ def _raster_source(address: str | Path) -> CubeSource:
         lines=LineFacts(np.ones(values.shape[0], np.bool_)),
         bands=_raster_bands(path, raster.assumed_nm, raster.known, values.shape[2]),
         nodata=raster.nodata,
+        geobox=raster.geobox,
+        bad_bands=raster.bad_bands,
         notes=raster.notes,
     )
+
+
+def _tiff_source(path: Path, rows: TiffRows) -> CubeSource:
+    """A TIFF as lines; of one with transparent or masked pixels they are float32, with NaN there."""
+    starts = range(0, rows.shape[0], BLOCK_LINES)
+    voids = (rows.void(start, min(start + BLOCK_LINES, rows.shape[0])) for start in starts)
+    gaps = any(void is not None and bool(void.any()) for void in voids)
+
+    def read(start: int, stop: int) -> NDArray[Any]:
+        void = rows.void(start, stop)
+        assert void is not None  # of a file with gaps
+        return _with_gaps(rows.read(start, stop), void)
+
+    return CubeSource(
+        name=path.name,
+        shape=rows.shape,
+        dtype=np.dtype(np.float32) if gaps else rows.dtype,
+        read=read if gaps else rows.read,
+        files=(path,),
+        lines=LineFacts(np.ones(rows.shape[0], np.bool_)),
+        bands=_raster_bands(path, rows.assumed_nm, rows.known, rows.shape[2]),
+        nodata=rows.nodata,
+        geobox=rows.geobox,
+        bad_bands=rows.bad_bands,
+        notes=rows.notes,
+    )
+
+
+def _with_gaps(values: NDArray[Any], void: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """(y, x, band) values as float32, NaN in the (y, x) pixels that are void."""
+    return np.where(void[..., None], np.float32(np.nan), values.astype(np.float32))
 
 
 def _raster_bands(path: Path, assumed_nm: Sequence[float] | None, known: BandWavelengths | None, count: int) -> Bands:

@@ -9,6 +9,7 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from threading import Lock
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,9 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.lazy import Once
 from pipeline.readings import MOST_VALUE, find_beyond
+
+if TYPE_CHECKING:
+    from odc.geo.geobox import GeoBox
 
 Drawn = tuple[NDArray[np.float32], NDArray[np.uint8] | None]
 _BINOMIAL = (np.array([1, 8, 28, 56, 70, 56, 28, 8, 1]) / 256).astype(np.float32)
@@ -112,6 +116,7 @@ class RasterScene:
     band; ``missing`` (y, x) are those without one in most bands, of which nothing is known (None: no such pixel).
     ``panel`` is the scene value of the white panel, ``wavelength_nm`` and ``fwhm_nm`` are centres and widths of the
     bands, all (band,); widths are None where not known. Equal keys give equal light.
+    ``geobox`` is where the pixels lie on the earth, as the scene's file says (None: it does not).
     Planes, labels and electrons may be made when they are first asked for; all else is known at once.
     """
 
@@ -126,6 +131,7 @@ class RasterScene:
     class_colours: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))
     filled_px: int = 0
     missing: NDArray[np.bool_] | None = None
+    geobox: GeoBox | None = None
 
     def __post_init__(self) -> None:
         if self.light.is_made():
@@ -202,6 +208,7 @@ def raster_from_values(
     class_names: tuple[str, ...] = (),
     class_colours: NDArray[np.uint8] | None = None,
     key: str | None = None,
+    geobox: GeoBox | None = None,
 ) -> RasterScene:
     """Turn an image (y, x, band) without a radiance law into a scene of relative, linear light.
 
@@ -246,6 +253,7 @@ def raster_from_values(
         class_colours=np.zeros((0, 3), np.uint8) if class_colours is None else class_colours,
         filled_px=filled,
         missing=missing,
+        geobox=geobox,
     )
 
 

@@ -12,7 +12,9 @@ from typing import Any
 
 import numpy as np
 import odc.geo.xr  # noqa: F401 - gives xarray its .odc
+import pystac
 import pytest
+import rasterio
 import xarray as xr
 from rich.console import Console
 
@@ -31,8 +33,6 @@ from tests.remembered_work import without_effects
 from tests.storage.export.stac_rules import extension_problems
 from tests.storage.small_archive import flip
 
-rasterio = pytest.importorskip("rasterio", reason="exports are written with rasterio, of the extra [geo]")
-pystac = pytest.importorskip("pystac", reason="exports are described with pystac, of the extra [geo]")
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 POSE = RigPose(lon_deg=9.5, lat_deg=52.1, heading_deg=25.0, tilt_deg=50.0, height_m=14.0)
 QUIET = Console(quiet=True)

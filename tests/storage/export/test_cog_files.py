@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+import rasterio
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
@@ -21,7 +22,6 @@ from storage.arrays.class_maps import ClassNames
 from storage.arrays.layout import AngularGrid
 from storage.export.image_files import ANGULAR, CogImage, Place, cog_problems, need_rasterio, write_cog
 
-rasterio = pytest.importorskip("rasterio", reason="GeoTIFF is written with rasterio, of the extra [geo]")
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 LEGEND = ClassNames(
     ("sugar beet", "soil & stones", "maïs"), np.array([[10, 200, 30], [120, 90, 60], [0, 0, 255]], "u1")

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pystac
 import pytest
 from odc.geo.geobox import GeoBox
 
@@ -34,7 +35,6 @@ from storage.export.stac_items import (
 )
 from tests.storage.export.stac_rules import extension_problems
 
-pystac = pytest.importorskip("pystac", reason="STAC is written with pystac, of the extra [geo]")
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 BOX = GeoBox.from_bbox((500000, 5770000, 500050, 5770040), crs="EPSG:32632", resolution=0.5)
 ABOUT = Collection("field-a", "Surveys of field-a", "Surveys")

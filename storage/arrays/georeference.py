@@ -1,0 +1,231 @@
+"""Where images lie: their GeoBox, or the camera's angles, as a store's attributes and coordinates, written and read.
+
+A GeoBox is said by CF's grid mapping with coordinates of pixel centres, and by GeoZarr's attributes ``proj:`` and
+``spatial:``, so that plain xarray, rioxarray and odc-geo find the same. A grid that is turned has no centres along its
+axes: as odc-geo has it, its coordinates count pixels, and the grid mapping's GeoTransform says the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import zarr
+from affine import Affine
+from numpy.typing import NDArray
+
+from pipeline.errors import PoseError
+from pipeline.ground.georeference import zoomed_out
+from pipeline.lazy import deferred
+from storage.arrays.layout import AngularGrid, create_group, damage_named, open_group, write_small
+
+if TYPE_CHECKING:  # half a second to import, for images on the earth alone
+    import odc.geo.crs as odc_crs
+    import odc.geo.geobox as odc_geobox
+    import odc.geo.xr as odc_geo_xr
+    from odc.geo.crs import CRS
+    from odc.geo.geobox import GeoBox
+else:
+    odc_crs = deferred("odc.geo.crs")
+    odc_geobox = deferred("odc.geo.geobox")
+    odc_geo_xr = deferred("odc.geo.xr")
+
+GRID_MAPPING = "spatial_ref"
+# on every image: CF's link to the grid mapping, and the same as a coordinate, so that plain xarray takes it for one
+ON_THE_MAP = {"grid_mapping": GRID_MAPPING, "coordinates": GRID_MAPPING}
+_CONVENTIONS = [
+    {
+        "uuid": uuid,
+        "name": name,
+        "schema_url": f"https://raw.githubusercontent.com/zarr-conventions/{name}/refs/tags/v0.1/schema.json",
+        "spec_url": f"https://github.com/zarr-conventions/{name}/blob/v0.1/README.md",
+        "description": description,
+    }
+    for uuid, name, description in (
+        ("f17cb550-5864-4468-aeb7-f3180cfb622f", "proj", "Coordinate reference system of the map"),
+        ("689b58e2-cf7b-45e0-9fff-9cfc0883d6b4", "spatial", "Relation of array indices to the map's coordinates"),
+    )
+]
+_DEGREES = {"x": ("longitude", "degrees_east"), "y": ("latitude", "degrees_north")}
+_EVEN = 1e-3  # of a step, by which coordinates may differ from an even grid's
+
+
+def geobox_of(grid: AngularGrid, shape: tuple[int, ...]) -> GeoBox | None:
+    """The GeoBox of an image of (y, x) ``shape`` on a scene's grid; None where the scene has none."""
+    return None if grid.geobox is None else zoomed_out(grid.geobox, grid.factor, (shape[0], shape[1]))
+
+
+def create_placed_group(
+    path: Path, title: str, grid: AngularGrid | None, shape: tuple[int, ...], attributes: Mapping[str, Any]
+) -> tuple[zarr.Group, dict[str, Any]]:
+    """Begin a store of images of (y, x) ``shape`` on a scene's grid, with the coordinates y and x.
+
+    Gives the store, and the attributes that say of each of its images where it lies.
+    """
+    if grid is None:
+        return create_group(path, title, attributes), {}
+    geobox, record = geobox_of(grid, shape), {"angular_grid": grid.record()}
+    if geobox is not None:
+        place = map_attributes(geobox)
+        group = create_group(path, title, {**place, **record, **attributes})
+        write_map_coordinates(group, geobox)
+        return group, {**place, **ON_THE_MAP}
+    place = grid.attributes((shape[0], shape[1]))
+    group = create_group(path, title, {**place, **record, **attributes})
+    step, left, top = (place["spatial:transform"][number] for number in (0, 2, 5))
+    for name, first, size in (("y", top, shape[0]), ("x", left, shape[1])):
+        about = {"long_name": f"tangent of the angle from the undeflected direction along {name}", "units": "rad"}
+        write_small(group, name, (name,), first + step * (np.arange(size) + 0.5), {**about, "axis": name.upper()})
+    return group, place
+
+
+def map_attributes(geobox: GeoBox) -> dict[str, Any]:
+    """GeoZarr ``proj:`` and ``spatial:`` attributes of a map; the transform maps pixel corners.
+
+    Raises PoseError: the grid has no CRS.
+    """
+    crs = _crs_of(geobox)
+    code = {} if crs.epsg is None else {"proj:code": f"EPSG:{crs.epsg}"}
+    return {
+        **code,
+        "proj:wkt2": crs.to_wkt(),
+        "spatial:dimensions": ["y", "x"],
+        "spatial:shape": list(geobox.shape),
+        "spatial:transform_type": "affine",
+        "spatial:transform": [float(number) for number in geobox.affine[:6]],
+        "spatial:bbox": [float(number) for number in geobox.boundingbox.bbox],
+        "spatial:registration": "pixel",
+        "zarr_conventions": _CONVENTIONS,
+    }
+
+
+def write_map_coordinates(group: zarr.Group, geobox: GeoBox) -> None:
+    """Store ``x``, ``y`` and the grid mapping ``spatial_ref`` of a map, as CF wants them."""
+    crs = _crs_of(geobox)
+    a, _, c, _, e, f = (float(number) for number in geobox.affine[:6])
+    for name, size, step, first in (("x", geobox.shape[1], a, c), ("y", geobox.shape[0], e, f)):
+        if geobox.axis_aligned:
+            about, centres = _axis(crs, name), np.arange(size) * step + (first + step / 2)
+        else:
+            about = {"long_name": f"pixels along {name}; the grid is turned, see GeoTransform", "units": "pixel"}
+            centres = np.arange(size) + 0.5
+        write_small(group, name, (name,), np.asarray(centres, np.float64), {**about, "axis": name.upper()})
+    write_grid_mapping(group, geobox)
+
+
+def write_grid_mapping(group: zarr.Group, geobox: GeoBox) -> None:
+    """Store CRS and transform of a map as CF's grid mapping."""
+    mapping = odc_geo_xr.xr_crs_coord(_crs_of(geobox), transform=geobox.transform)
+    write_small(group, GRID_MAPPING, (), np.asarray(mapping.values, np.int32), dict(mapping.attrs))
+
+
+def write_corners(group: zarr.Group, grid: AngularGrid | None, origin_px: NDArray[np.integer]) -> list[str]:
+    """Store where on a map patches begin, (patch, 2) first row and column, and give the coordinates' names.
+
+    Nothing where the scene has no place.
+    """
+    if grid is None or grid.geobox is None:
+        return []
+    a, b, c, d, e, f = grid.geobox.affine[:6]
+    row, column = origin_px.T.astype(np.float64)
+    for name, values in (("map_y", d * column + e * row + f), ("map_x", a * column + b * row + c)):
+        about = _axis(_crs_of(grid.geobox), name[-1]) | {"long_name": "upper left corner of the patch on the map"}
+        write_small(group, name, ("patch",), np.asarray(values, np.float64), about)
+    write_grid_mapping(group, grid.geobox)
+    return ["map_y", "map_x", GRID_MAPPING]
+
+
+def _axis(crs: CRS, name: str) -> dict[str, str]:
+    """CF's words for one axis of a map."""
+    if crs.geographic:
+        standard, unit = _DEGREES[name]
+        return {"standard_name": standard, "long_name": f"{standard} of the pixel's centre", "units": unit}
+    unit = crs.proj.axis_info[0].unit_name if crs.proj.axis_info else "metre"
+    return {
+        "standard_name": f"projection_{name}_coordinate",
+        "long_name": f"{name} of the pixel's centre on the map",
+        "units": "m" if unit == "metre" else unit,
+    }
+
+
+def _crs_of(geobox: GeoBox) -> CRS:
+    if geobox.crs is None:
+        raise PoseError(f"a map needs a CRS, got {geobox!r}")
+    return geobox.crs
+
+
+def load_geobox(path: Path) -> GeoBox | None:
+    """Read the grid of a stored map; None where the store lies on an angular grid.
+
+    Raises IncompleteStoreError: the store is missing, or what says its grid is damaged.
+    """
+    group = open_group(path)
+    if GRID_MAPPING not in group:
+        return None
+    with damage_named(f"the grid of {path}"):
+        sizes = {name: array.shape[0] for name, array in group.arrays() if name in ("x", "y")}
+        said = {**dict(group.attrs), "grid_mapping": GRID_MAPPING}
+        geobox = find_geobox(said, dict(group.arrays()), (sizes["y"], sizes["x"]), ("y", "x"))
+        if geobox is None:
+            raise KeyError(f"{GRID_MAPPING}, x and y give none")
+    return geobox
+
+
+def find_geobox(
+    attributes: Mapping[str, Any], arrays: Mapping[str, zarr.Array[Any]], shape: tuple[int, int], dims: tuple[str, str]
+) -> GeoBox | None:
+    """Where an image of (y, x) ``shape`` lies, as its store says; None where it does not say CRS and grid.
+
+    ``attributes`` are the image's and its group's, ``arrays`` what else lies in the group, ``dims`` the names of the
+    image's axes. Asked are GeoZarr's ``proj:`` and ``spatial:transform``, the grid mapping with its GeoTransform, and
+    even coordinates of pixel centres along both axes.
+    """
+    mapping = _mapping(attributes, arrays)
+    crs = _crs_said(attributes, mapping)
+    if crs is None:
+        return None
+    transform = _transform_said(attributes, mapping) or _transform_of_axes(arrays, dims)
+    return None if transform is None else odc_geobox.GeoBox(shape, transform, crs)
+
+
+def _mapping(attributes: Mapping[str, Any], arrays: Mapping[str, zarr.Array[Any]]) -> dict[str, Any]:
+    """Attributes of the grid mapping: the one that the image names, else the only array that could be one."""
+    named = str(attributes.get("grid_mapping", "")).split(":")[0].split(" ")[0]
+    if named in arrays:
+        return dict(arrays[named].attrs)
+    found = [dict(array.attrs) for array in arrays.values() if array.ndim == 0]
+    found = [about for about in found if {"crs_wkt", "spatial_ref"} & set(about)]
+    return found[0] if len(found) == 1 else {}
+
+
+def _crs_said(attributes: Mapping[str, Any], mapping: Mapping[str, Any]) -> CRS | None:
+    places = ((mapping, ("crs_wkt", "spatial_ref")), (attributes, ("proj:wkt2", "proj:code", "proj:projjson")))
+    said = next((about[name] for about, names in places for name in names if about.get(name)), None)
+    return None if said is None else odc_crs.CRS(said)
+
+
+def _transform_said(attributes: Mapping[str, Any], mapping: Mapping[str, Any]) -> Affine | None:
+    words = str(mapping.get("GeoTransform", "")).split()
+    if len(words) == 6:
+        return Affine.from_gdal(*map(float, words))
+    said = attributes.get("spatial:transform")
+    return None if said is None else Affine(*map(float, said))
+
+
+def _transform_of_axes(arrays: Mapping[str, zarr.Array[Any]], dims: tuple[str, str]) -> Affine | None:
+    """The same from coordinates of pixel centres, where both axes have even ones of two or more pixels."""
+    if not all(name in arrays and arrays[name].ndim == 1 and arrays[name].shape[0] > 1 for name in dims):
+        return None
+    y, x = (np.asarray(arrays[name][...], np.float64) for name in dims)
+    steps = [_even_step(centres) for centres in (y, x)]
+    if steps[0] is None or steps[1] is None:
+        return None
+    return Affine(steps[1], 0.0, float(x[0]) - steps[1] / 2, 0.0, steps[0], float(y[0]) - steps[0] / 2)
+
+
+def _even_step(centres: NDArray[np.float64]) -> float | None:
+    step = float(centres[-1] - centres[0]) / (len(centres) - 1)
+    even = np.abs(centres - centres[0] - step * np.arange(len(centres))).max() <= _EVEN * abs(step)
+    return step if step and even else None
