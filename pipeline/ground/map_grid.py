@@ -229,7 +229,7 @@ def ground_grid(
             f"no ray of the field meets the ground from the pose {view.pose}; tilt it further down, or check roll_deg "
             "and slope_deg"
         )
-    least = max(median_sink(view, scene_shape) / FAR_PIXELS ** (2 / 3), LEAST_SINK)  # a footprint's area goes as w^-3
+    least = _least_sink(view, scene_shape)
     left, bottom, right, top = _bounds(frame, view.outline_px(scene_shape, least))
     growth = USUAL_GROWTH if resolution_m is None else MOST_GROWTH
     finest = float(np.sqrt((right - left) * (top - bottom) / (growth * scene_shape[0] * scene_shape[1])))
@@ -242,6 +242,20 @@ def ground_grid(
         )
     geobox = odc_geobox.GeoBox.from_bbox((left, bottom, right, top), crs=frame.crs, resolution=step)
     return GroundGrid(frame, scene_shape, geobox, least)
+
+
+def grid_of_map(view: GroundView, scene_shape: tuple[int, int], geobox: GeoBox) -> GroundGrid:
+    """Give the grid of a map that is there already, as ``ground_grid`` made it for the view and scene."""
+    assert geobox.crs is not None
+    return GroundGrid(
+        MapFrame(view, pyproj.CRS.from_wkt(geobox.crs.to_wkt())), scene_shape, geobox, _least_sink(view, scene_shape)
+    )
+
+
+def _least_sink(view: GroundView, scene_shape: tuple[int, int]) -> float:
+    return max(
+        median_sink(view, scene_shape) / float(FAR_PIXELS ** (2 / 3)), LEAST_SINK
+    )  # a footprint's area goes as w^-3
 
 
 def median_sink(view: GroundView, scene_shape: tuple[int, int]) -> float:

@@ -74,7 +74,7 @@ class SpectralIndex:
 
 def _narrow(*centres_nm: float) -> tuple[IndexBand, ...]:
     return tuple(
-        IndexBand(f"R{centre:.0f}", f"{centre:g} nm", centre, centre - NARROW_NM, centre + NARROW_NM)
+        IndexBand(f"R{centre:.0f}", f"near {centre:g} nm", centre, centre - NARROW_NM, centre + NARROW_NM)
         for centre in centres_nm
     )
 
@@ -171,9 +171,9 @@ def pick_bands(index: SpectralIndex, wavelength_nm: ArrayLike) -> tuple[int, ...
     there = np.asarray(wavelength_nm, np.float64)
     numbers, missing = [], []
     for band in index.bands:
-        nearest = int(np.argmin(np.abs(there - band.centre_nm)))
-        numbers.append(nearest)
-        if not band.low_nm <= there[nearest] <= band.high_nm:
+        away = np.where((there >= band.low_nm) & (there <= band.high_nm), np.abs(there - band.centre_nm), np.inf)
+        numbers.append(int(np.argmin(away)))
+        if not np.isfinite(away.min()):
             missing.append(band)
     if missing:
         raise WavelengthError(

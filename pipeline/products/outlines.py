@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from affine import Affine
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, depth_first_order
@@ -39,7 +40,18 @@ class Coverage:
 
     def areas(self, count: int) -> NDArray[np.float64]:
         """(class,) area of the first ``count`` classes [px]."""
-        return np.bincount(self.classes, shapely.area(self.polygons), count)[:count]
+        return np.bincount(self.classes, self.polygon_areas(), count)[:count].astype(np.float64)
+
+    def polygon_areas(self) -> NDArray[np.float64]:
+        """(polygon,) area of each."""
+        area: NDArray[np.float64] = shapely.area(self.polygons)
+        return area
+
+    def moved(self, transform: Affine) -> Coverage:
+        """The same in x and y of a map, to which ``transform`` leads from pixel corners."""
+        a, b, c, d, e, f = transform[:6]
+        turn, origin = np.array([[a, d], [b, e]]), np.array([c, f])
+        return Coverage(self.classes, shapely.transform(self.polygons, lambda points: points @ turn + origin))
 
     def of_classes(self) -> Coverage:
         """The same without what has no class."""
@@ -102,10 +114,7 @@ def _assembled(
 
 
 def _sides(padded: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Sides of pixels at which a region ends, as 4 times the pixel's number and the way round: top, right, bottom, left.
-
-    Ascending.
-    """
+    """Sides of pixels where a region ends, ascending: 4 times the pixel's number and 0 to 3 from the top clockwise."""
     inner = padded[1:-1, 1:-1]
     numbers = np.arange(padded.size, dtype=np.int64).reshape(padded.shape)[1:-1, 1:-1]
     found = []

@@ -1,4 +1,4 @@
-"""Prescription maps: cells along a heading, or along north for task data, and the dose that each gets by its classes."""
+"""Prescription maps: cells along a heading, or along north for task data, and the dose of each by its classes."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ is never given to a class, nor takes anything from one, unless a class is grown 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,8 +62,9 @@ def _summed(
 
 def number_regions(classes: Classes) -> NDArray[np.int32]:
     """Number the regions of a class map from 0, (y, x); what has no class is numbered too."""
-    found: NDArray[np.int32] = skimage_measure.label(classes.astype(np.int16) + 1, connectivity=1, background=0)
-    return found.astype(np.int32) - 1
+    label: Any = skimage_measure.label
+    found: NDArray[np.int32] = label(classes.astype(np.int16) + 1, connectivity=1, background=0).astype(np.int32)
+    return found - 1
 
 
 def find_regions(classes: Classes) -> tuple[NDArray[np.int32], RegionGraph]:
@@ -91,7 +92,7 @@ def merge_small(classes: Classes, least_px: float) -> Classes:
     if least_px <= 1:
         return classes.copy()
     numbers, graph = find_regions(classes)
-    group = np.arange(len(graph.classes))
+    group: NDArray[np.integer] = np.arange(len(graph.classes))
     while len(links := _links_of_small(graph, least_px)):
         group_of = _joined(links, len(graph.classes))
         graph, group = graph.grouped(group_of), group_of[group]
@@ -111,7 +112,8 @@ def _links_of_small(graph: RegionGraph, least_px: float) -> NDArray[np.int64]:
     ends, sides = ends[small], sides[small]
     order = np.lexsort((ends[:, 1], -sides, ends[:, 0]))
     first = np.unique(ends[order, 0], return_index=True)[1]
-    return ends[order][first]
+    links: NDArray[np.int64] = ends[order][first]
+    return links
 
 
 def _joined(links: NDArray[np.int64], count: int) -> NDArray[np.int32]:
