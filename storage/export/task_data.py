@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pipeline.errors import SettingsError
 from storage.archive.whole_files import written_aside
 
-FOLDER, XML, NUMBERS = "TASKDATA", "TASKDATA.XML", "GRD00000.BIN"
+FOLDER, XML, NUMBERS = "TASKDATA", "TASKDATA.XML", "GRD00000.bin"
 DESIGNATOR = 32  # letters of a name
 MOST_NUMBER = 2**31 - 1
 DEGREE_DIGITS = 9
@@ -115,7 +115,7 @@ def _grid_fields(grid: TaskGrid, length: int) -> dict[str, str]:
         "D": f"{grid.east_step_deg:.{DEGREE_DIGITS}f}",
         "E": str(columns),
         "F": str(rows),
-        "G": NUMBERS.removesuffix(".BIN"),
+        "G": NUMBERS.removesuffix(".bin"),
         "H": str(length),
         "I": "2",
         "J": str(TREATED),
