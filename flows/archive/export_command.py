@@ -1,20 +1,24 @@
-"""What `spectralzoom export` does: a run's maps as GeoTIFF, its cubes as ENVI, and a STAC catalogue of both."""
+"""What `spectralzoom export` does: a run's maps and products, its cubes as ENVI, and a STAC catalogue of them."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from affine import Affine
-from odc.geo.geobox import GeoBox
+import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
+from flows.archive.export_areas import CSV, write_areas
 from flows.archive.export_layers import ExportedRun, Layer, Rows, map_layers, open_exported, seen_rows
+from flows.archive.export_spectra import spectral_layers
+from flows.archive.export_styles import write_layer_style
+from flows.archive.export_zones import check_zones, write_zones
+from flows.archive.product_choice import NO_PRODUCTS, ProductChoice, ProductFlags, choose_products
 from flows.cli.app import ArchiveName, AsJson, OutFile, Switch, check_outside, stderr
 from flows.terminal.processes import DONE
 from flows.terminal.progress import print_json
@@ -27,6 +31,7 @@ from storage.arrays.georeference import load_geobox
 from storage.arrays.ground_maps import load_bands, open_image
 from storage.arrays.layout import SHARD_ROWS
 from storage.export.image_files import EnviFile, has_map_info, write_cog, write_envi
+from storage.export.qgis_styles import STYLE
 from storage.export.stac_items import (
     COG,
     ZARR,
@@ -57,9 +62,15 @@ Asset = dict[str, Any]
 
 
 def export(
-    archive: ArchiveName, run: str | None = None, *, out: OutFile, envi: Switch = False, as_json: AsJson = False
+    archive: ArchiveName,
+    run: str | None = None,
+    *,
+    out: OutFile,
+    envi: Switch = False,
+    products: ProductFlags = NO_PRODUCTS,
+    as_json: AsJson = False,
 ) -> int:
-    """Export a run: maps as cloud-optimised GeoTIFF, a STAC catalogue of them, and on request cubes as ENVI.
+    """Export a run: maps as GeoTIFF with QGIS styles, areas, a STAC catalogue; on request what a field needs.
 
     Parameters
     ----------
@@ -70,29 +81,40 @@ def export(
     envi
         Also write the coarse mosaic and the raw sweeps as ENVI files.
     """
-    content = run_export(archive, run, out, envi, stderr)
+    content = run_export(archive, run, out, envi, stderr, choose_products(products))
     if as_json:
         print_json(content)
     return DONE
 
 
-def run_export(archive: str | Path, run: str | None, out: Path, envi: bool, console: Console) -> dict[str, Any]:
+def run_export(
+    archive: str | Path,
+    run: str | None,
+    out: Path,
+    envi: bool,
+    console: Console,
+    choice: ProductChoice = choose_products(NO_PRODUCTS),  # noqa: B008 - a value
+) -> dict[str, Any]:
     """Export a run (the latest without a name) into ``out``, beside others that lie there, and print what was written.
 
     Gives run, item and collection (paths), placed (whether there is a CRS), and files: every asset's path seen from
-    ``out``. Raises SettingsError: no such run, or ``out`` lies in the archive; ArchiveError: ``out`` is
-    another archive's or cannot be written; IncompleteStoreError: a store is missing or damaged.
+    ``out``. Raises SettingsError: no such run, ``out`` lies in the archive, or the run does not give what is asked for;
+    WavelengthError: its cube lacks bands of an index; ArchiveError: ``out`` is another archive's or cannot be written;
+    IncompleteStoreError: a store is missing or damaged.
     """
     opened = open_exported(open_archive(archive, create=False, write=False), run)
     out = check_outside(out, opened.archive.root)
     about = describe_collection(opened)
+    choice = check_zones(opened, choice)
+    layers = [*map_layers(opened), *spectral_layers(opened, choice)]
     export = Export(opened, out)
     try:
         with _alone_in(out):
             check_owner(out, about.id)
             for folder in (out, export.folder, export.folder / "envi"):
                 remove_leftovers(folder)
-            _export_images(export, console)
+            _export_images(export, layers, console)
+            _export_tables(export, choice, console)
             name_stores(export)
             if envi:
                 _export_cubes(export, console)
@@ -124,13 +146,25 @@ def _alone_in(out: Path) -> Iterator[None]:
             release()
 
 
-def _export_images(export: Export, console: Console) -> None:
-    for layer in map_layers(export.run):
+def _export_images(export: Export, layers: Sequence[Layer], console: Console) -> None:
+    for layer in layers:
         path = export.folder / f"{layer.name}.tif"
         with console.status(f"writing {path.name}"):
             write_cog(path, layer.image, layer.rows())
         fields = {"bands": band_fields(layer), **grid_fields(export.run, layer), **layer.fields}
         export.add(layer.name, path, layer.title, COG, list(layer.roles), **fields)
+        style = write_layer_style(layer, path)
+        export.add(f"{layer.name}_style", style, f"QGIS style of {path.name}", STYLE, ["metadata", "style"])
+
+
+def _export_tables(export: Export, choice: ProductChoice, console: Console) -> None:
+    """Areas as a table, and what else is no image."""
+    path = export.folder / "areas.csv"
+    write_areas(export.run, path)
+    export.add("areas", path, "Areas of the classes, and how surely they are known", CSV, ["data", "metadata"])
+    with console.status("drawing polygons"):
+        for made in write_zones(export.run, export.folder, choice):
+            export.add(made.key, made.path, made.title, made.kind, list(made.roles), **made.fields)
 
 
 def _export_cubes(export: Export, console: Console) -> None:
@@ -186,17 +220,22 @@ def band_fields(layer: Layer) -> list[Asset]:
     """STAC's words for the bands of an image."""
     nodata: Any = "nan" if layer.image.nodata != layer.image.nodata else layer.image.nodata
     unit = {} if layer.unit is None else {"unit": layer.unit}
-    return [{"name": name, "data_type": layer.image.dtype, "nodata": nodata, **unit} for name in layer.image.bands]
+    about = {"data_type": layer.image.dtype, "nodata": nodata, **unit}
+    if layer.image.wavelength_nm is not None:
+        width = None if layer.image.fwhm_nm is None else np.array(layer.image.fwhm_nm)
+        bands: list[Asset] = spectral_bands(np.array(layer.image.wavelength_nm), width, about)["bands"]
+        return bands
+    return [{"name": name, **about} for name in layer.image.bands]
 
 
 def grid_fields(run: ExportedRun, layer: Layer) -> dict[str, Any]:
     """Where an image lies, for surveys that have a place at all."""
     if run.geobox is None:
         return {}
-    if layer.image.place.crs_wkt is None:
+    geobox = layer.image.place.geobox(layer.image.shape)
+    if geobox is None:
         return angular(layer.image.place.transform, layer.image.shape)
-    place = layer.image.place
-    return projection(GeoBox(layer.image.shape, Affine(*place.transform), place.crs_wkt))
+    return projection(geobox)
 
 
 def name_stores(export: Export) -> None:

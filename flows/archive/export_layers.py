@@ -112,6 +112,11 @@ class Layer:
     fields: Mapping[str, Any] = field(default_factory=dict)  # STAC's, beside its bands and its grid
 
 
+def map_product(run: ExportedRun) -> str:
+    """Which store a run's map is exported from: on the ground where there is one, else on the scene's own grid."""
+    return "class_map" if run.store("ground_map") is None else "ground_map"
+
+
 def map_layers(run: ExportedRun) -> list[Layer]:
     """Class map, confidence, attention (on its seats) and picture: on the map where there is one, else on angles."""
     product = run.map_product
@@ -135,7 +140,8 @@ def map_layers(run: ExportedRun) -> list[Layer]:
     return layers
 
 
-def _tags(run: ExportedRun, product: str, place: Place) -> dict[str, str]:
+def layer_tags(run: ExportedRun, product: str, place: Place) -> dict[str, str]:
+    """What every image says of its run."""
     return {
         "TIFFTAG_SOFTWARE": f"spectralzoom {run.receipt['versions'].get('spectralzoom', 'of unknown version')}",
         "run": run.id,
@@ -167,7 +173,7 @@ def _layer(
     stored = open_image(run.path(product), array)
     place = _place(run, stored)
     shape = (stored.shape[0], stored.shape[1])
-    image = CogImage(shape, stored.dtype.name, place, bands, nodata, legend, _tags(run, product, place))
+    image = CogImage(shape, stored.dtype.name, place, bands, nodata, legend, layer_tags(run, product, place))
     return image, stored.rows
 
 
@@ -184,7 +190,7 @@ def _of_seats(
     on_angles = Place.on_angles(replace(scene, factor=patch), shape)
     place = on_angles if geobox is None else Place.on_map(zoomed_out(geobox, patch, shape))
     policy = {"policy": str(stored.about.get("policy", ""))} if product == "attention" else {}
-    tags = {**_tags(run, product, place), **policy, "seat_px": str(patch)}
+    tags = {**layer_tags(run, product, place), **policy, "seat_px": str(patch)}
     return CogImage(shape, stored.dtype.name, place, bands, np.nan, tags=tags), stored.rows
 
 
@@ -193,7 +199,7 @@ def _picture(run: ExportedRun) -> tuple[CogImage, Callable[[], Rows]]:
     stored, ref = open_image(run.path("mosaic"), "coverage"), run.store("mosaic")
     assert ref is not None
     place = _place(run, stored)
-    image = CogImage((stored.shape[0], stored.shape[1]), "uint8", place, RGB, 0, tags=_tags(run, "mosaic", place))
+    image = CogImage((stored.shape[0], stored.shape[1]), "uint8", place, RGB, 0, tags=layer_tags(run, "mosaic", place))
 
     def rows() -> Rows:
         yield 0, np.nan_to_num(np.rint(coarse_colours(ref))).astype(np.uint8)

@@ -250,6 +250,13 @@ def least_mapped_sink(view: GroundView, scene_shape: tuple[int, int]) -> float:
     return max(median_sink(view, scene_shape) / farther, LEAST_SINK)
 
 
+def grid_of_map(view: GroundView, scene_shape: tuple[int, int], geobox: GeoBox) -> GroundGrid:
+    """Give the grid of a map that is there already, as ``ground_grid`` made it for the view and scene."""
+    assert geobox.crs is not None
+    frame = MapFrame(view, pyproj.CRS.from_wkt(geobox.crs.to_wkt()))
+    return GroundGrid(frame, scene_shape, geobox, least_mapped_sink(view, scene_shape))
+
+
 def median_sink(view: GroundView, scene_shape: tuple[int, int]) -> float:
     """Give the median by which the rays of a field that meet the ground sink; NaN if none does."""
     y, x = (np.linspace(places[0], places[-1], min(len(places), SAMPLES)) for places in pixel_places(scene_shape))

@@ -6,7 +6,7 @@ Both are written block by block; GeoTIFF goes through GDAL, and is read back bef
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pyproj
+from affine import Affine
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
@@ -53,6 +54,10 @@ class Place:
         """Of an image of (y, x) px on the camera's angular grid."""
         return cls(tuple(grid.attributes(shape)["spatial:transform"]))
 
+    def geobox(self, shape: tuple[int, int]) -> GeoBox | None:
+        """The grid of an image of (y, x) px that lies here; None without a CRS."""
+        return None if self.crs_wkt is None else GeoBox(shape, Affine(*self.transform), self.crs_wkt)
+
 
 @dataclass(frozen=True)
 class CogImage:
@@ -65,6 +70,8 @@ class CogImage:
     nodata: float
     legend: ClassNames | None = None  # of an image of classes: overviews take the commonest, not the mean
     tags: Mapping[str, str] = field(default_factory=dict)
+    wavelength_nm: Sequence[float] | None = None  # of each band
+    fwhm_nm: Sequence[float] | None = None
 
 
 def write_cog(path: Path, image: CogImage, blocks: Blocks) -> None:
@@ -119,6 +126,7 @@ def _write_plain(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> 
     with rasterio.open(path, "w", **profile) as file:
         file.descriptions = image.bands
         file.update_tags(**image.tags)
+        _tag_wavelengths(file, image)
         if image.legend is not None:
             names = image.legend.names
             flags = {f"CLASS_{number}": name for number, name in enumerate(names)}
@@ -138,6 +146,20 @@ def _write_plain(rasterio: Any, path: Path, image: CogImage, blocks: Blocks) -> 
         raise ShapeError(f"{path.name}: {reached} of {y} rows were given")
 
 
+def _tag_wavelengths(file: Any, image: CogImage) -> None:
+    """Say each band's wavelength and width: in GDAL's own domain IMAGERY [um], and as its driver of ENVI does [nm]."""
+    if image.wavelength_nm is None:
+        return
+    widths = [None] * len(image.bands) if image.fwhm_nm is None else image.fwhm_nm
+    for band, (centre, width) in enumerate(zip(image.wavelength_nm, widths, strict=True), start=1):
+        own = {"CENTRAL_WAVELENGTH_UM": f"{centre / 1000:.9g}"}
+        usual = {"wavelength": f"{centre:.9g}", "wavelength_units": "Nanometers"}
+        if width is not None:
+            own["FWHM_UM"], usual["fwhm"] = f"{width / 1000:.9g}", f"{width:.9g}"
+        file.update_tags(band, ns="IMAGERY", **own)
+        file.update_tags(band, **usual)
+
+
 def _differences(rasterio: Any, plain: Path, made: Path) -> list[str]:
     """Where two files do not hold the same numbers, transform, CRS or nodata."""
     with rasterio.open(plain) as wanted, rasterio.open(made) as found:
@@ -152,6 +174,21 @@ def _differences(rasterio: Any, plain: Path, made: Path) -> list[str]:
             if not np.array_equal(*pair, equal_nan=pair[0].dtype.kind == "f"):
                 return [f"its numbers differ from row {first} on"]
     return []
+
+
+def value_span(path: Path, bands: Sequence[int], share: float = 0.02) -> tuple[float, float]:
+    """Values of some bands, counted from 1, that ``share`` of a file's pixels are below and above; 0 and 1 without any.
+
+    Of at most 512 x 512 pixels of the file.
+    """
+    with need_rasterio().open(path) as file:
+        y, x = (min(size, TILE) for size in file.shape)
+        values = file.read(list(bands), out_shape=(len(bands), y, x), masked=True).astype(np.float64).filled(np.nan)
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return 0.0, 1.0
+    low, high = (float(value) for value in np.quantile(known, (share, 1 - share)))
+    return (low, high) if low < high else (low, low + 1.0)
 
 
 def cog_problems(path: Path) -> list[str]:

@@ -1,0 +1,96 @@
+"""The table of areas of a run: each class's pixels, hectares and confidence, and how surely its area is known."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.archive.export_layers import ExportedRun, map_product
+from pipeline.products.areas import ShareEstimate, probable_shares, stratified_shares
+from storage.archive.whole_files import write_whole
+from storage.arrays.beliefs import BeliefStore
+from storage.arrays.georeference import load_geobox
+from storage.arrays.ground_maps import M2_PER_HECTARE, open_image
+from storage.arrays.layout import SHARD_ROWS
+from storage.export.map_scale import MapScale
+
+CSV = "text/csv"
+COLUMNS = (
+    "class",
+    "pixels",
+    "hectares",
+    "share",
+    "mean_confidence",
+    "estimated_share",
+    "estimated_hectares",
+    "standard_error_share",
+    "standard_error_hectares",
+    "estimated_from",
+)
+DIGITS = 6
+
+
+def write_areas(run: ExportedRun, path: Path) -> None:
+    """Write the table, a row a class; empty where something is not known, as hectares where there is no CRS."""
+    path_of_map = run.path(map_product(run))
+    names = tuple(open_image(path_of_map, "classes").about["class_names"])
+    pixels, confidence = _counted(path_of_map, len(names))
+    hectares = _hectares(run, names, pixels)
+    share = pixels / max(pixels.sum(), 1) if hectares is None else hectares / (hectares.sum() or 1.0)
+    estimate, source = _estimate(run, share)
+    total = np.nan if hectares is None else hectares.sum()
+    own = np.full(len(names), np.nan) if hectares is None else hectares
+    figures = (own, share, confidence, estimate.shares, estimate.shares * total, estimate.errors)
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(COLUMNS)
+    for number, (name, count) in enumerate(zip(names, pixels.tolist(), strict=True)):
+        told = [_cell(figure[number]) for figure in (*figures, estimate.errors * total)]
+        table.writerow([name, count, *told, source])
+    write_whole(path, text.getvalue())
+
+
+def _cell(value: float) -> str:
+    return f"{value:.{DIGITS}g}" if np.isfinite(value) else ""
+
+
+def _counted(path: Path, count: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """(class,) pixels and mean confidence of the exported map; NaN for a class without a pixel."""
+    pixels, sums = np.zeros(256, np.int64), np.zeros(256)
+    for (_, classes), (_, sure) in zip(
+        open_image(path, "classes").rows(), open_image(path, "confidence").rows(), strict=True
+    ):
+        pixels += np.bincount(classes.ravel(), minlength=256)
+        sums += np.bincount(classes.ravel(), np.nan_to_num(sure).ravel(), 256)
+    return pixels[:count], np.where(pixels > 0, sums / np.maximum(pixels, 1), np.nan)[:count]
+
+
+def _hectares(run: ExportedRun, names: tuple[str, ...], pixels: NDArray[np.int64]) -> NDArray[np.float64] | None:
+    """Hectares of each class: with a pose those of the receipt, from footprints of the scene's pixels."""
+    if "ground" in run.receipt:
+        areas = run.receipt["ground"]["areas_ha"]
+        return np.array([areas.get(name, 0.0) for name in names], np.float64)
+    geobox = load_geobox(run.path("class_map"))
+    return None if geobox is None else pixels.astype(np.float64) * (MapScale.of(geobox).pixel_m2 / M2_PER_HECTARE)
+
+
+def _estimate(run: ExportedRun, share: NDArray[np.float64]) -> tuple[ShareEstimate, str]:
+    """Shares with their errors: by the confusion matrix of the receipt where there is one, else by probabilities."""
+    confusion = run.receipt.get("accuracy", {}).get("confusion")
+    if confusion is not None:
+        return stratified_shares(share, confusion), "labels"
+    if run.store("belief") is None:
+        unknown = np.full(len(share), np.nan)
+        return ShareEstimate(unknown, unknown), ""
+    store = BeliefStore(run.path("belief"))
+    return probable_shares(_probabilities(store), len(share)), "probabilities"
+
+
+def _probabilities(store: BeliefStore) -> Iterator[NDArray[np.float32]]:
+    for first in range(0, store.shape[0], SHARD_ROWS):
+        yield np.exp(store.read(slice(first, first + SHARD_ROWS))[0])

@@ -1,0 +1,240 @@
+"""Products of a run's classes that are no images: polygons, and prescriptions as shapefile and task data."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from affine import Affine
+from numpy.typing import NDArray
+from odc.geo.geobox import GeoBox
+
+from flows.archive.export_layers import ExportedRun, map_product
+from flows.archive.export_spectra import MosaicView
+from flows.archive.product_choice import ProductChoice, class_numbers
+from pipeline.errors import SettingsError
+from pipeline.geometry.grid import UNLABELLED
+from pipeline.planning.orientation import find_rows
+from pipeline.products.outlines import class_polygons
+from pipeline.products.prescriptions import (
+    CellGrid,
+    Heading,
+    ToAxes,
+    cell_polygons,
+    count_classes,
+    dose_cells,
+    pixel_axes,
+)
+from pipeline.products.regions import grow_class, merge_small
+from storage.arrays.class_maps import ClassNames
+from storage.arrays.georeference import load_geobox
+from storage.arrays.ground_maps import open_image
+from storage.arrays.mosaics import mosaic_brightness
+from storage.export.map_scale import MapScale, crs_wkt, to_degrees, to_plane
+from storage.export.qgis_styles import NONE, REDS, STYLE, Entry, ramp_colour, write_polygon_style
+from storage.export.task_data import DEGREE_DIGITS, TaskGrid, TaskWords, write_task_data
+from storage.export.vector_files import GEOJSON, GEOPACKAGE, SHAPEFILE, write_geojson, write_geopackage, write_shapefile
+
+IN_DEGREES = {"proj:code": "EPSG:4326"}
+NEEDS_PLACE = "the run does not say where on earth it was; survey with a [pose], or a scene with a CRS"
+
+
+@dataclass(frozen=True)
+class Made:
+    """One file that was written, as the catalogue is to name it."""
+
+    key: str
+    path: Path
+    title: str
+    kind: str
+    roles: tuple[str, ...] = ("data",)
+    fields: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class ClassRaster:
+    """A run's classes as they are exported, whole."""
+
+    classes: NDArray[np.uint8]  # (y, x)
+    legend: ClassNames
+    transform: Affine  # from pixel corners to the map; tangents of angles without a CRS
+    geobox: GeoBox | None
+
+    @classmethod
+    def of(cls, run: ExportedRun) -> ClassRaster:
+        """Read them from the map's store."""
+        path = run.path(map_product(run))
+        stored, geobox = open_image(path, "classes"), load_geobox(path)
+        names, colours = stored.about["class_names"], np.array(stored.about["class_colours"], np.uint8)
+        transform = Affine(*stored.about["spatial:transform"])
+        classes = np.concatenate([rows for _, rows in stored.rows()])
+        return cls(classes, ClassNames(tuple(names), colours.reshape(-1, 3)), transform, geobox)
+
+    @cached_property
+    def scale(self) -> MapScale | None:
+        """Metres of its pixels; None without a CRS."""
+        return None if self.geobox is None else MapScale.of(self.geobox)
+
+    def shaped(self, choice: ProductChoice) -> ClassRaster:
+        """Small regions given to a neighbour, then classes grown in the order in which they were named.
+
+        Raises SettingsError: there is no such class, or what is meant in metres has no place on the ground.
+        """
+        buffers = class_numbers(self.legend.names, choice.buffers_m, "--buffer")
+        if self.scale is None:
+            if buffers or choice.least_area_m2 or choice.simplify_m is not None:
+                raise SettingsError(f"--buffer, --least-area and --simplify are in metres, and {NEEDS_PLACE}")
+            return self
+        classes = merge_small(self.classes, choice.least_area_m2 / self.scale.pixel_m2)
+        for number, metres in buffers.items():
+            classes = grow_class(classes, number, metres / self.scale.pixel_m)
+        return ClassRaster(classes, self.legend, self.transform, self.geobox)
+
+
+def check_zones(run: ExportedRun, choice: ProductChoice) -> ProductChoice:
+    """Fill in the heading of crop rows where that is asked for.
+
+    Raises SettingsError: the run's classes, its place or its rows do not give what is asked for.
+    """
+    names = open_image(run.path(map_product(run)), "classes").about["class_names"]
+    class_numbers(names, choice.buffers_m, "--buffer")
+    if choice.prescription is not None:
+        class_numbers(names, choice.prescription.doses, "--prescription")
+        if load_geobox(run.path(map_product(run))) is None:
+            raise SettingsError(f"a prescription is in metres, and {NEEDS_PLACE}")
+        if choice.prescription.heading is None:
+            return replace(choice, prescription=replace(choice.prescription, heading=row_heading(run)))
+    return choice
+
+
+def write_zones(run: ExportedRun, folder: Path, choice: ProductChoice) -> Iterator[Made]:
+    """Write polygons and prescriptions that were asked for into ``folder``, each with its style."""
+    if not (choice.polygons or choice.prescription):
+        return
+    raster = ClassRaster.of(run).shaped(choice)
+    if choice.polygons:
+        yield from _write_polygons(run, raster, folder, choice)
+    if choice.prescription:
+        yield from _write_prescription(run, raster, folder, choice)
+
+
+def _write_polygons(run: ExportedRun, raster: ClassRaster, folder: Path, choice: ProductChoice) -> Iterator[Made]:
+    scale, crs = raster.scale, None if raster.geobox is None else crs_wkt(raster.geobox)
+    tolerance = 1.0 if scale is None or choice.simplify_m is None else choice.simplify_m / scale.pixel_m
+    found = class_polygons(raster.classes, tolerance).moved(raster.transform)
+    unit = "area_rad2" if scale is None else "area_m2"
+    area = found.polygon_areas() * (1.0 if scale is None else scale.pixel_m2 / abs(raster.transform.determinant))
+    names = [raster.legend.names[number] for number in found.classes]
+    columns = {"class": found.classes.astype(np.int32), "name": names, unit: area}
+    path = folder / "classes.gpkg"
+    write_geopackage(path, "classes", found.polygons, columns, crs, run.receipt["finished"])
+    yield Made("polygons", path, f"Classes as {len(names)} polygons", GEOPACKAGE)
+    entries: list[Entry] = [
+        (name, name, tuple(colour))
+        for name, colour in zip(raster.legend.names, raster.legend.colours.tolist(), strict=True)
+    ]
+    yield _styled(path, "name", entries)
+    if crs is not None:
+        path = folder / "classes.geojson"
+        write_geojson(path, "classes", found.polygons, columns, crs)
+        yield Made("polygons_geojson", path, "Classes as polygons, longitude and latitude", GEOJSON, fields=IN_DEGREES)
+
+
+def _styled(path: Path, column: str, entries: Sequence[Entry]) -> Made:
+    style = path.with_suffix(".qml")
+    write_polygon_style(style, column, entries)
+    return Made(f"{path.stem}_polygon_style", style, f"QGIS style of {path.name}", STYLE, ("metadata", "style"))
+
+
+def _write_prescription(run: ExportedRun, raster: ClassRaster, folder: Path, choice: ProductChoice) -> Iterator[Made]:
+    asked = choice.prescription
+    assert asked is not None
+    assert raster.geobox is not None
+    assert raster.scale is not None
+    doses = class_numbers(raster.legend.names, asked.doses, "--prescription")
+    assert asked.heading is not None
+    heading = Heading(asked.heading)
+    plane, to_own = to_plane(raster.geobox)
+    grid, found = _dosed(raster, doses, asked.least_share, (asked.cell_m, asked.cell_m), _turned(plane, heading))
+    seen = np.isfinite(found)
+    row, column = np.nonzero(seen)
+    columns = {"dose": found[seen], "unit": [asked.unit.name] * len(row), "row": row, "col": column}
+    path = folder / "prescription.shp"
+    write_shapefile(path, cell_polygons(grid, heading)[seen], columns, to_own)
+    words = ", ".join(f"{name} {dose:g} {asked.unit.name}" for name, dose in asked.doses.items())
+    title = f"Prescription ({words}) in cells of {asked.cell_m:g} m along {heading.degrees:g} degrees"
+    yield Made("prescription", path, f"{title}; .shx, .dbf, .prj and .cpg beside it", SHAPEFILE)
+    most = max(doses.values())
+    levels = sorted({0.0, *found[seen].tolist()})
+    shown = [(d, f"{d:g} {asked.unit.name}", ramp_colour(d / most, REDS) if d else NONE) for d in levels]
+    yield _styled(path, "dose", shown)
+    step = tuple(round(asked.cell_m / metres, DEGREE_DIGITS) for metres in raster.scale.degree_m)
+    degrees = to_degrees(raster.geobox)
+    grid, found = _dosed(raster, doses, asked.least_share, (step[0], step[1]), degrees)
+    known = int((raster.classes != UNLABELLED).sum())
+    told = TaskWords(
+        run.receipt["survey"], run.receipt["survey"], words, layer_version(run), known * raster.scale.pixel_m2
+    )
+    task = TaskGrid(*grid.corner, *grid.step, found, asked.unit)
+    for key, path, kind in zip(
+        ("task_data", "task_grid"),
+        write_task_data(folder, task, told),
+        ("application/xml", "application/octet-stream"),
+        strict=True,
+    ):
+        yield Made(
+            key, path, f"{title.split(' in ')[0]} as ISOXML task data, cells along north", kind, fields=IN_DEGREES
+        )
+
+
+def _turned(plane: ToAxes, heading: Heading) -> ToAxes:
+    def turned(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+        place = plane(x, y)
+        return heading.to_axes(place[..., 0], place[..., 1])
+
+    return turned
+
+
+def _dosed(
+    raster: ClassRaster, doses: dict[int, float], least_share: float, step: tuple[float, float], to_axes: ToAxes
+) -> tuple[CellGrid, NDArray[np.float64]]:
+    """Cells around all that has a class, and their doses."""
+    known = raster.classes != UNLABELLED
+    rows, columns = (np.flatnonzero(known.any(axis=axis)) for axis in (1, 0))
+    if not len(rows):
+        raise SettingsError("no pixel of the run's map has a class; there is nothing to prescribe")
+    width = raster.classes.shape[1]
+    edges = [pixel_axes(raster.transform, slice(r, r + 1), width, to_axes)[0] for r in (rows[0], rows[-1])]
+    sides = pixel_axes(raster.transform, slice(rows[0], rows[-1] + 1), width, to_axes)[:, [columns[0], columns[-1]]]
+    around = np.concatenate([*(edge[columns[0] : columns[-1] + 1] for edge in edges), sides.reshape(-1, 2)])
+    grid = CellGrid.around(around, step)
+    counts = count_classes(grid, raster.classes, raster.transform, to_axes, len(raster.legend.names))
+    return grid, dose_cells(counts, doses, least_share)
+
+
+def row_heading(run: ExportedRun) -> float:
+    """Heading of the crop rows on the map, 0 to 180 degrees clockwise from north, as the coarse look shows them.
+
+    Raises SettingsError: no rows are seen.
+    """
+    angle = find_rows(mosaic_brightness(run.path("mosaic"))).angle_deg
+    if angle is None:
+        raise SettingsError("no crop rows are seen in this run; give --heading in degrees from north")
+    across, down = np.cos(np.deg2rad(angle)), np.sin(np.deg2rad(angle))
+    ground = MosaicView(run).ground
+    if ground is None:
+        a, b, _, d, e, _ = MosaicView(run).place.transform
+        east, north = a * across + b * down, d * across + e * down
+    else:  # about the middle of the scene: perspective turns rows elsewhere a little otherwise
+        ends = ground.frame.view.scene_to_ground(np.array([[-down, -across], [down, across]]))
+        east, north = np.diff(ground.frame.ground_to_map(ends), axis=0)[0]
+    return round(float(np.rad2deg(np.arctan2(east, north))) % 180, 1)
+
+
+def layer_version(run: ExportedRun) -> str:
+    """Version of the program that made the run."""
+    return str(run.receipt["versions"].get("spectralzoom", "unknown"))

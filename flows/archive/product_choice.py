@@ -1,0 +1,131 @@
+"""What products an export is asked for: flags, what they mean for the classes of a run, and what cannot be meant."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from flows.cli.app import Switch, split_list
+from pipeline.errors import SettingsError
+from pipeline.products.indices import SpectralIndex, find_index
+from storage.export.task_data import UNITS, DoseUnit
+
+ROWS = "rows"  # said as a heading: along the crop rows
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class ProductFlags:
+    """What was given of the products to make of a run."""
+
+    reflectance: Annotated[Switch, Parameter(help="Also the coarse mosaic with all bands, as GeoTIFF.")] = False
+    indices: Annotated[
+        str | None, Parameter(help="Spectral indices to write as GeoTIFF, with commas: NDVI,NDRE,MCARI,PRI.")
+    ] = None
+    polygons: Annotated[
+        Switch, Parameter(help="Also the classes as polygons: GeoPackage, and GeoJSON where there is a CRS.")
+    ] = False
+    prescription: Annotated[
+        str | None,
+        Parameter(help="Doses by class, with commas: weed=2.5,grass=1. Written as shapefile and ISOXML task data."),
+    ] = None
+    dose_unit: Annotated[str, Parameter(help="Unit of the doses: l/ha or kg/ha.")] = "l/ha"
+    cell: Annotated[float, Parameter(help="Side of the prescription's cells [m].")] = 3.0
+    heading: Annotated[
+        str, Parameter(help="Along which its cells lie, clockwise from north [deg], or `rows`: along the crop rows.")
+    ] = "0"
+    least_share: Annotated[
+        float, Parameter(help="A cell gets the dose of a class of which it has more than this share, 0 to 1.")
+    ] = 0.0
+    least_area: Annotated[
+        float, Parameter(help="Regions below it go to their neighbour, in polygons and prescription [m2].")
+    ] = 0.0
+    buffer: Annotated[
+        str | None, Parameter(help="How far classes grow in polygons and prescription, with commas: weed=0.3 [m].")
+    ] = None
+    simplify: Annotated[
+        float | None, Parameter(help="By how much borders of polygons are simplified [m]; by default one pixel.")
+    ] = None
+
+
+NO_PRODUCTS = ProductFlags()
+
+
+@dataclass(frozen=True)
+class Prescription:
+    """Doses by class, and the cells that get them."""
+
+    doses: Mapping[str, float]
+    unit: DoseUnit
+    cell_m: float
+    heading: float | None  # degrees clockwise from north; None along the crop rows, whatever that is in a run
+    least_share: float
+
+
+@dataclass(frozen=True)
+class ProductChoice:
+    """Products to make of a run, checked as far as words alone can be."""
+
+    reflectance: bool
+    indices: tuple[SpectralIndex, ...]
+    polygons: bool
+    prescription: Prescription | None
+    least_area_m2: float
+    buffers_m: Mapping[str, float]
+    simplify_m: float | None  # None by a pixel
+
+
+def choose_products(flags: ProductFlags) -> ProductChoice:
+    """Read the flags. Raises SettingsError: a number, an index or a unit that cannot be, or that nothing asks for."""
+    for name, value in (("--least-area", flags.least_area), ("--simplify", flags.simplify or 0.0)):
+        if not 0 <= value < float("inf"):
+            raise SettingsError(f"{name} expects 0 or more, got {value:g}")
+    doses = by_class(flags.prescription, "--prescription", "weed=2.5")
+    if (flags.buffer or flags.least_area) and not (doses or flags.polygons):
+        raise SettingsError("--buffer and --least-area shape polygons and prescriptions; ask for one of them as well")
+    return ProductChoice(
+        flags.reflectance,
+        tuple(dict.fromkeys(find_index(name) for name in split_list(flags.indices))),
+        flags.polygons,
+        _prescription(flags, doses) if doses else None,
+        flags.least_area,
+        by_class(flags.buffer, "--buffer", "weed=0.3"),
+        flags.simplify,
+    )
+
+
+def _prescription(flags: ProductFlags, doses: Mapping[str, float]) -> Prescription:
+    if flags.dose_unit not in UNITS:
+        raise SettingsError(f"--dose-unit expects {' or '.join(UNITS)}, got {flags.dose_unit!r}")
+    if not 0 < flags.cell < float("inf"):
+        raise SettingsError(f"--cell expects metres above 0, got {flags.cell:g}")
+    if not 0 <= flags.least_share < 1:
+        raise SettingsError(f"--least-share expects a share from 0 to below 1, got {flags.least_share:g}")
+    try:
+        heading = None if flags.heading == ROWS else float(flags.heading) % 360
+    except ValueError:
+        raise SettingsError(f"--heading expects degrees from north, or {ROWS}, got {flags.heading!r}") from None
+    return Prescription(doses, UNITS[flags.dose_unit], flags.cell, heading, flags.least_share)
+
+
+def by_class(text: str | None, flag: str, example: str) -> dict[str, float]:
+    """Numbers by class out of ``weed=2.5,grass=1``. Raises SettingsError: not so, or less than 0."""
+    found = {}
+    for part in split_list(text):
+        name, _, number = part.partition("=")
+        if not re.fullmatch(r"\s*\d+(\.\d*)?|\s*\.\d+", number) or not name.strip():
+            raise SettingsError(f"{flag} expects classes with numbers, {example}, got {part!r}")
+        found[name.strip()] = float(number)
+    return found
+
+
+def class_numbers(names: Sequence[str], wanted: Mapping[str, float], flag: str) -> dict[int, float]:
+    """The same by the numbers of a run's classes. Raises SettingsError: the run has no class of a name."""
+    unknown = sorted(set(wanted) - set(names))
+    if unknown:
+        raise SettingsError(f"{flag}: the run has no class {unknown[0]!r}; its classes are {', '.join(names)}")
+    return {names.index(name): value for name, value in wanted.items()}

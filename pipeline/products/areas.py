@@ -1,0 +1,69 @@
+"""How large the classes of a map are, and how surely: from a confusion matrix, or from the map's own probabilities."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pipeline.errors import ShapeError
+
+Floats = NDArray[np.float64]
+
+BLOCK_PX = 16  # a side: errors within such a block are taken to come together, those of different blocks alone
+
+
+@dataclass(frozen=True)
+class ShareEstimate:
+    """Shares of the classes in what is mapped, and their standard errors."""
+
+    shares: Floats  # (class,)
+    errors: Floats  # (class,)
+
+
+def stratified_shares(mapped: ArrayLike, confusion: ArrayLike) -> ShareEstimate:
+    """Estimate shares from a map's and what pixels of each mapped class turned out to be.
+
+    ``mapped`` is (class,) shares of the map, ``confusion`` (label, mapped class) counts, as
+    `models.evaluation.metrics.confusion` gives them. The judged pixels are taken for a random sample of each mapped
+    class. NaN where a class that is mapped was judged at fewer than two pixels. Raises ShapeError: the sizes differ.
+
+    References
+    ----------
+    .. [1] Olofsson et al., "Good practices for estimating area and assessing accuracy of land change", Remote Sensing
+       of Environment 148, 2014. doi:10.1016/j.rse.2014.02.015
+    """
+    weight, counts = np.asarray(mapped, np.float64), np.asarray(confusion, np.float64)
+    if counts.shape != (len(weight), len(weight)):
+        raise ShapeError(f"{len(weight)} classes and a confusion matrix of {counts.shape} do not fit")
+    judged = counts.sum(axis=0)
+    with np.errstate(all="ignore"):  # a class that was not judged says nothing
+        of_map = np.where(weight > 0, counts / judged, 0.0)
+        spread = np.where(weight > 0, of_map * (1 - of_map) / (judged - 1), 0.0)
+    shares = (weight * of_map).sum(axis=1)  # [1] Eq. 9
+    errors = np.sqrt((weight**2 * spread).sum(axis=1))  # [1] Eq. 10
+    return ShareEstimate(shares, np.where(np.isfinite(shares), errors, np.nan))
+
+
+def probable_shares(strips: Iterable[NDArray[np.floating]], classes: int) -> ShareEstimate:
+    """Estimate shares from probabilities (y, x, class), given as strips of a map from the top down.
+
+    NaN where a pixel has no class. Strips are as high as a multiple of ``BLOCK_PX``, but for the last. Each pixel is
+    one draw by its probabilities; within a block of 16 x 16 px all draws go the same way, between blocks they are
+    independent, so that a map in large patches is not taken for surer than it is. NaN without any pixel.
+    """
+    total, expected, variance = 0, np.zeros(classes), np.zeros(classes)
+    for strip in strips:
+        known = np.isfinite(strip).all(axis=-1)
+        share = np.where(known[..., None], strip, 0.0).astype(np.float64)
+        total += int(known.sum())
+        expected += share.sum(axis=(0, 1))
+        spread = np.sqrt(share * (1 - share))
+        for axis in (0, 1):
+            spread = np.add.reduceat(spread, np.arange(0, spread.shape[axis], BLOCK_PX), axis=axis)
+        variance += (spread**2).sum(axis=(0, 1))
+    if not total:
+        return ShareEstimate(np.full(classes, np.nan), np.full(classes, np.nan))
+    return ShareEstimate(expected / total, np.sqrt(variance) / total)

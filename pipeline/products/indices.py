@@ -1,0 +1,214 @@
+"""Spectral indices by name: which bands each wants, and its values from a cube's.
+
+Names, formulas and the ranges of bands are those of Awesome Spectral Indices (Montero et al. 2023, doi:
+10.1038/s41597-023-02096-0), as the package spyndex has them; four that need narrower bands than satellites have are
+added from their papers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pipeline.errors import SettingsError, WavelengthError
+from pipeline.lazy import deferred
+
+if TYPE_CHECKING:
+    import spyndex
+else:
+    spyndex = deferred("spyndex")
+
+Floats = NDArray[np.float32]
+Formula = Callable[[Mapping[str, Any]], Any]
+
+DARK_SHARE = 0.01  # of white: pixels whose bands are darker on the mean have no index
+NARROW_NM = 10.0  # how far a band may lie from the wavelength that a narrow one is meant at
+MOST_REFLECTANCE = 1.5  # a cube of which one value in a hundred is above this holds no reflectance
+LAMBDA = "lambda"  # begins the names of what stands for a band's wavelength in a formula
+CONSTANTS = {"SAVI": {"L": 0.5}}  # where the list's default is another index's
+PAPERS_NM = {  # centres of the papers, where the list has those of a satellite
+    "MCARI": {"RE1": 700.0, "R": 670.0, "G": 550.0},
+    "TCARI": {"RE1": 700.0, "R": 670.0, "G": 550.0},
+    "MCARIOSAVI": {"RE1": 700.0, "R": 670.0, "G": 550.0, "N": 800.0},
+    "TCARIOSAVI": {"RE1": 700.0, "R": 670.0, "G": 550.0, "N": 800.0},
+}
+
+
+@dataclass(frozen=True)
+class IndexBand:
+    """A band that an index wants: the one nearest to ``centre_nm`` that lies within ``low_nm`` to ``high_nm``."""
+
+    symbol: str
+    title: str
+    centre_nm: float
+    low_nm: float
+    high_nm: float
+
+    def __str__(self) -> str:
+        return f"{self.title}, {self.low_nm:g} to {self.high_nm:g} nm"
+
+
+@dataclass(frozen=True)
+class SpectralIndex:
+    """One index by its name, and how it is worked out of the bands that it wants."""
+
+    name: str
+    title: str
+    reference: str
+    bands: tuple[IndexBand, ...]
+    formula: Formula  # of the bands' values and, with "lambda" before the symbol, wavelengths
+
+    @property
+    def wants_reflectance(self) -> bool:
+        """Whether values of another scale than 0 to 1 give another index, as where numbers are added to them."""
+        rising = {band.symbol: 0.2 + 0.05 * number for number, band in enumerate(self.bands)}
+        nm = {LAMBDA + band.symbol: band.centre_nm for band in self.bands}
+        twice = {symbol: 2 * value for symbol, value in rising.items()}
+        return not np.isclose(self.formula(rising | nm), self.formula(twice | nm), rtol=1e-9, atol=0)
+
+
+def _narrow(*centres_nm: float) -> tuple[IndexBand, ...]:
+    return tuple(
+        IndexBand(f"R{centre:.0f}", f"near {centre:g} nm", centre, centre - NARROW_NM, centre + NARROW_NM)
+        for centre in centres_nm
+    )
+
+
+NARROW = (
+    SpectralIndex(
+        "NDRE",
+        "Normalized Difference Red Edge",
+        "Barnes et al. 2000, 5th International Conference on Precision Agriculture",
+        _narrow(790, 720),
+        lambda v: (v["R790"] - v["R720"]) / (v["R790"] + v["R720"]),
+    ),
+    SpectralIndex(
+        "PRI",
+        "Photochemical Reflectance Index",
+        "https://doi.org/10.1016/0034-4257(92)90059-S",
+        _narrow(531, 570),
+        lambda v: (v["R531"] - v["R570"]) / (v["R531"] + v["R570"]),
+    ),
+    SpectralIndex(
+        "REIP",
+        "Red Edge Inflection Point [nm]",
+        "Guyot and Baret 1988, ESA SP-287",
+        _narrow(670, 700, 740, 780),
+        lambda v: 700 + 40 * ((v["R670"] + v["R780"]) / 2 - v["R700"]) / (v["R740"] - v["R700"]),
+    ),
+    SpectralIndex(
+        "WBI",
+        "Water Band Index",
+        "https://doi.org/10.1080/01431169308954010",
+        _narrow(970, 900),
+        lambda v: v["R900"] / v["R970"],
+    ),
+)
+
+
+def find_index(name: str) -> SpectralIndex:
+    """Give an index by its name, in capitals or not.
+
+    Raises SettingsError: there is none of that name, or it wants what no camera gives; names like it are told.
+    """
+    own = {index.name.lower(): index for index in NARROW}
+    if name.lower() in own:
+        return own[name.lower()]
+    listed = {one.lower(): one for one in spyndex.indices}
+    if name.lower() not in listed:
+        near = get_close_matches(name.lower(), [*own, *listed], n=3, cutoff=0.5)
+        named = ", ".join(own[one].name if one in own else listed[one] for one in near) or "NDVI, NDRE, MCARI, PRI"
+        raise SettingsError(
+            f"there is no index {name!r}; like it: {named}. All names: awesome-ee-spectral-indices.readthedocs.io, and "
+            f"{', '.join(index.name for index in NARROW)}"
+        )
+    return _listed(listed[name.lower()])
+
+
+def _listed(name: str) -> SpectralIndex:
+    """An index of spyndex's list, its constants filled in."""
+    about, bands, constants = spyndex.indices[name], [], {}
+    for symbol in about.bands:
+        if symbol in spyndex.bands:
+            band = spyndex.bands[symbol]
+            centre = _centre_nm(name, symbol)
+            bands.append(IndexBand(symbol, band.long_name, centre, band.min_wavelength, band.max_wavelength))
+        elif symbol.startswith(LAMBDA):  # of a band that the index itself may not want, as red in FDI
+            constants[symbol] = _centre_nm(name, symbol.removeprefix(LAMBDA))
+        else:
+            known = spyndex.constants[symbol].default if symbol in spyndex.constants else None
+            value = CONSTANTS.get(name, {}).get(symbol, known)
+            if value is None:
+                raise SettingsError(f"{name} ({about.long_name}) needs {symbol}, which no camera gives; choose another")
+            constants[symbol] = value
+    return SpectralIndex(
+        name,
+        about.long_name,
+        about.reference,
+        tuple(bands),
+        lambda values: spyndex.computeIndex(name, params={**constants, **values}),
+    )
+
+
+def _centre_nm(index: str, symbol: str) -> float:
+    """Where an index wants a band: as its paper says, else as Sentinel-2 has it, else in the middle of its range."""
+    band = spyndex.bands[symbol]
+    satellite = getattr(band, "sentinel2a", None)
+    usual = (band.min_wavelength + band.max_wavelength) / 2 if satellite is None else satellite.wavelength
+    return float(PAPERS_NM.get(index, {}).get(symbol, usual))
+
+
+def pick_bands(index: SpectralIndex, wavelength_nm: ArrayLike) -> tuple[int, ...]:
+    """Number, in a cube of (band,) wavelengths [nm], of the band that is taken for each that an index wants.
+
+    Raises WavelengthError: the cube has no wavelength in the range of one; says which, and what the cube has.
+    """
+    there = np.asarray(wavelength_nm, np.float64)
+    numbers, missing = [], []
+    for band in index.bands:
+        away = np.where((there >= band.low_nm) & (there <= band.high_nm), np.abs(there - band.centre_nm), np.inf)
+        numbers.append(int(np.argmin(away)))
+        if not np.isfinite(away.min()):
+            missing.append(band)
+    if missing:
+        raise WavelengthError(
+            f"{index.name} wants {' and '.join(map(str, missing))}, and the cube has no such band: "
+            f"{_spread(there)}; leave {index.name} out of --indices"
+        )
+    return tuple(numbers)
+
+
+def _spread(wavelength_nm: NDArray[np.float64]) -> str:
+    if len(wavelength_nm) <= 6:
+        return f"its bands lie at {', '.join(f'{one:g}' for one in wavelength_nm)} nm"
+    return f"its {len(wavelength_nm)} bands lie from {wavelength_nm.min():g} to {wavelength_nm.max():g} nm"
+
+
+def index_values(
+    index: SpectralIndex, values: NDArray[np.floating], wavelength_nm: Sequence[float], *, white: float = 1.0
+) -> Floats:
+    """Work an index out of the values (..., band) of the bands that `pick_bands` gave, and their wavelengths [nm].
+
+    NaN where a band has no value, where the bands are darker than 1 % of ``white`` on the mean, and where the formula
+    has no finite value, as by a division by zero.
+    """
+    usable: NDArray[np.bool_] = np.isfinite(values).all(axis=-1)
+    usable &= np.where(usable, values.mean(axis=-1), -np.inf) >= DARK_SHARE * white
+    planes = {band.symbol: values[..., number].astype(np.float64) for number, band in enumerate(index.bands)}
+    nm = {LAMBDA + band.symbol: float(wavelength_nm[number]) for number, band in enumerate(index.bands)}
+    with np.errstate(all="ignore"):  # what is not finite is NaN by rule
+        found = np.asarray(index.formula(planes | nm), np.float64)
+    result: Floats = np.where(usable & np.isfinite(found), found, np.nan).astype(np.float32)
+    return result
+
+
+def white_level(values: NDArray[np.floating]) -> float:
+    """What is white in a cube's values: 1 where they are reflectance, else the value that one in a hundred is above."""
+    known = values[np.isfinite(values)]
+    bright = float(np.percentile(known, 99)) if known.size else 0.0
+    return 1.0 if bright <= MOST_REFLECTANCE else bright

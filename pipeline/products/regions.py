@@ -1,0 +1,131 @@
+"""Regions of a class map: small ones given to a neighbour, classes grown; `outlines` makes polygons of them.
+
+A region is a set of pixels of one class that hang together by their sides. What has no class (255) is no region: it
+is never given to a class, nor takes anything from one, unless a class is grown over it on request.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from pipeline.geometry.grid import UNLABELLED
+from pipeline.lazy import deferred
+
+if TYPE_CHECKING:
+    import skimage.measure as skimage_measure
+else:
+    skimage_measure = deferred("skimage.measure")
+
+Classes = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class RegionGraph:
+    """Regions of a map and the sides of pixels between them."""
+
+    classes: Classes  # (region,)
+    sizes: NDArray[np.int64]  # (region,) px
+    pairs: NDArray[np.int64]  # (pair, 2) regions that touch, the lower number first
+    sides: NDArray[np.int64]  # (pair,) how many sides of pixels lie between them
+
+    def grouped(self, group: NDArray[np.integer]) -> RegionGraph:
+        """The graph of groups of regions, (region,) numbers of groups from 0; a group has its largest region's class.
+
+        Of equally large ones the first gives the class.
+        """
+        count = int(group.max(initial=-1)) + 1
+        sizes = np.bincount(group, self.sizes, count).astype(np.int64)
+        classes = np.empty(count, np.uint8)
+        order = np.lexsort((-np.arange(len(group)), self.sizes))  # the last one that is written stays
+        classes[group[order]] = self.classes[order]
+        return RegionGraph(classes, sizes, *_summed(group[self.pairs], self.sides, count))
+
+
+def _summed(
+    pairs: NDArray[np.integer], sides: NDArray[np.int64], count: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pairs of different regions, each once, with the sum of its sides."""
+    apart = pairs[:, 0] != pairs[:, 1]
+    low, high = pairs[apart].min(axis=1).astype(np.int64), pairs[apart].max(axis=1).astype(np.int64)
+    codes, number = np.unique(low * count + high, return_inverse=True)
+    return np.stack([codes // max(count, 1), codes % max(count, 1)], axis=-1), np.bincount(
+        number, sides[apart], len(codes)
+    ).astype(np.int64)
+
+
+def number_regions(classes: Classes) -> NDArray[np.int32]:
+    """Number the regions of a class map from 0, (y, x); what has no class is numbered too."""
+    label: Any = skimage_measure.label
+    found: NDArray[np.int32] = label(classes.astype(np.int16) + 1, connectivity=1, background=0).astype(np.int32)
+    return found - 1
+
+
+def find_regions(classes: Classes) -> tuple[NDArray[np.int32], RegionGraph]:
+    """Number the regions of a class map, (y, x), and give their graph."""
+    numbers = number_regions(classes)
+    count = int(numbers.max(initial=-1)) + 1
+    sizes = np.bincount(numbers.ravel(), minlength=count).astype(np.int64)
+    of_region = np.empty(count, np.uint8)
+    of_region[numbers.ravel()] = classes.ravel()
+    found = []
+    for here, there in ((numbers[:, :-1], numbers[:, 1:]), (numbers[:-1], numbers[1:])):
+        border = here != there
+        found.append(np.stack([here[border], there[border]], axis=-1))
+    pairs = np.concatenate(found)
+    return numbers, RegionGraph(of_region, sizes, *_summed(pairs, np.ones(len(pairs), np.int64), count))
+
+
+def merge_small(classes: Classes, least_px: float) -> Classes:
+    """Give every region of less than ``least_px`` pixels to the neighbour that it shares the longest border with.
+
+    Neighbours that are small as well go on together, as the class of the largest, until the whole is large enough.
+    What has no neighbour with a class stays, however small. Of borders equally long the neighbour numbered first (from
+    the upper left) is taken.
+    """
+    if least_px <= 1:
+        return classes.copy()
+    numbers, graph = find_regions(classes)
+    group: NDArray[np.integer] = np.arange(len(graph.classes))
+    while len(links := _links_of_small(graph, least_px)):
+        group_of = _joined(links, len(graph.classes))
+        graph, group = graph.grouped(group_of), group_of[group]
+        same = graph.pairs[graph.classes[graph.pairs[:, 0]] == graph.classes[graph.pairs[:, 1]]]
+        group_of = _joined(same, len(graph.classes))  # what became the class next to it is one region with it
+        graph, group = graph.grouped(group_of), group_of[group]
+    merged: Classes = graph.classes[group][numbers]
+    return merged
+
+
+def _links_of_small(graph: RegionGraph, least_px: float) -> NDArray[np.int64]:
+    """(link, 2): each small region with its neighbour of the longest border; none for those without a neighbour."""
+    known = (graph.classes[graph.pairs] != UNLABELLED).all(axis=1)
+    pairs, sides = graph.pairs[known], np.tile(graph.sides[known], 2)
+    ends = np.concatenate([pairs, pairs[:, ::-1]])
+    small = graph.sizes[ends[:, 0]] < least_px
+    ends, sides = ends[small], sides[small]
+    order = np.lexsort((ends[:, 1], -sides, ends[:, 0]))
+    first = np.unique(ends[order, 0], return_index=True)[1]
+    links: NDArray[np.int64] = ends[order][first]
+    return links
+
+
+def _joined(links: NDArray[np.int64], count: int) -> NDArray[np.int32]:
+    graph = coo_array((np.ones(len(links), np.int8), (links[:, 0], links[:, 1])), shape=(count, count))
+    groups: NDArray[np.int32] = connected_components(graph, directed=False)[1]
+    return groups
+
+
+def grow_class(classes: Classes, number: int, radius_px: float) -> Classes:
+    """Give a class all pixels whose centres lie within ``radius_px`` of one of its own; what has no class stays so."""
+    grown = classes.copy()
+    if radius_px > 0 and (classes == number).any():
+        away = ndimage.distance_transform_edt(classes != number)
+        grown[(away <= radius_px) & (classes != UNLABELLED)] = number
+    return grown

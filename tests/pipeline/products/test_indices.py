@@ -1,0 +1,74 @@
+"""Spectral indices: formulas by hand, bands by wavelength, NaN by rule, refusals that say what is wanted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.errors import SettingsError, WavelengthError
+from pipeline.products.indices import find_index, index_values, pick_bands, white_level
+
+FINE_NM = np.arange(400.0, 1000.0, 5.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "nm", "value"),
+    [
+        ("NDVI", {835: 0.5, 665: 0.1}, 0.4 / 0.6),
+        ("ndre", {790: 0.5, 720: 0.3}, 0.2 / 0.8),
+        ("PRI", {530: 0.06, 570: 0.08}, -0.02 / 0.14),
+        ("MCARI", {700: 0.2, 670: 0.1, 550: 0.15}, (0.1 - 0.2 * 0.05) * 2),
+        ("SAVI", {835: 0.5, 665: 0.1}, 1.5 * 0.4 / 1.1),
+        ("REIP", {670: 0.05, 700: 0.1, 740: 0.4, 780: 0.45}, 700 + 40 * (0.25 - 0.1) / 0.3),
+        ("GNDVI", {835: 0.5, 560: 0.2}, 0.3 / 0.7),
+    ],
+)
+def test_an_index_is_its_papers_formula_of_the_nearest_bands(name: str, nm: dict[float, float], value: float) -> None:
+    """Worked out by hand; every other band of the cube holds what would spoil it."""
+    index = find_index(name)
+    cube = np.full((1, 2, len(FINE_NM)), 0.9)
+    for centre, level in nm.items():
+        cube[..., centre == FINE_NM] = level
+    bands = list(pick_bands(index, FINE_NM))
+    np.testing.assert_allclose(index_values(index, cube[..., bands], FINE_NM[bands].tolist()), value, rtol=1e-6)
+
+
+def test_what_is_dark_missing_or_divided_by_zero_is_nan() -> None:
+    """A pixel of which the bands' mean is below 1 % of white, one without a value, and one where the formula ends."""
+    index = find_index("MCARI")  # divides by red
+    cube = np.array([[[0.2, 0.1, 0.1], [0.01, 0.005, 0.01], [0.2, np.nan, 0.1], [0.2, 0.0, 0.1]]])
+    found = index_values(index, cube, [700, 670, 550])
+    assert np.isnan(found).tolist() == [[False, True, True, True]]
+    scaled = index_values(find_index("NDVI"), 100 * cube[..., :2], [835, 665], white=100.0)
+    np.testing.assert_array_equal(scaled, index_values(find_index("NDVI"), cube[..., :2], [835, 665]))
+
+
+def test_a_cube_without_a_band_is_refused_with_what_is_wanted() -> None:
+    """Which band is missing, its range, and what the cube has."""
+    with pytest.raises(WavelengthError, match=r"NDVI wants .*760 to 900 nm, .*at 460, 550, 640 nm; leave NDVI out"):
+        pick_bands(find_index("NDVI"), [460, 550, 640])
+    assert pick_bands(find_index("MCARI"), [550, 667, 690, 712]) == (3, 1, 0)  # 690 is nearer to 700, and no red edge
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("NDVY", "like it: .*NDVI"), ("kNDVI", "needs kNN, which no camera gives"), ("RFDI", "which no camera gives")],
+)
+def test_what_is_no_index_of_a_camera_is_refused(name: str, words: str) -> None:
+    """Unknown names with those like them; radar and kernels with what they need."""
+    with pytest.raises(SettingsError, match=words):
+        find_index(name)
+
+
+def test_an_index_of_ratios_needs_no_reflectance() -> None:
+    """Told from the formula itself; what is white in a cube tells whether it holds reflectance."""
+    assert [find_index(name).wants_reflectance for name in ("NDVI", "PRI", "SAVI", "EVI", "MCARI")] == [
+        False,
+        False,
+        True,
+        True,
+        True,
+    ]
+    assert white_level(np.linspace(0, 1.2, 500)) == 1.0
+    assert white_level(np.linspace(0, 255, 500)) > 250
+    assert white_level(np.full(4, np.nan)) == 1.0
