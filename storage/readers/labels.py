@@ -12,7 +12,7 @@ small files made in these layouts, and on nothing else.
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -82,6 +82,22 @@ def load_labels(
         values=tuple(stated.values()),
         colours=np.array(colours, np.uint8).reshape(-1, 3),
     )
+
+
+def found_classes(addresses: Iterable[str | Path], unlabelled: ClassValue | None = None) -> dict[str, ClassValue]:
+    """Every value of several label files as one class each, named by it; errors as for :func:`load_labels`."""
+    codes: set[int] = set()
+    is_colour = isinstance(unlabelled, tuple)
+    parts = []
+    where = ""
+    for address in addresses:
+        values, of_colours = load_codes(address, by_number=False)
+        is_colour, where = is_colour or of_colours, str(address)
+        parts.append((np.unique(values), of_colours))
+    for values, of_colours in parts:  # a grey value g is the colour (g, g, g) where others have colours
+        codes |= {int(code) * (0x010101 if is_colour and not of_colours else 1) for code in values if code >= 0}
+    none = None if unlabelled is None else _code(unlabelled)
+    return _found_classes(np.array(sorted(codes), np.int64), none, is_colour, f"up to {where}")
 
 
 def load_codes(address: str | Path, *, by_number: bool) -> tuple[NDArray[np.int64], bool]:
