@@ -21,6 +21,7 @@ from flows.survey.scene import (
     FieldSource,
     check_labels,
     check_mask,
+    check_scene_there,
     farm_refusal,
     field_source,
     for_rig,
@@ -169,6 +170,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     `pipeline.errors` for the kinds.
     """
     settings = for_rig(settings)
+    check_scene_there(settings)
     path = weights_path(settings)
     described, load = describe_weights(path), Once(lambda: load_weights(path))
     check_two_scale(described.config, path)
@@ -177,7 +179,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     refused = farm_refusal(settings)
     if refused is not None and not planning:
         raise SettingsError(refused)
-    scene, notes = open_scene(settings)
+    scene, notes = open_scene(settings, described.class_names)
     if not planning:  # what the rig would find there: no stage's work
         scene.raster.drawn()
         scene.light()

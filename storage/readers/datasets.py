@@ -196,10 +196,7 @@ def _scenes(path: str | Path, train_mask: str | Path | None) -> _Scenes:
     folder = image_folder(file)
     settings = find_scene_settings(folder / SETTINGS_NAME)
     masks = () if train_mask is None else (split_variable(train_mask)[0].resolve(),)
-    if settings.labels is None:
-        found = match_folder(folder)
-    else:
-        found = _match_by_settings(folder, settings)
+    found = match_folder(folder) if settings.labels is None else _match_by_settings(folder, settings)
     images = [image for image in found.images if image.resolve() not in masks]
     if not images:
         raise SceneError(

@@ -80,7 +80,7 @@ def match_folder(folder: Path) -> MatchedFiles:
 
 def find_label(scene: Path) -> Path | None:
     """The label file of one scene by its name; None where there is none (SceneError: there are several)."""
-    if not scene.parent.is_dir() or scene.is_dir() and not _is_store(scene):
+    if not scene.parent.is_dir() or (scene.is_dir() and not _is_store(scene)):
         return None
     beside = [entry for entry in scene_entries(scene.parent) if is_label_name(entry) and entry != scene]
     return _label_of(scene, [*beside, *_in_label_folders(scene.parent)])
@@ -106,9 +106,7 @@ def _is_store(entry: Path) -> bool:
 def _in_label_folders(folder: Path) -> list[Path]:
     """All that may be labels in folders of labels: in this one, or beside it where it is one of images."""
     around = [folder, folder.parent] if is_image_folder(folder) else [folder]
-    found = [
-        entry for place in around for entry in sorted(place.iterdir()) if entry.name.lower() in LABEL_FOLDERS
-    ]
+    found = [entry for place in around for entry in sorted(place.iterdir()) if entry.name.lower() in LABEL_FOLDERS]
     return [entry for inner in found if inner.is_dir() and inner != folder for entry in scene_entries(inner)]
 
 

@@ -22,12 +22,17 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import UNLABELLED
-from storage.readers.array_files import variable_names
+from storage.readers.array_files import NAMED_ENDINGS, check_picture, variable_names
 from storage.readers.cube_sources import NEAR_INFRARED_NM, RGB_NM, Raster
 from storage.readers.raster_files import load_raster, split_variable
 from storage.readers.scene_toml import BandWavelengths, ClassValue, Colour
 
 MOST_FOUND_CLASSES = 64
+MIXED = (
+    "JPEG, soft edges and scaling mix values; save the labels again as PNG, with hard edges and by nearest neighbour,"
+    " or is this the picture itself?"
+)
+_MANY_UNKNOWN = 16  # values that are no class: nobody forgot so many
 
 # Eight colours that stay apart for most kinds of colour blindness (Okabe and Ito, 2008), in an order for maps.
 _EIGHT_COLOURS = (
@@ -145,8 +150,8 @@ def _found_classes(codes: NDArray[np.int64], none: int | None, is_colour: bool, 
     if len(found) > MOST_FOUND_CLASSES:
         what = "colours" if is_colour else "numbers"
         raise SceneError(
-            f"labels {where} have {len(found)} different {what}, at most {MOST_FOUND_CLASSES} are taken for classes; "
-            f"state [classes] in a scene.toml"
+            f"labels {where} have {len(found)} different {what}, at most {MOST_FOUND_CLASSES} are taken for classes: "
+            f"{MIXED}"
         )
     if is_colour:
         return {f"colour_{code:06x}": _colour(code) for code in found}
@@ -164,9 +169,10 @@ def _index(
     unknown = [int(value) for value in values if int(value) not in table and value not in (none, -1)]
     if unknown:
         count = int((codes == unknown[0]).sum())
+        cure = "add it to [classes] or state it as unlabelled in scene.toml"
         raise SceneError(
             f"labels {where} have {count} px of {_shown(unknown[0], classes)}, which is no class (and "
-            f"{len(unknown) - 1} more such values); add it to [classes] or state it as unlabelled in scene.toml"
+            f"{len(unknown) - 1} more such values); {MIXED if len(unknown) > _MANY_UNKNOWN else cure}"
         )
     lookup = np.array([table.get(int(value), UNLABELLED) for value in values], np.uint8)
     return lookup[inverse.reshape(codes.shape)]
@@ -229,8 +235,14 @@ def load_frame_or_raster(address: str | Path) -> tuple[Raster, Layout | None]:
 
     Raises SceneError: there is no such file, it is damaged, or of a kind that is not read.
     """
-    layout = find_layout(*split_variable(address))
-    return (load_raster(address, dims=3), None) if layout is None else (layout.raster, layout)
+    path, variable = split_variable(address)
+    layout = find_layout(path, variable)
+    if layout is not None:
+        return layout.raster, layout
+    raster = load_raster(address, dims=3)
+    if path.suffix.lower() in (".npy", *NAMED_ENDINGS):
+        check_picture(raster.values.shape, address)
+    return raster, None
 
 
 def find_layout(path: Path, variable: str | None) -> Layout | None:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.errors import SceneError
-from storage.readers.array_files import NAMED_ENDINGS, load_named, load_npy
+from storage.readers.array_files import NAMED_ENDINGS, load_named, load_npy, split_step, take_step
 from storage.readers.cube_sources import (
     DEFLATE_RATIO,
     GREY_NM,
@@ -173,11 +173,13 @@ SCENE_ENDINGS = (*IMAGE_ENDINGS, *TIFF_ENDINGS, ".npy", *NAMED_ENDINGS, ".hdr")
 _PILLOW_LIMIT = threading.RLock()  # it is the process's, not a call's
 _FORMATS = ("PNG", "JPEG", "BMP")  # whatever the ending says; Pillow's others may run programs
 _BYTES = {"I": 4, "F": 4, "I;16": 2, "I;16L": 2, "I;16B": 2}  # a number, by Pillow's mode; 1 in the others
-_WITH_VARIABLE = re.compile(r"^(?P<path>.+\.(?:mat|npz|zarr)):(?P<variable>[^/\\:]+)$", re.IGNORECASE)
+_WITH_VARIABLE = re.compile(
+    r"^(?P<path>.+\.(?:mat|npz|zarr|npy)):(?P<variable>[^/\\:]+(?::\d+)?)$", re.IGNORECASE | re.DOTALL
+)
 
 
 def split_variable(address: str | Path) -> tuple[Path, str | None]:
-    """``scene.mat:cube`` -> path and variable; None where the address names none."""
+    """``scene.mat:cube`` -> path and variable, with the step of time in ``cube:3``; None where none is named."""
     found = _WITH_VARIABLE.match(str(address))
     return (Path(address), None) if found is None else (Path(found["path"]), found["variable"])
 
@@ -222,9 +224,13 @@ def _read(path: Path, ending: str, variable: str | None, dims: int) -> Raster:
     if ending in TIFF_ENDINGS:
         return read_tiff(path)
     if ending == ".npy":
-        return Raster(load_npy(path))
+        named, step = split_step(variable, ())
+        if named is not None:
+            raise SceneError(f"{path} holds one array, which has no name; only a step of time can be told: {path}:0")
+        return Raster(take_step(load_npy(path), step, dims, str(path)))
     if ending != ".hdr":
-        return Raster(load_named(path, variable, dims))
+        values, notes = load_named(path, variable, dims)
+        return Raster(values, notes=notes)
     cube, known = open_envi_cube(path), None
     if cube.header.wavelength_nm is not None:
         known = BandWavelengths(cube.header.wavelength_nm, cube.header.fwhm_nm, f"wavelengths from {path}")

@@ -49,8 +49,15 @@ class SceneFile:
 
     def without_labels(self, note: str) -> SceneFile:
         """The same scene as if it had no labels; the note says why."""
-        nothing = {"labels": None, "class_names": (), "class_colours": self.class_colours[:0], "class_values": ()}
-        return replace(self, **nothing, content_hash=self.light_hash, provenance=(*self.provenance, note))
+        return replace(
+            self,
+            labels=None,
+            class_names=(),
+            class_colours=self.class_colours[:0],
+            class_values=(),
+            content_hash=self.light_hash,
+            provenance=(*self.provenance, note),
+        )
 
     def with_labels(self, labels: NDArray[np.uint8], note: str) -> SceneFile:
         """The same scene with other labels; hash and provenance say so."""
@@ -95,6 +102,7 @@ def load_scene_file(
     values, notes = _as_float(cube, chosen, nodata, file)
     shape = (cube.shape[0], cube.shape[1])
     by_name = labels is None and settings.labels is None
+    label_note: tuple[str, ...]
     if layout is not None and by_name:
         found, label_note = layout.labels, (layout.label_note,)
     else:
@@ -244,8 +252,8 @@ def label_file(scene: Path, settings: SceneSettings) -> tuple[Path | None, str]:
     number = scene_number(scene)
     if "{number}" in settings.labels and number is None:
         raise SceneError(
-            f"{scene} has no number in its name, which labels = {settings.labels!r} in scene.toml asks for; write {{name}}"
-            " for the whole name"
+            f"{scene} has no number in its name, which labels = {settings.labels!r} in scene.toml asks for; write"
+            " {name} for the whole name"
         )
     told = settings.labels.replace("{number}", number or "").replace("{name}", scene.stem)
     address = settings.path.parent / told
