@@ -54,7 +54,7 @@ def run_evaluate(request: EvaluateRequest, console: Console, *, as_json: bool = 
         sys.stdout.write(to_json(content))
     else:
         print_evaluation(content, on_stdout())
-    for note in content["notes"]:
+    for note in content["data_notes"]:
         console.print(f"note: {note}", markup=False, soft_wrap=True)
     for path in (*request.weights, *request.controls):
         if not describe_weights(path).sealed:
@@ -82,7 +82,7 @@ def evaluate_weights(request: EvaluateRequest, show: Show = lambda what, done, w
     work = Work(request, data, candidates, controls)
     made = work.judge(jobs, show)
     content = {"dataset": data.law, **_files(candidates, controls, jobs), **_figures(request, work, made)}
-    content["notes"] = [*data.notes, *alike_notes(jobs.alike)]
+    content["data_notes"] = [*data.notes, *alike_notes(jobs.alike)]
     content["files"] = publish_evaluation(work, content, made["frame"], show)
     return content
 

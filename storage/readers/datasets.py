@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import UNLABELLED
-from storage.readers.label_matching import MatchedFiles, image_folder, listed_names, match_folder, scene_entries
+from storage.readers.label_matching import (
+    MatchedFiles,
+    image_folder,
+    is_label_name,
+    listed_names,
+    match_folder,
+    scene_entries,
+)
 from storage.readers.labels import found_classes, load_codes
 from storage.readers.raster_files import SCENE_ENDINGS, split_variable
 from storage.readers.scene_files import SceneFile, label_file, load_scene_file, scene_number
@@ -221,8 +228,10 @@ def _match_by_settings(folder: Path, settings: SceneSettings) -> MatchedFiles:
         if address is not None:
             told[entry] = address
     labels = {split_variable(address)[0].resolve() for address in told.values()}
-    images = tuple(entry for entry in entries if entry.resolve() not in labels)
-    return MatchedFiles(images, {image: told[image] for image in images if image in told}, ())
+    others = [entry for entry in entries if entry.resolve() not in labels]
+    images = tuple(entry for entry in others if not is_label_name(entry)) or tuple(others)
+    alone = tuple(entry for entry in others if entry not in images)
+    return MatchedFiles(images, {image: told[image] for image in images if image in told}, alone)
 
 
 def _names(images: Sequence[Path]) -> dict[str, Path]:

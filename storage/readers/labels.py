@@ -141,6 +141,16 @@ def _colour(code: int) -> Colour:
     return code >> 16 & 255, code >> 8 & 255, code & 255
 
 
+def value_of_code(code: int, *, is_colour: bool) -> ClassValue:
+    """What a number of `load_codes` is in its file: itself, or a colour."""
+    return _colour(code) if is_colour else code
+
+
+def shown_value(code: int, *, is_colour: bool) -> str:
+    """The same, in words."""
+    return f"colour {list(_colour(int(code)))}" if is_colour else f"value {code}"
+
+
 def _found_classes(codes: NDArray[np.int64], none: int | None, is_colour: bool, where: str) -> dict[str, ClassValue]:
     """One class for each value in the file, ascending: ``class_N`` after a number, ``colour_RRGGBB`` after a colour.
 
@@ -179,8 +189,7 @@ def _index(
 
 
 def _shown(code: int, classes: Mapping[str, ClassValue]) -> str:
-    is_colour = any(isinstance(value, tuple) for value in classes.values())
-    return f"colour {list(_colour(code))}" if is_colour else f"value {code}"
+    return shown_value(code, is_colour=any(isinstance(value, tuple) for value in classes.values()))
 
 
 def default_colour(index: int) -> Colour:
