@@ -183,11 +183,11 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     if not planning:  # what the rig would find there: no stage's work
         scene.raster.drawn()
         scene.light()
+    band_notes = _check_bands(scene, described, path)
     label_notes = check_labels(scene, described)
     grid = SceneGrid(*scene.shape, described.config.patch, described.config.factor)
     settings, scans = choose_plain_scan(settings, described, path, grid, len(scene.wavelength_nm))
     plan = plan_capture(settings, grid)
-    band_notes = _check_bands(scene, described, path)
     if settings.mask is not None:
         check_mask(settings.mask, scene.shape)
     sealing = () if described.sealed else (unsealed_note(path),)

@@ -42,8 +42,14 @@ SAME_HOUR = 0.5  # by which true solar time is at most off mean solar time, and 
 def check_scene_there(settings: Settings) -> None:
     """Refuse a scene file that is not there, before anything else is asked for (SceneError)."""
     path, _ = split_variable(settings.scene)
-    if settings.scene not in (RIG_FIELD, *BUILT_IN_SCENES) and not path.exists():
-        raise SceneError(f"--scene {settings.scene}: there is no file {path}; check the name (seen from {Path.cwd()})")
+    if settings.scene in (RIG_FIELD, *BUILT_IN_SCENES):
+        return
+    try:
+        there, what = path.exists(), "a link that leads nowhere," if path.is_symlink() else "no file"
+    except OSError as error:  # such as a name longer than any
+        raise SceneError(f"--scene {settings.scene} cannot be the name of a file: {error.strerror}") from error
+    if not there:
+        raise SceneError(f"--scene {settings.scene}: there is {what} {path}; check the name (seen from {Path.cwd()})")
 
 
 def open_scene(settings: Settings, known: Sequence[str] | None = None) -> tuple[RasterScene, tuple[str, ...]]:

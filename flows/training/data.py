@@ -188,6 +188,9 @@ def alike_notes(alone: Mapping[str, str]) -> tuple[str, ...]:
 def trained_pixels(scene: RasterScene) -> NDArray[np.bool_]:
     """Pixels whose label training sees."""
     if scene.labels is None:
-        raise SceneError(f"scene {scene.name} has no labels; training needs them: give --labels or a scene.toml")
+        raise SceneError(
+            f"scene {scene.name} has no labels; training needs them: give --labels, or call"
+            f" its label file {scene.name}_mask.png or labels/{scene.name}.png (scene.toml: other names)"
+        )
     mask: NDArray[np.bool_] = scene.labels != UNLABELLED
     return mask

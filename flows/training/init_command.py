@@ -183,11 +183,11 @@ def _unseen(draft: SceneDraft) -> list[str]:
     """What somebody has to look at: what could not be told from the files, or does not fit."""
     found, told = draft.files, []
     if found.labels and found.bare:
-        told.append(f"{len(found.bare)} images have no labels, and are not trained on: {listed_names(found.bare)}")
+        told.append(f"labels of {len(found.bare)} images, which are not trained on: {listed_names(found.bare)}")
     if not found.labels:
-        told.append("no label files: beside an image NAME.png they are called NAME_mask.png, or labels/NAME.png")
+        told.append("label files: beside an image NAME.png they are called NAME_mask.png, or labels/NAME.png")
     if found.alone:
-        told.append(f"{len(found.alone)} label files belong to no image: {listed_names(found.alone)}")
+        told.append(f"the images of {len(found.alone)} label files: {listed_names(found.alone)}")
     if draft.wavelength_nm is None:
         told.append(f"the wavelengths of {draft.shape[2]} bands: write wavelengths_nm into {SETTINGS_NAME}")
     if len(draft.classes) == 1:

@@ -227,7 +227,8 @@ def _question_labels(about: _About, dataset: str, tell: Callable[[str], None]) -
 def _common(request: TrainRequest, scene: RasterScene) -> _About:
     trained_pixels(scene)  # refuses a scene without labels
     if len(scene.class_names) < 2:
-        raise SceneError(f"scene {scene.name} has {len(scene.class_names)} class; training needs two or more")
+        notes = alike_notes({scene.name: scene.class_names[0]})
+        raise SceneError(f"{request.dataset}: training needs two or more classes, and {notes[0]}")
     basis = SpectralBasis.spanning(scene.wavelength_nm, request.columns)
     patch = request.patch or suggested_patch(scene.shape, built_in=request.dataset in FARM_NAMES)
     about = _About(basis, scene.class_names, scene.class_colours, patch, scene.wavelength_nm)

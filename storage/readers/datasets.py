@@ -207,7 +207,7 @@ def _scenes(path: str | Path, train_mask: str | Path | None) -> _Scenes:
     images = [image for image in found.images if image.resolve() not in masks]
     if not images:
         raise SceneError(
-            f"{folder} holds no scene ({', '.join(SCENE_ENDINGS)}); give a folder with images/ and a {SETTINGS_NAME}"
+            f"{folder} holds no scene ({', '.join(SCENE_ENDINGS)}); give a folder of images, or with images/ in it"
         )
     names = _names(images)
     return _Scenes(

@@ -6,6 +6,7 @@ folder of images (``labels/001.png``, ``annotations/001_annotation.png``). Upper
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -118,9 +119,11 @@ def _label_of(image: Path, candidates: Sequence[Path]) -> Path | None:
         found = [one for one in candidates if wanted in (alike(one.stem.lower()), alike(_bare(one)))]
         if len(found) > 1:
             names = " and ".join(str(one) for one in found[:SHOWN])
+            home = image.parent.parent if is_image_folder(image.parent) else image.parent
+            told = Path(os.path.relpath(found[0].parent, home), found[0].name.replace(image.stem, "{name}", 1))
             raise SceneError(
                 f"{image} has several files of labels by their names: {names}; keep one, or say which in a"
-                f' {SETTINGS_NAME}: labels = "{found[0].parent.name}/{{name}}{found[0].suffix}"'
+                f' {SETTINGS_NAME}: labels = "{told.as_posix()}"'
             )
         if found:
             return found[0]

@@ -93,16 +93,17 @@ def found_classes(addresses: Iterable[str | Path], unlabelled: ClassValue | None
     """Every value of several label files as one class each, named by it; errors as for :func:`load_labels`."""
     codes: set[int] = set()
     is_colour = isinstance(unlabelled, tuple)
-    parts = []
-    where = ""
+    parts: list[tuple[NDArray[np.int64], bool]] = []
     for address in addresses:
         values, of_colours = load_codes(address, by_number=False)
-        is_colour, where = is_colour or of_colours, str(address)
+        is_colour = is_colour or of_colours
         parts.append((np.unique(values), of_colours))
+        if len(parts[-1][0]) > MOST_FOUND_CLASSES:
+            _found_classes(parts[-1][0], None, of_colours, str(address))  # refuses this file by its name
     for values, of_colours in parts:  # a grey value g is the colour (g, g, g) where others have colours
         codes |= {int(code) * (0x010101 if is_colour and not of_colours else 1) for code in values if code >= 0}
     none = None if unlabelled is None else _code(unlabelled)
-    return _found_classes(np.array(sorted(codes), np.int64), none, is_colour, f"up to {where}")
+    return _found_classes(np.array(sorted(codes), np.int64), none, is_colour, f"of {len(parts)} files")
 
 
 def load_codes(address: str | Path, *, by_number: bool) -> tuple[NDArray[np.int64], bool]:

@@ -196,6 +196,8 @@ def load_raster(address: str | Path, *, dims: int) -> Raster:
     if not path.is_file():
         raise SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
     ending = path.suffix.lower()
+    if ending in TIFF_ENDINGS and (guess := content_guess(path)):
+        raise SceneError(f"{path} cannot be read as {ending}: {guess}")
     if ending not in SCENE_ENDINGS:
         raise SceneError(f"{path} ends in {ending or 'nothing'}, which is not read; use {', '.join(SCENE_ENDINGS)}")
     try:
@@ -205,11 +207,34 @@ def load_raster(address: str | Path, *, dims: int) -> Raster:
     except Exception as error:  # decoders raise anything at all on damaged bytes
         objects = "pickle" in str(error) or "Python objects" in str(error)
         why = "it holds Python objects or is damaged" if objects else str(error)
-        raise SceneError(f"{path} cannot be read as {ending}: {why}; write it again as plain numbers") from error
+        cure = "write it again as plain numbers" if ending not in IMAGE_ENDINGS else "copy it again, or save it as PNG"
+        raise SceneError(f"{path} cannot be read as {ending}: {why}; {content_guess(path) or cure}") from error
     check_numbers(raster.values.dtype, path)
     if raster.values.size == 0:
         raise SceneError(f"{path} holds an empty array of shape {raster.values.shape}")
     return raster
+
+
+_BEGINNINGS = {  # of files, and the endings that go with them
+    b"\x89PNG": (".png",),
+    b"\xff\xd8\xff": (".jpg", ".jpeg"),
+    b"II*\0": TIFF_ENDINGS,
+    b"MM\0*": TIFF_ENDINGS,
+    b"\x93NUMPY": (".npy",),
+    b"PK\x03\x04": (".npz",),
+    b"\x89HDF": (".mat",),
+    b"MATLAB": (".mat",),
+}
+
+
+def content_guess(path: Path) -> str:
+    """What to do with a file that begins as one of another ending does; nothing where it does not."""
+    with path.open("rb") as file:
+        head = file.read(8)
+    for begins, endings in _BEGINNINGS.items():
+        if head.startswith(begins) and path.suffix.lower() not in endings:
+            return f"it begins as a {endings[0]} file does; give it that ending"
+    return ""
 
 
 def _read(path: Path, ending: str, variable: str | None, dims: int) -> Raster:
@@ -246,6 +271,15 @@ def _of_any_size() -> Iterator[None]:
             yield
         finally:
             Image.MAX_IMAGE_PIXELS = before
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Rows and columns of a picture by its head (SceneError: it is damaged, or of another kind than its ending)."""
+    try:
+        with _of_any_size(), Image.open(path, formats=_FORMATS) as image:
+            return image.size[1], image.size[0]
+    except Exception as error:  # decoders raise anything at all on damaged bytes
+        raise SceneError(f"{path} cannot be read as {path.suffix.lower()}: {error}; is it damaged?") from error
 
 
 def _is_deep_colour(path: Path) -> bool:

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from pipeline.errors import PipelineError, SceneError
 from pipeline.readings import edge_fill
@@ -18,7 +17,7 @@ from storage.readers.cube_sources import CubeSource
 from storage.readers.label_matching import MatchedFiles, find_label, image_folder, is_label_name, match_folder
 from storage.readers.labels import MIXED, MOST_FOUND_CLASSES, load_codes, shown_value, value_of_code
 from storage.readers.legends import Legend, find_legend
-from storage.readers.raster_files import IMAGE_ENDINGS, TIFF_ENDINGS, open_tiff_rows, split_variable
+from storage.readers.raster_files import IMAGE_ENDINGS, TIFF_ENDINGS, image_size, open_tiff_rows, split_variable
 from storage.readers.scan_files import open_cube_source
 from storage.readers.scene_files import scene_number
 from storage.readers.scene_toml import ClassValue
@@ -164,7 +163,8 @@ def _refuse_mixed(label: Path, values: NDArray[np.int64], counts: NDArray[np.int
     most = np.argsort(-counts)[:4]
     shown = ", ".join(f"{shown_value(values[at], is_colour=is_colour)} {counts[at] / counts.sum():.0%}" for at in most)
     what = "colours" if is_colour else "numbers"
-    raise SceneError(f"{label} has {len(values)} different {what} (most of it: {shown}): {MIXED}")
+    told = f" (most of it: {shown})" if counts[most].sum() > counts.sum() / 2 else ""
+    raise SceneError(f"{label} has {len(values)} different {what}{told}: {MIXED}")
 
 
 def _refuse_many(counts: Counter[int]) -> None:
@@ -178,11 +178,7 @@ def _refuse_many(counts: Counter[int]) -> None:
 def _size(image: Path) -> tuple[int, int]:
     """Rows and columns of an image, by its head where it has one."""
     if image.suffix.lower() in IMAGE_ENDINGS:
-        try:
-            with Image.open(image) as file:
-                return file.size[1], file.size[0]
-        except (OSError, ValueError, Image.DecompressionBombError):
-            pass  # whoever reads it says why
+        return image_size(image)
     rows = open_tiff_rows(image) if image.suffix.lower() in TIFF_ENDINGS else None
     shape = open_cube_source(image).shape if rows is None else rows.shape
     return shape[0], shape[1]

@@ -89,6 +89,7 @@ def load_scene_file(
     settings = find_scene_settings(file)
     cube = raster.three_axes(file)
     chosen = _chosen_bands(bands, settings, cube.shape[2], file)
+    _refuse_bands_first(file, cube.shape, wavelengths or settings.wavelengths_nm)
     light = settle_wavelengths(
         file,
         chosen,
@@ -156,6 +157,16 @@ def load_scan(address: str | Path) -> Raster:
         known=known_bands(source),
         files=source.files,
     )
+
+
+def _refuse_bands_first(path: Path, shape: tuple[int, ...], wavelengths: Sequence[float] | None) -> None:
+    """Refuse a cube that has as many rows as there are wavelengths, and other bands (SceneError)."""
+    count = 0 if wavelengths is None else len(wavelengths)
+    if count > 1 and shape[0] == count != shape[2] and shape[1] != shape[2]:
+        raise SceneError(
+            f"{path} has the axes {shape}, read as (y, x, band), and there are {count} wavelengths: its bands come"
+            " first; store it with the bands last, np.moveaxis(values, 0, -1)"
+        )
 
 
 def _content_hash(file: Path, raster: Raster) -> str:
