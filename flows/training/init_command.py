@@ -80,7 +80,10 @@ def _set_aside(path: Path) -> Iterator[None]:
 def scene_text(draft: SceneDraft) -> str:
     """The lines of a scene.toml, each with a comment on where it comes from."""
     parts = [
-        [f"# What {len(draft.files.images)} image(s) do not say of themselves, as `spectralzoom init` saw it."],
+        [
+            f"# What {_counted(len(draft.files.images), 'image')} here cannot say, as `spectralzoom init` saw it.",
+            "# Any line may be changed or taken away; what comes after a # is a comment.",
+        ],
         _label_lines(draft),
         _wavelength_lines(draft),
         _nodata_lines(draft),
@@ -113,7 +116,7 @@ def _wavelength_lines(draft: SceneDraft) -> list[str]:
         low, high = draft.wavelength_nm.min(), draft.wavelength_nm.max()
         return [f"# {bands} bands, {low:g}-{high:g} nm: {_said(draft.wavelength_origin)}"]
     listed = ", ".join(repr(float(nm)) for nm in draft.wavelength_nm)
-    return [f"wavelengths_nm = [{listed}]   # assumed of its colours"]
+    return [f"# wavelengths_nm = [{listed}]   # assumed of its colours: if you know better, take away the first #"]
 
 
 def _nodata_lines(draft: SceneDraft) -> list[str]:
@@ -143,6 +146,10 @@ def _class_lines(classes: tuple[FoundClass, ...], legend: Path | None) -> list[s
     named = f"names from {_said(legend.name)}" if legend is not None else "rename them as you like"
     lines += ["", f"[classes]   # name = value in the label files, share of all pixels; {named}"]
     return lines + [f"{_key(one.name)} = {_value(one)}   # {one.share:.1%}" for one in classes if one not in void[:1]]
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}{'s' if count != 1 else ''}"
 
 
 def _value(one: FoundClass) -> str:
@@ -183,11 +190,12 @@ def _unseen(draft: SceneDraft) -> list[str]:
     """What somebody has to look at: what could not be told from the files, or does not fit."""
     found, told = draft.files, []
     if found.labels and found.bare:
-        told.append(f"labels of {len(found.bare)} images, which are not trained on: {listed_names(found.bare)}")
+        images = _counted(len(found.bare), "image")
+        told.append(f"labels of {images}, left out of the training: {listed_names(found.bare)}")
     if not found.labels:
         told.append("label files: beside an image NAME.png they are called NAME_mask.png, or labels/NAME.png")
     if found.alone:
-        told.append(f"the images of {len(found.alone)} label files: {listed_names(found.alone)}")
+        told.append(f"the image of {_counted(len(found.alone), 'label file')}: {listed_names(found.alone)}")
     if draft.wavelength_nm is None:
         told.append(f"the wavelengths of {draft.shape[2]} bands: write wavelengths_nm into {SETTINGS_NAME}")
     if len(draft.classes) == 1:
@@ -206,7 +214,7 @@ def _next(source: str, draft: SceneDraft) -> str:
 
 def _show(record: dict[str, Any], console: Console) -> None:
     height, width, bands = record["shape"]
-    images = f"{record['images']} image{'s' if record['images'] != 1 else ''}"
+    images = _counted(record["images"], "image")
     names = ", ".join(one["name"] for one in record["classes"][:8])
     more = f" and {len(record['classes']) - 8} more" if len(record["classes"]) > 8 else ""
     console.print(f"{images}, {record['labelled']} with labels; the first has {height} x {width} px, {bands} bands")

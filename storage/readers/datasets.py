@@ -50,8 +50,8 @@ class DataSet:
     def notes(self) -> tuple[str, ...]:
         """What was left out: scenes without labels, and labels without a scene."""
         bare = [Path(self.files[name]) for name in self.unlabelled]
-        told = [f"{len(bare)} of {len(self.files)} scenes have no labels and are left out: {listed_names(bare)}"]
-        lone = [f"{len(self.alone)} label files belong to no scene: {listed_names(self.alone)}"]
+        told = [f"of {len(self.files)} scenes {len(bare)} without labels left out: {listed_names(bare)}"]
+        lone = [f"label files without a scene, {len(self.alone)}: {listed_names(self.alone)}"]
         return (*(told if bare else ()), *(lone if self.alone else ()))
 
     @cached_property
@@ -230,7 +230,9 @@ def _match_by_settings(folder: Path, settings: SceneSettings) -> MatchedFiles:
     labels = {split_variable(address)[0].resolve() for address in told.values()}
     others = [entry for entry in entries if entry.resolve() not in labels]
     images = tuple(entry for entry in others if not is_label_name(entry)) or tuple(others)
-    alone = tuple(entry for entry in others if entry not in images)
+    apart = {address.parent for address in told.values()} - {folder}
+    beside = [entry for place in sorted(apart) if place.is_dir() for entry in scene_entries(place)]
+    alone = tuple(one for one in (*others, *beside) if one not in images and one.resolve() not in labels)
     return MatchedFiles(images, {image: told[image] for image in images if image in told}, alone)
 
 

@@ -273,11 +273,15 @@ def _of_any_size() -> Iterator[None]:
             Image.MAX_IMAGE_PIXELS = before
 
 
-def image_size(path: Path) -> tuple[int, int]:
-    """Rows and columns of a picture by its head (SceneError: it is damaged, or of another kind than its ending)."""
+def image_shape(path: Path) -> tuple[int, int, int]:
+    """(y, x, band) of a picture by its head (SceneError: it is damaged, or of another kind than its ending)."""
     try:
         with _of_any_size(), Image.open(path, formats=_FORMATS) as image:
-            return image.size[1], image.size[0]
+            return (
+                image.size[1],
+                image.size[0],
+                1 if image.mode in ("1", "L", "LA", "La", "F") or "I" in image.mode else 3,
+            )
     except Exception as error:  # decoders raise anything at all on damaged bytes
         raise SceneError(f"{path} cannot be read as {path.suffix.lower()}: {error}; is it damaged?") from error
 

@@ -17,7 +17,7 @@ from storage.readers.cube_sources import CubeSource
 from storage.readers.label_matching import MatchedFiles, find_label, image_folder, is_label_name, match_folder
 from storage.readers.labels import MIXED, MOST_FOUND_CLASSES, load_codes, shown_value, value_of_code
 from storage.readers.legends import Legend, find_legend
-from storage.readers.raster_files import IMAGE_ENDINGS, TIFF_ENDINGS, image_size, open_tiff_rows, split_variable
+from storage.readers.raster_files import IMAGE_ENDINGS, TIFF_ENDINGS, image_shape, open_tiff_rows, split_variable
 from storage.readers.scan_files import open_cube_source
 from storage.readers.scene_files import scene_number
 from storage.readers.scene_toml import ClassValue
@@ -74,7 +74,7 @@ def draft_scene(address: str | Path, report: Report = lambda done, name: None) -
     source = open_cube_source(address if alone else found.images[0])
     legend = find_legend([folder, *(label.parent for label in found.labels.values())], list(found.labels.values()))
     unseen: list[str] = []
-    classes = _classes(found, source.shape[:2], legend, unseen, report)
+    classes = _classes(found, source.shape, legend, unseen, report)
     edge, missing = _look_at_edge(source)
     return SceneDraft(
         folder=folder,
@@ -120,7 +120,7 @@ def _filled(pattern: str, image: Path) -> str:
 
 
 def _classes(
-    found: MatchedFiles, shape: tuple[int, int], legend: Legend | None, unseen: list[str], report: Report
+    found: MatchedFiles, shape: tuple[int, int, int], legend: Legend | None, unseen: list[str], report: Report
 ) -> tuple[FoundClass, ...]:
     """All values of the label files, as classes; what cannot be read or has another size than its image is told."""
     by_number = legend is not None and bool(legend.listed or any(isinstance(one, int) for one in legend.names))
@@ -130,17 +130,20 @@ def _classes(
         report(number / len(found.labels), label.name)
         try:
             codes, is_colour = load_codes(label, by_number=by_number)
-            size = shape if image == found.images[0] else _size(image)
+            size = shape if image == found.images[0] else _shape(image)
         except PipelineError as error:
             unseen.append(str(error))
             continue
-        if codes.shape != size:
+        if size[2] != shape[2]:
+            unseen.append(f"{image} has {size[2]} bands, the first image {shape[2]}: train on images of one camera")
+        if codes.shape != size[:2]:
             unseen.append(f"{label} is {codes.shape[0]} x {codes.shape[1]} px, its image {size[0]} x {size[1]} (y x x)")
         values, number_of = np.unique(codes, return_counts=True)
         _refuse_mixed(label, values, number_of, is_colour=is_colour)
         into = counts if is_colour else greys
         into.update({int(value): int(count) for value, count in zip(values, number_of, strict=True) if value >= 0})
-    report(1.0, "")
+    if found.labels:
+        report(1.0, "")
     of_colours = bool(counts)
     counts.update({code * (0x010101 if of_colours else 1): count for code, count in greys.items()})
     _refuse_many(counts)
@@ -175,13 +178,12 @@ def _refuse_many(counts: Counter[int]) -> None:
         )
 
 
-def _size(image: Path) -> tuple[int, int]:
-    """Rows and columns of an image, by its head where it has one."""
+def _shape(image: Path) -> tuple[int, int, int]:
+    """(y, x, band) of an image, by its head where it has one."""
     if image.suffix.lower() in IMAGE_ENDINGS:
-        return image_size(image)
+        return image_shape(image)
     rows = open_tiff_rows(image) if image.suffix.lower() in TIFF_ENDINGS else None
-    shape = open_cube_source(image).shape if rows is None else rows.shape
-    return shape[0], shape[1]
+    return open_cube_source(image).shape if rows is None else rows.shape
 
 
 def _look_at_edge(source: CubeSource) -> tuple[tuple[float, float] | None, float]:
