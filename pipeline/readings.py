@@ -58,3 +58,23 @@ def readings_alone(values: NDArray[np.floating], most: float) -> NDArray[np.floa
     """Give values with NaN for those that are no readings; the same array where all are."""
     found = beyond_range(values, most)
     return values if found is None else np.where(found, values.dtype.type(np.nan), values)
+
+
+MOST_EDGE = 0.1  # of a picture's edge that is one value: by chance it is less
+
+
+def edge_fill(edge: NDArray[Any]) -> tuple[float, float] | None:
+    """The value that a picture's edge may be filled with, and its share of the edge; None where nothing suggests one.
+
+    ``edge`` is (pixel, band), NaN where nothing is known. Taken is the commonest value that all bands of a pixel have,
+    where it is 0 or less, the most that its kind of whole numbers holds, or no reading.
+    """
+    alike = edge[(edge == edge[:, :1]).all(axis=1), 0]
+    if not alike.size:
+        return None
+    values, counts = np.unique(alike, return_counts=True)
+    value, share = values[counts.argmax()], float(counts.max()) / len(edge)
+    ends = edge.dtype.kind in "iu" and value == np.iinfo(edge.dtype).max
+    if share < MOST_EDGE or not (value <= 0 or ends or value > MOST_VALUE):
+        return None
+    return float(value), share

@@ -32,6 +32,7 @@ VERBS = {  # by what is typed: the module of the function, loaded once it is ask
     "reprocess": "flows.archive.reprocess_command",
     "serve": "flows.schedule.serve_command",
     "report": "flows.schedule.history",
+    "init": "flows.training.init_command",
     "train": "flows.cli.model_verbs",
     "evaluate": "flows.cli.model_verbs",
     "tradeoff": "flows.cli.model_verbs",

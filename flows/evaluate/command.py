@@ -30,6 +30,7 @@ from flows.evaluate.table import print_evaluation
 from flows.evaluate.work import Made, Work
 from flows.terminal.processes import writing
 from flows.terminal.progress import StageProgress, on_stdout
+from flows.training.data import alike_notes
 from models.evaluation.bootstrap import LEVEL
 from models.evaluation.metrics import agreement, false_pixels, iou_per_class, mean_iou
 from models.network.process import keep_freed_memory
@@ -53,6 +54,8 @@ def run_evaluate(request: EvaluateRequest, console: Console, *, as_json: bool = 
         sys.stdout.write(to_json(content))
     else:
         print_evaluation(content, on_stdout())
+    for note in content["data_notes"]:
+        console.print(f"note: {note}", markup=False, soft_wrap=True)
     for path in (*request.weights, *request.controls):
         if not describe_weights(path).sealed:
             console.print(f"note: {unsealed_note(path)}", markup=False, soft_wrap=True)
@@ -79,6 +82,7 @@ def evaluate_weights(request: EvaluateRequest, show: Show = lambda what, done, w
     work = Work(request, data, candidates, controls)
     made = work.judge(jobs, show)
     content = {"dataset": data.law, **_files(candidates, controls, jobs), **_figures(request, work, made)}
+    content["data_notes"] = [*data.notes, *alike_notes(jobs.alike)]
     content["files"] = publish_evaluation(work, content, made["frame"], show)
     return content
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.survey.scene import check_labels, judged_labels
-from flows.training.data import TrainingData, farm_test_data, open_training_data
+from flows.training.data import TrainingData, farm_test_data, only_class, open_training_data
 from flows.training.look import observe_scene
 from models.evaluation.bootstrap import DRAWS
 from models.network.spectral import patches_of
@@ -204,7 +204,7 @@ def open_frames(
     if unknown:
         raise SceneError(f"{dataset} has no frame {', '.join(unknown)}; it has {', '.join(data.train)}")
     names = tuple(name for name in data.train if not frames or name in frames)
-    return TrainingData(data.law, names, (), (), data.camera, data.files)
+    return TrainingData(data.law, names, (), (), data.camera, data.files, data.notes)
 
 
 def look_at(scene: RasterScene, name: str, weights: Weights, camera: LineCamera, seed: int) -> Look:
@@ -252,6 +252,7 @@ class Jobs:
 
     frames: list[Job]
     left_out: list[str]
+    alike: dict[str, str] = field(default_factory=dict)  # frame -> class, where all its labels are one
 
     def covered(self, number: int, *, control: bool = False) -> list[str]:
         return [job.name for job in self.frames if number in (job.controls if control else job.weights)]
@@ -284,6 +285,8 @@ def sort_frames(
             raise SceneError(
                 f"frame {scene.name} has no labels, and a map is judged by labels: give --labels or a scene.toml"
             )
+        if (alone := only_class(scene)) is not None:
+            jobs.alike[name] = alone
         for one in weights:
             check_labels(scene, one.described)
         job = Job(name, *(_fit(some, scene, name, data.law, chosen) for some in (weights, controls)))

@@ -139,7 +139,8 @@ def load_settings(
     except FileNotFoundError:
         raise SettingsError(f"no settings file {path}; give the path of a survey's TOML file, or none") from None
     except ValueError as error:
-        raise SettingsError(f"cannot read the settings file {path}: {error}; expected TOML in UTF-8") from None
+        scene = f"; a scene is given as --scene {path}" if Path(str(path)).suffix != ".toml" else ""
+        raise SettingsError(f"cannot read the settings file {path}: {error}; expected TOML in UTF-8{scene}") from None
     origin = dict.fromkeys(table, str(path))
     for name in TABLES:
         inner = table.get(name)

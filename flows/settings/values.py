@@ -71,7 +71,9 @@ def parse_budget(value: object) -> float:
     """A share of the full scan's seconds above 0 and at most 1; raises BudgetError."""
     number = _to_float(value)
     if number is None or not 0 < number <= 1:
-        hint = f"; for {number:g} % write {number / 100:g}" if number is not None and 1 < number <= 100 else ""
+        percent = _to_float(value.removesuffix("%")) if isinstance(value, str) else number
+        told = percent is not None and 1 < percent <= 100
+        hint = f"; for {percent:g} % write {percent / 100:g}" if told and percent is not None else ""
         raise BudgetError(f"must be a share of the full scan's seconds, above 0 and at most 1, got {value!r}{hint}")
     return number
 

@@ -21,6 +21,7 @@ from flows.survey.scene import (
     FieldSource,
     check_labels,
     check_mask,
+    check_scene_there,
     farm_refusal,
     field_source,
     for_rig,
@@ -178,6 +179,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     `pipeline.errors` for the kinds.
     """
     settings = for_rig(settings)
+    check_scene_there(settings)
     path = weights_path(settings)
     described, load = describe_weights(path), Once(lambda: load_weights(path))
     check_two_scale(described.config, path)
@@ -186,16 +188,16 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     refused = farm_refusal(settings)
     if refused is not None and not planning:
         raise SettingsError(refused)
-    scene, notes = open_scene(settings)
+    scene, notes = open_scene(settings, described.class_names)
     if not planning:  # what the rig would find there: no stage's work
         scene.raster.drawn()
         scene.light()
+    band_notes = _check_bands(scene, described, path)
     label_notes = check_labels(scene, described)
     grid = SceneGrid(*scene.shape, described.config.patch, described.config.factor)
     zones = open_zones(settings, place_of_field(settings, scene), grid)
     settings, scans = choose_plain_scan(settings, described, path, grid, len(scene.wavelength_nm), zones.shown)
     plan = plan_capture(settings, grid, zones.shown)
-    band_notes = _check_bands(scene, described, path)
     if settings.mask is not None:
         check_mask(settings.mask, scene.shape)
     sealing = () if described.sealed else (unsealed_note(path),)

@@ -26,7 +26,7 @@ from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Source
 from storage.readers.cube_sources import machine_bytes
-from storage.readers.raster_files import load_raster
+from storage.readers.raster_files import load_raster, split_variable
 from storage.readers.scene_files import load_scene_file
 
 if TYPE_CHECKING:
@@ -40,8 +40,24 @@ POSE_WINS = "the scene's own place on the earth is set aside: [pose] says where 
 SAME_HOUR = 0.5  # by which true solar time is at most off mean solar time, and whoever rounds it [h]
 
 
-def open_scene(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
-    """Open the scene, say what was assumed; SceneError, WavelengthError: its file, SettingsError: not for a farm."""
+def check_scene_there(settings: Settings) -> None:
+    """Refuse a scene file that is not there, before anything else is asked for (SceneError)."""
+    path, _ = split_variable(settings.scene)
+    if settings.scene in (RIG_FIELD, *BUILT_IN_SCENES):
+        return
+    try:
+        there, what = path.exists(), "a link that leads nowhere," if path.is_symlink() else "no file"
+    except OSError as error:  # such as a name longer than any
+        raise SceneError(f"--scene {settings.scene} cannot be the name of a file: {error.strerror}") from error
+    if not there:
+        raise SceneError(f"--scene {settings.scene}: there is {what} {path}; check the name (seen from {Path.cwd()})")
+
+
+def open_scene(settings: Settings, known: Sequence[str] | None = None) -> tuple[RasterScene, tuple[str, ...]]:
+    """Open the scene, say what was assumed; SceneError, WavelengthError: its file, SettingsError: not for a farm.
+
+    Labels that nobody named, but that lie beside the scene, count where their classes are among the ``known`` ones.
+    """
     if settings.scene == RIG_FIELD:
         return _field_before_rig(settings), ()
     if settings.scene in BUILT_IN_SCENES:
@@ -54,6 +70,10 @@ def open_scene(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
     file = load_scene_file(
         settings.scene, labels=settings.labels, bands=settings.bands, wavelengths=settings.wavelengths
     )
+    strange = [name for name in file.class_names if known is not None and name not in known]
+    if file.labels_found and strange:
+        told = f"of the class {strange[0]!r}, which the weights do not know: name its classes in a scene.toml to judge"
+        file = file.without_labels(f"the labels beside the scene are left out: they are {told} by them")
     scene, notes = scene_of_file(file, settings.camera), file.provenance
     if scene.geobox is not None and settings.pose is not None:  # one place a run
         scene, notes = replace(scene, geobox=None), (*notes, POSE_WINS)

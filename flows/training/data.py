@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,6 +38,7 @@ class TrainingData:
     held_out: tuple[str, ...]
     camera: LineCamera
     files: DataSet | None = None
+    notes: tuple[str, ...] = ()  # what was left out, for people
 
     def scenes(self, names: tuple[str, ...]) -> Iterator[RasterScene]:
         for name in names:
@@ -98,8 +99,11 @@ def read_farm_name(name: str) -> tuple[int, int, float]:
 
 
 def file_data(files: DataSet, validation: int, camera: LineCamera) -> TrainingData:
-    """Scenes of a data set; every ``n``-th of those not held out goes to validation, split by scene, never by pixel."""
-    names = files.train_names
+    """Scenes of a data set; every ``n``-th of those not held out goes to validation, split by scene, never by pixel.
+
+    Scenes without labels are left out where others have some, and ``notes`` say so.
+    """
+    names = _labelled_names(files)
     if validation >= len(names) and validation:
         raise SceneError(f"{validation} scenes for validation leave none of {len(names)} to train on; take fewer")
     kept = names[:: max(len(names) // validation, 1)][:validation] if validation else ()
@@ -110,7 +114,15 @@ def file_data(files: DataSet, validation: int, camera: LineCamera) -> TrainingDa
         held_out=files.held_out,
         camera=camera,
         files=files,
+        notes=files.notes,
     )
+
+
+def _labelled_names(files: DataSet) -> tuple[str, ...]:
+    names = tuple(name for name in files.train_names if name not in files.unlabelled)
+    if not names:
+        raise SceneError(f"{files.path}: {'; '.join(files.notes)}; of those that are held out none can be trained on")
+    return names
 
 
 def open_training_data(
@@ -133,7 +145,7 @@ def open_training_data(
     if scenes is not None:
         raise SettingsError(f"--scenes is for the built-in farms; {dataset} has its own scenes")
     files = load_data_set(Path(dataset), **choices)  # type: ignore[arg-type]
-    share = min(4, len(files.train_names) // 8)
+    share = min(4, len(_labelled_names(files)) // 8)
     return file_data(files, share if validation is None else validation, camera)
 
 
@@ -154,9 +166,32 @@ def either_mask(one: str | None, other: str | None) -> str:
     return base64.b64encode(zlib.compress(np.bitwise_or.reduce(bits).tobytes(), 9)).decode("ascii")
 
 
+def only_class(scene: RasterScene) -> str | None:
+    """The class that all labels of a scene are; None where they are of several, or there is none."""
+    if scene.labels is None:
+        return None
+    there = np.unique(scene.labels[scene.labels != UNLABELLED])
+    return scene.class_names[there[0]] if len(there) == 1 else None
+
+
+def alike_notes(alone: Mapping[str, str]) -> tuple[str, ...]:
+    """Question scenes whose labels are all one class, given by their names: it may stand for what nobody labelled."""
+    by_class: dict[str, list[str]] = {}
+    for name, kind in alone.items():
+        by_class.setdefault(kind, []).append(name)
+    return tuple(
+        f"all labels are {kind} in {', '.join(names[:5])}{f' and {len(names) - 5} more' if len(names) > 5 else ''}; if"
+        f" its value in the label files stands for no class, write unlabelled = VALUE into the scene.toml"
+        for kind, names in by_class.items()
+    )
+
+
 def trained_pixels(scene: RasterScene) -> NDArray[np.bool_]:
     """Pixels whose label training sees."""
     if scene.labels is None:
-        raise SceneError(f"scene {scene.name} has no labels; training needs them: give --labels or a scene.toml")
+        raise SceneError(
+            f"scene {scene.name} has no labels; training needs them: give --labels, or call"
+            f" its label file {scene.name}_mask.png or labels/{scene.name}.png (scene.toml: other names)"
+        )
     mask: NDArray[np.bool_] = scene.labels != UNLABELLED
     return mask

@@ -16,7 +16,15 @@ from rich.console import Console
 from rich.table import Table
 
 from flows.terminal.progress import StageProgress
-from flows.training.data import TrainingData, either_mask, open_training_data, pack_mask, trained_pixels
+from flows.training.data import (
+    TrainingData,
+    alike_notes,
+    either_mask,
+    only_class,
+    open_training_data,
+    pack_mask,
+    trained_pixels,
+)
 from flows.training.figures import judge_scans, validate
 from flows.training.look import observe_scene
 from models.network.segmenter import Segmenter
@@ -64,8 +72,12 @@ class TrainRequest:
 Report = Callable[[str, float, str], None]  # what is done, how far 0..1, a figure
 
 
-def train_weights(request: TrainRequest, report: Report = lambda what, done, figure: None) -> dict[str, Any]:
-    """Train, validate and save; give the record that stands in the file.
+def train_weights(
+    request: TrainRequest,
+    report: Report = lambda what, done, figure: None,
+    tell: Callable[[str], None] = lambda note: None,
+) -> dict[str, Any]:
+    """Train, validate and save; give the record that stands in the file. ``tell`` is told what was left out.
 
     Raises SceneError: no labels, one class only, or scenes whose bands or classes differ; SettingsError: a folder to
     write to that does not exist, a folder in the place of a file, or sizes that do not fit.
@@ -83,7 +95,10 @@ def train_weights(request: TrainRequest, report: Report = lambda what, done, fig
         **request.choices,
     )
     refuse_seen(start, data)
+    for note in data.notes:
+        tell(note)
     seen, about = _observe_all(request, data, data.train, "looking at scenes", report)
+    _question_labels(about, request.dataset, tell)
     normalisation = measured_normalisation(seen, math.sqrt(request.settings.darkest_ms * REFERENCE_MS))
     reached = np.ones(about.basis.columns, bool)
     examples = [normalised(observation, normalisation, reached) for observation in seen]
@@ -169,6 +184,7 @@ class _About:
     wavelength_nm: NDArray[np.float64]
     keys: dict[str, str] = field(default_factory=dict)  # scene -> identity of its light
     pixels: dict[str, str] = field(default_factory=dict)  # identity -> trained pixels, where not all labelled ones
+    alike: dict[str, str] = field(default_factory=dict)  # scene -> class, where all its labels are one
 
 
 def _observe_all(
@@ -189,6 +205,8 @@ def _observe_all(
         if request.choices.get("train_mask") is not None:
             known.pixels[scene.key] = pack_mask(mask)
         about = known
+        if (alone := only_class(scene)) is not None:
+            known.alike[name] = alone
         grid = SceneGrid(*scene.shape, known.patch, request.factor)
         rng = np.random.default_rng([request.settings.seed, 0x0B5, number])
         seen.append(observe_scene(scene, request.camera, grid, known.basis, rng))
@@ -197,10 +215,20 @@ def _observe_all(
     return seen, about
 
 
+def _question_labels(about: _About, dataset: str, tell: Callable[[str], None]) -> None:
+    """Tell which scenes have labels of one class (SceneError: all of them, and of the same)."""
+    notes = alike_notes(about.alike)
+    if len(about.alike) == len(about.keys) and len(notes) == 1:
+        raise SceneError(f"{dataset}: training needs two or more classes, and {notes[0]}")
+    for note in notes:
+        tell(note)
+
+
 def _common(request: TrainRequest, scene: RasterScene) -> _About:
     trained_pixels(scene)  # refuses a scene without labels
     if len(scene.class_names) < 2:
-        raise SceneError(f"scene {scene.name} has {len(scene.class_names)} class; training needs two or more")
+        notes = alike_notes({scene.name: scene.class_names[0]})
+        raise SceneError(f"{request.dataset}: training needs two or more classes, and {notes[0]}")
     basis = SpectralBasis.spanning(scene.wavelength_nm, request.columns)
     patch = request.patch or suggested_patch(scene.shape, built_in=request.dataset in FARM_NAMES)
     about = _About(basis, scene.class_names, scene.class_colours, patch, scene.wavelength_nm)
@@ -317,7 +345,9 @@ def run_train(request: TrainRequest, console: Console) -> dict[str, Any]:
             last = what
             progress.show(what, done, figure)
 
-        record = train_weights(request, report)
+        record = train_weights(
+            request, report, lambda note: console.print(f"note: {note}", markup=False, soft_wrap=True)
+        )
         progress.show(last, 1.0, ended=True)
     if "begun_from" in record:
         print_start(record["begun_from"], console)

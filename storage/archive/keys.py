@@ -167,7 +167,8 @@ def open_folder(path: Path, *, create: bool, write: bool) -> None:
 
 def _open_folder(path: Path, *, create: bool, write: bool) -> None:
     if path.exists() and not path.is_dir():
-        raise ArchiveError(f"{path} is a file, expected a folder for the archive; choose another --out")
+        cure = "choose another --out" if create else "check the name"
+        raise ArchiveError(f"{path} is a file, expected a folder for the archive; {cure}")
     if not create and not (path / "stages").is_dir():
         state = "is a folder but no archive (it has no folder stages)" if path.is_dir() else "is not there"
         raise ArchiveError(f"{path} {state}; check the name, or make an archive with survey --out")

@@ -12,7 +12,7 @@ import math
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -172,10 +172,11 @@ def load_npy(path: Path) -> NDArray[Any]:
     return values
 
 
-def load_named(path: Path, variable: str | None, dims: int) -> NDArray[Any]:
-    """Read one array of a .npz or .mat file: the one named, or the only one with ``dims`` axes.
+def load_named(path: Path, variable: str | None, dims: int) -> tuple[NDArray[Any], tuple[str, ...]]:
+    """Read one array of a .npz or .mat file: the one named, or the only one with ``dims`` axes; and notes.
 
-    Raises SceneError: there is none, or several; or it claims more than the file or the machine can hold.
+    ``variable`` may be a step of time, or end in one: see :func:`take_step`. Raises SceneError: there is no such array,
+    or several; or it claims more than the file or the machine can hold.
     """
     if path.suffix.lower() == ".npz":
         found = _npz_arrays(path)
@@ -185,17 +186,75 @@ def load_named(path: Path, variable: str | None, dims: int) -> NDArray[Any]:
         listed = list_mat_variables(path)
         found = {one.name: _Held(one.shape, partial(load_mat_variable, path, one)) for one in listed if one.width}
     listing = ", ".join(f"{name} {held.shape}" for name, held in found.items()) or "none"
-    if variable is not None:
-        if variable not in found:
-            raise SceneError(f"{path} has no array {variable}; it has {listing}")
-        return found[variable].load()
-    for wanted in (dims, 5 - dims):
+    named, step = split_step(variable, found)
+    if named is not None and named not in found:
+        raise SceneError(f"{path} has no array {named}; it has {listing}; name one: {path.name}:VARIABLE")
+    name = named if named is not None else _only_one(path, found, _AXES[dims, step is not None], listing)
+    others = [f"{other} {held.shape}" for other, held in found.items() if other != name]
+    notes = (f"array {name} of the file, which also has {', '.join(others)}",) if others and named is None else ()
+    return take_step(found[name].load(), step, dims, f"{path}:{name}"), notes
+
+
+_AXES = {(3, False): (3, 4, 2), (2, False): (2, 3), (3, True): (4,), (2, True): (3, 4)}  # in the order in which tried
+
+
+def _only_one(path: Path, found: Mapping[str, _Held], axes: Sequence[int], listing: str) -> str:
+    """Name of the only array with the first of these numbers of axes that any has; vectors stand back."""
+    for wanted in axes:
         fitting = [name for name, held in found.items() if len(held.shape) == wanted and math.prod(held.shape) > 1]
-        if len(fitting) == 1:
-            return found[fitting[0]].load()
-        if fitting:
+        planes = [name for name in fitting if min(found[name].shape) > 1] or fitting
+        if len(planes) == 1:
+            return planes[0]
+        if planes:
             break
-    raise SceneError(f"{path} has no single array with {dims} axes; it has {listing}; name one: {path.name}:VARIABLE")
+    raise SceneError(
+        f"{path} has no single array with {axes[0]} axes; it has {listing}; name one: {path.name}:VARIABLE"
+    )
+
+
+def split_step(variable: str | None, names: Container[str]) -> tuple[str | None, int | None]:
+    """What an address names: ``cube``, ``cube:3`` or, where no array is called so, the step ``3`` of the only one."""
+    if variable is None or variable in names:
+        return variable, None
+    name, colon, step = variable.rpartition(":")
+    if not step.isdecimal():
+        return variable, None
+    return name if colon else None, int(step)
+
+
+def take_step(values: NDArray[Any], step: int | None, dims: int, where: str) -> NDArray[Any]:
+    """One step of a time series, (time, y, x, band), counted from 0; what is none is given as it is.
+
+    Of labels (``dims`` is 2), (time, y, x). Raises SceneError: a series without a step, or one that it lacks; a step of
+    what is no series.
+    """
+    shape = values.shape
+    series = values.ndim in ((4,) if dims == 3 else (3, 4))
+    if step is None:
+        if dims == 3 and series:
+            raise SceneError(
+                f"{where} has the shape {shape}, read as (time, y, x, band); name one of its {shape[0]} steps, "
+                f"{where}:0 to {where}:{shape[0] - 1}"
+            )
+        return values
+    if not series:
+        raise SceneError(f"{where} has the shape {shape}, no axis of time (time, y, x, band); leave :{step} out")
+    if step >= shape[0]:
+        raise SceneError(f"{where} has {shape[0]} steps of time, counted from 0; got :{step}")
+    return np.asarray(values[step])
+
+
+MOST_UNEVEN = 16  # times that a picture is longer than wide
+
+
+def check_picture(shape: tuple[int, ...], where: object) -> None:
+    """Question a table of numbers that is given for a scene of one band (SceneError)."""
+    if len(shape) == 2 and max(shape) >= MOST_UNEVEN * min(shape) and max(shape) >= 1000:
+        rows, columns = shape
+        raise SceneError(
+            f"{where} is a table of {rows} x {columns} numbers, expected a picture (y, x) or a cube (y, x, band); are"
+            f" its columns or rows spectra? Then store them as a cube: values.reshape(height, width, bands)"
+        )
 
 
 def variable_names(path: Path) -> set[str]:

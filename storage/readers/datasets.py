@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +12,18 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import UNLABELLED
-from storage.readers.labels import load_codes
+from storage.readers.label_matching import (
+    MatchedFiles,
+    image_folder,
+    is_label_name,
+    listed_names,
+    match_folder,
+    scene_entries,
+)
+from storage.readers.labels import found_classes, load_codes
 from storage.readers.raster_files import SCENE_ENDINGS, split_variable
-from storage.readers.scene_files import SceneFile, load_scene_file, scene_number
-from storage.readers.scene_toml import SETTINGS_NAME, load_scene_settings
+from storage.readers.scene_files import SceneFile, label_file, load_scene_file, scene_number
+from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings
 
 
 @dataclass(frozen=True)
@@ -29,6 +38,31 @@ class DataSet:
     wavelengths: tuple[float, ...] | None = None
     train_mask: str | Path | None = None
     mask_classes: tuple[int, ...] | None = None
+    label_files: Mapping[str, Path] = field(default_factory=dict)  # of scenes of a folder, by their names
+    alone: tuple[Path, ...] = ()  # label files that belong to no scene
+
+    @property
+    def unlabelled(self) -> tuple[str, ...]:
+        """Scenes without a label file, where others have one."""
+        return tuple(name for name in self.files if name not in self.label_files) if self.label_files else ()
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was left out: scenes without labels, and labels without a scene."""
+        bare = [Path(self.files[name]) for name in self.unlabelled]
+        told = [f"of {len(self.files)} scenes {len(bare)} without labels left out: {listed_names(bare)}"]
+        lone = [f"label files without a scene, {len(self.alone)}: {listed_names(self.alone)}"]
+        return (*(told if bare else ()), *(lone if self.alone else ()))
+
+    @cached_property
+    def classes(self) -> dict[str, ClassValue]:
+        """Every class that any of the label files holds, by its value; none where scene.toml names them, or one is."""
+        if len(self.label_files) < 2:
+            return {}
+        settings = find_scene_settings(Path(next(iter(self.files.values()))))
+        if settings.classes:
+            return {}
+        return found_classes(self.label_files.values(), settings.unlabelled)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -44,7 +78,13 @@ class DataSet:
         """Read one scene with all its labels; its ``name`` is the data set's. Errors as load_scene_file."""
         if name not in self.files:
             raise SceneError(f"{self.path} has no scene {name}; it has {', '.join(self.files)}")
-        return load_scene_file(self.files[name], labels=self.labels, bands=self.bands, wavelengths=self.wavelengths)
+        return load_scene_file(
+            self.files[name],
+            labels=self.labels or self.label_files.get(name),
+            bands=self.bands,
+            wavelengths=self.wavelengths,
+            classes=self.classes,
+        )
 
     def train(self) -> Iterator[tuple[str, SceneFile]]:
         """Scenes to train on, with the labels to train on."""
@@ -79,13 +119,14 @@ def load_data_set(
     """Name the scenes of a folder (``images/`` in it, or the files themselves) or of one file. Reads none of them yet.
 
     A scene is named by the first number in its file's name (``images/059_image.png`` is ``059``), or by the whole name
-    where numbers are missing or alike.
+    where numbers are missing or alike. Its labels are those that scene.toml tells, or that have its name.
 
     Those of ``hold_out`` are kept from training. ``train_mask`` says where to train in one scene: 0 is nowhere, number
     i the label file's class ``mask_classes[i - 1]``, or i where that is None. Raises SceneError: there is no scene, a
-    name to hold out does not exist, or a mask is given for several scenes.
+    name to hold out does not exist, a mask is given for several scenes, or labels may belong to several.
     """
-    files = _scene_files(path, train_mask)
+    found = _scenes(path, train_mask)
+    files = found.files
     unknown = [name for name in hold_out if name not in files]
     if unknown:
         raise SceneError(f"{path} has no scene {', '.join(unknown)} to hold out; it has {', '.join(files)}")
@@ -104,6 +145,8 @@ def load_data_set(
         wavelengths=None if wavelengths is None else tuple(wavelengths),
         train_mask=train_mask,
         mask_classes=None if mask_classes is None else tuple(mask_classes),
+        label_files={} if labels is not None else found.labels,
+        alone=found.alone,
     )
 
 
@@ -144,26 +187,61 @@ def _mask_to_index(
     return np.array([UNLABELLED, *(numbers[number] for number in given[:highest])], np.uint8)
 
 
-def _scene_files(path: str | Path, train_mask: str | Path | None) -> dict[str, str]:
+@dataclass(frozen=True)
+class _Scenes:
+    files: dict[str, str]  # name -> file (or FILE:VARIABLE)
+    labels: dict[str, Path] = field(default_factory=dict)
+    alone: tuple[Path, ...] = ()
+
+
+def _scenes(path: str | Path, train_mask: str | Path | None) -> _Scenes:
     file, _ = split_variable(path)
-    if not file.is_dir():
-        if not file.is_file():
+    if not file.is_dir() or file.suffix.lower() == ".zarr":
+        if not file.exists():
             raise SceneError(f"there is no file or folder {file}; check the name (seen from {Path.cwd()})")
-        return {file.stem: str(path)}
-    inner = file / "images"
-    folder = inner if inner.is_dir() else file
-    found = sorted(entry for entry in folder.iterdir() if entry.suffix.lower() in SCENE_ENDINGS and entry.is_file())
-    labels = load_scene_settings(file / SETTINGS_NAME).labels if (file / SETTINGS_NAME).is_file() else None
-    filled = set() if labels is None else {labels.replace("{number}", scene_number(one) or "") for one in found}
-    others = [file / split_variable(name)[0] for name in filled]  # which hold labels, or the mask
-    others += [] if train_mask is None else [split_variable(train_mask)[0]]
-    resolved = {other.resolve() for other in others}
-    found = [entry for entry in found if entry.resolve() not in resolved]
-    if not found:
+        return _Scenes({file.stem: str(path)})
+    folder = image_folder(file)
+    settings = find_scene_settings(folder / SETTINGS_NAME)
+    masks = () if train_mask is None else (split_variable(train_mask)[0].resolve(),)
+    found = match_folder(folder) if settings.labels is None else _match_by_settings(folder, settings)
+    images = [image for image in found.images if image.resolve() not in masks]
+    if not images:
         raise SceneError(
-            f"{folder} holds no scene ({', '.join(SCENE_ENDINGS)}); give a folder with images/ and a {SETTINGS_NAME}"
+            f"{folder} holds no scene ({', '.join(SCENE_ENDINGS)}); give a folder of images, or with images/ in it"
         )
-    numbers = [scene_number(entry) or "" for entry in found]
-    by_number = all(numbers) and len(set(numbers)) == len(found)
-    names = numbers if by_number else [entry.stem for entry in found]
-    return dict(zip(names, map(str, found), strict=True))
+    names = _names(images)
+    return _Scenes(
+        {name: str(image) for name, image in names.items()},
+        {name: found.labels[image] for name, image in names.items() if image in found.labels},
+        tuple(one for one in found.alone if one.resolve() not in masks),
+    )
+
+
+def _match_by_settings(folder: Path, settings: SceneSettings) -> MatchedFiles:
+    """Images of a folder and their labels as ``labels`` in scene.toml tells; what holds labels is no image."""
+    entries = scene_entries(folder)
+    told: dict[Path, Path] = {}
+    for entry in entries:
+        if "{number}" in str(settings.labels) and scene_number(entry) is None:
+            continue  # whoever reads the scene is told
+        address = label_file(entry, settings)[0]
+        if address is not None:
+            told[entry] = address
+    labels = {split_variable(address)[0].resolve() for address in told.values()}
+    others = [entry for entry in entries if entry.resolve() not in labels]
+    images = tuple(entry for entry in others if not is_label_name(entry)) or tuple(others)
+    apart = {address.parent for address in told.values()} - {folder}
+    beside = [entry for place in sorted(apart) if place.is_dir() for entry in scene_entries(place)]
+    alone = tuple(one for one in (*others, *beside) if one not in images and one.resolve() not in labels)
+    return MatchedFiles(images, {image: told[image] for image in images if image in told}, alone)
+
+
+def _names(images: Sequence[Path]) -> dict[str, Path]:
+    """Names of scenes: their first numbers, where each has its own; else the names of the files, with their endings
+    where two differ by nothing else."""
+    numbers = [scene_number(image) or "" for image in images]
+    stems = [image.stem for image in images]
+    for names in (numbers, stems):
+        if all(names) and len(set(names)) == len(images):
+            return dict(zip(names, images, strict=True))
+    return {image.name: image for image in images}

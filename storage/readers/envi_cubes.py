@@ -108,6 +108,8 @@ def find_envi_pair(path: Path) -> tuple[Path, Path]:
         stem = path.with_suffix("")
         endings = (ending for name in DATA_ENDINGS for ending in {name: None, name.upper(): None})
         data = next((file for file in (stem.with_name(stem.name + end) for end in endings) if file.is_file()), None)
+        if not path.is_file():
+            raise SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
         if data is None:
             raise SceneError(
                 f"no data file beside {path}; expected {stem.name} or {stem.name}.bin, .dat, .img, .raw, ..."
@@ -118,7 +120,8 @@ def find_envi_pair(path: Path) -> tuple[Path, Path]:
     names = [path.name + ".hdr", path.stem + ".hdr", path.name + ".HDR", path.stem + ".HDR"]
     header = next((file for file in map(path.with_name, names) if file.is_file()), None)
     if header is None:
-        raise SceneError(f"no header beside {path}; expected {names[0]} or {names[1]}")
+        wanted = " or ".join(dict.fromkeys(names[:2]))
+        raise SceneError(f"no header beside {path}; expected {wanted}, or the ending of another kind in its name")
     return header, path
 
 

@@ -12,7 +12,7 @@ small files made in these layouts, and on nothing else.
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,12 +22,17 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import UNLABELLED
-from storage.readers.array_files import variable_names
+from storage.readers.array_files import NAMED_ENDINGS, check_picture, variable_names
 from storage.readers.cube_sources import NEAR_INFRARED_NM, RGB_NM, Raster
 from storage.readers.raster_files import load_raster, split_variable
 from storage.readers.scene_toml import BandWavelengths, ClassValue, Colour
 
 MOST_FOUND_CLASSES = 64
+MIXED = (
+    "JPEG, soft edges and scaling mix values; save the labels again as PNG, with hard edges and by nearest neighbour,"
+    " or is this the picture itself?"
+)
+_MANY_UNKNOWN = 16  # values that are no class: nobody forgot so many
 
 # Eight colours that stay apart for most kinds of colour blindness (Okabe and Ito, 2008), in an order for maps.
 _EIGHT_COLOURS = (
@@ -84,6 +89,23 @@ def load_labels(
     )
 
 
+def found_classes(addresses: Iterable[str | Path], unlabelled: ClassValue | None = None) -> dict[str, ClassValue]:
+    """Every value of several label files as one class each, named by it; errors as for :func:`load_labels`."""
+    codes: set[int] = set()
+    is_colour = isinstance(unlabelled, tuple)
+    parts: list[tuple[NDArray[np.int64], bool]] = []
+    for address in addresses:
+        values, of_colours = load_codes(address, by_number=False)
+        is_colour = is_colour or of_colours
+        parts.append((np.unique(values), of_colours))
+        if len(parts[-1][0]) > MOST_FOUND_CLASSES:
+            _found_classes(parts[-1][0], None, of_colours, str(address))  # refuses this file by its name
+    for values, of_colours in parts:  # a grey value g is the colour (g, g, g) where others have colours
+        codes |= {int(code) * (0x010101 if is_colour and not of_colours else 1) for code in values if code >= 0}
+    none = None if unlabelled is None else _code(unlabelled)
+    return _found_classes(np.array(sorted(codes), np.int64), none, is_colour, f"of {len(parts)} files")
+
+
 def load_codes(address: str | Path, *, by_number: bool) -> tuple[NDArray[np.int64], bool]:
     """Read a file as one whole number a pixel, (y, x); colours become r * 65536 + g * 256 + b, NaN becomes -1.
 
@@ -120,6 +142,16 @@ def _colour(code: int) -> Colour:
     return code >> 16 & 255, code >> 8 & 255, code & 255
 
 
+def value_of_code(code: int, *, is_colour: bool) -> ClassValue:
+    """What a number of `load_codes` is in its file: itself, or a colour."""
+    return _colour(code) if is_colour else code
+
+
+def shown_value(code: int, *, is_colour: bool) -> str:
+    """The same, in words."""
+    return f"colour {list(_colour(int(code)))}" if is_colour else f"value {code}"
+
+
 def _found_classes(codes: NDArray[np.int64], none: int | None, is_colour: bool, where: str) -> dict[str, ClassValue]:
     """One class for each value in the file, ascending: ``class_N`` after a number, ``colour_RRGGBB`` after a colour.
 
@@ -129,8 +161,8 @@ def _found_classes(codes: NDArray[np.int64], none: int | None, is_colour: bool, 
     if len(found) > MOST_FOUND_CLASSES:
         what = "colours" if is_colour else "numbers"
         raise SceneError(
-            f"labels {where} have {len(found)} different {what}, at most {MOST_FOUND_CLASSES} are taken for classes; "
-            f"state [classes] in a scene.toml"
+            f"labels {where} have {len(found)} different {what}, at most {MOST_FOUND_CLASSES} are taken for classes: "
+            f"{MIXED}"
         )
     if is_colour:
         return {f"colour_{code:06x}": _colour(code) for code in found}
@@ -148,17 +180,17 @@ def _index(
     unknown = [int(value) for value in values if int(value) not in table and value not in (none, -1)]
     if unknown:
         count = int((codes == unknown[0]).sum())
+        cure = "add it to [classes] or state it as unlabelled in scene.toml"
         raise SceneError(
             f"labels {where} have {count} px of {_shown(unknown[0], classes)}, which is no class (and "
-            f"{len(unknown) - 1} more such values); add it to [classes] or state it as unlabelled in scene.toml"
+            f"{len(unknown) - 1} more such values); {MIXED if len(unknown) > _MANY_UNKNOWN else cure}"
         )
     lookup = np.array([table.get(int(value), UNLABELLED) for value in values], np.uint8)
     return lookup[inverse.reshape(codes.shape)]
 
 
 def _shown(code: int, classes: Mapping[str, ClassValue]) -> str:
-    is_colour = any(isinstance(value, tuple) for value in classes.values())
-    return f"colour {list(_colour(code))}" if is_colour else f"value {code}"
+    return shown_value(code, is_colour=any(isinstance(value, tuple) for value in classes.values()))
 
 
 def default_colour(index: int) -> Colour:
@@ -213,8 +245,14 @@ def load_frame_or_raster(address: str | Path) -> tuple[Raster, Layout | None]:
 
     Raises SceneError: there is no such file, it is damaged, or of a kind that is not read.
     """
-    layout = find_layout(*split_variable(address))
-    return (load_raster(address, dims=3), None) if layout is None else (layout.raster, layout)
+    path, variable = split_variable(address)
+    layout = find_layout(path, variable)
+    if layout is not None:
+        return layout.raster, layout
+    raster = load_raster(address, dims=3)
+    if path.suffix.lower() in (".npy", *NAMED_ENDINGS):
+        check_picture(raster.values.shape, address)
+    return raster, None
 
 
 def find_layout(path: Path, variable: str | None) -> Layout | None:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.errors import SceneError
-from storage.readers.array_files import NAMED_ENDINGS, load_named, load_npy
+from storage.readers.array_files import NAMED_ENDINGS, load_named, load_npy, split_step, take_step
 from storage.readers.cube_sources import (
     DEFLATE_RATIO,
     GREY_NM,
@@ -179,11 +179,13 @@ SCENE_ENDINGS = (*IMAGE_ENDINGS, *TIFF_ENDINGS, ".npy", *NAMED_ENDINGS, ".hdr")
 _PILLOW_LIMIT = threading.RLock()  # it is the process's, not a call's
 _FORMATS = ("PNG", "JPEG", "BMP")  # whatever the ending says; Pillow's others may run programs
 _BYTES = {"I": 4, "F": 4, "I;16": 2, "I;16L": 2, "I;16B": 2}  # a number, by Pillow's mode; 1 in the others
-_WITH_VARIABLE = re.compile(r"^(?P<path>.+\.(?:mat|npz|zarr)):(?P<variable>[^/\\:]+)$", re.IGNORECASE)
+_WITH_VARIABLE = re.compile(
+    r"^(?P<path>.+\.(?:mat|npz|zarr|npy)):(?P<variable>[^/\\:]+(?::\d+)?)$", re.IGNORECASE | re.DOTALL
+)
 
 
 def split_variable(address: str | Path) -> tuple[Path, str | None]:
-    """``scene.mat:cube`` -> path and variable; None where the address names none."""
+    """``scene.mat:cube`` -> path and variable, with the step of time in ``cube:3``; None where none is named."""
     found = _WITH_VARIABLE.match(str(address))
     return (Path(address), None) if found is None else (Path(found["path"]), found["variable"])
 
@@ -200,6 +202,8 @@ def load_raster(address: str | Path, *, dims: int) -> Raster:
     if not path.is_file():
         raise SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
     ending = path.suffix.lower()
+    if ending in TIFF_ENDINGS and (guess := content_guess(path)):
+        raise SceneError(f"{path} cannot be read as {ending}: {guess}")
     if ending not in SCENE_ENDINGS:
         raise SceneError(f"{path} ends in {ending or 'nothing'}, which is not read; use {', '.join(SCENE_ENDINGS)}")
     try:
@@ -209,11 +213,34 @@ def load_raster(address: str | Path, *, dims: int) -> Raster:
     except Exception as error:  # decoders raise anything at all on damaged bytes
         objects = "pickle" in str(error) or "Python objects" in str(error)
         why = "it holds Python objects or is damaged" if objects else str(error)
-        raise SceneError(f"{path} cannot be read as {ending}: {why}; write it again as plain numbers") from error
+        cure = "write it again as plain numbers" if ending not in IMAGE_ENDINGS else "copy it again, or save it as PNG"
+        raise SceneError(f"{path} cannot be read as {ending}: {why}; {content_guess(path) or cure}") from error
     check_numbers(raster.values.dtype, path)
     if raster.values.size == 0:
         raise SceneError(f"{path} holds an empty array of shape {raster.values.shape}")
     return raster
+
+
+_BEGINNINGS = {  # of files, and the endings that go with them
+    b"\x89PNG": (".png",),
+    b"\xff\xd8\xff": (".jpg", ".jpeg"),
+    b"II*\0": TIFF_ENDINGS,
+    b"MM\0*": TIFF_ENDINGS,
+    b"\x93NUMPY": (".npy",),
+    b"PK\x03\x04": (".npz",),
+    b"\x89HDF": (".mat",),
+    b"MATLAB": (".mat",),
+}
+
+
+def content_guess(path: Path) -> str:
+    """What to do with a file that begins as one of another ending does; nothing where it does not."""
+    with path.open("rb") as file:
+        head = file.read(8)
+    for begins, endings in _BEGINNINGS.items():
+        if head.startswith(begins) and path.suffix.lower() not in endings:
+            return f"it begins as a {endings[0]} file does; give it that ending"
+    return ""
 
 
 def _read(path: Path, ending: str, variable: str | None, dims: int) -> Raster:
@@ -228,9 +255,13 @@ def _read(path: Path, ending: str, variable: str | None, dims: int) -> Raster:
     if ending in TIFF_ENDINGS:
         return read_tiff(path)
     if ending == ".npy":
-        return Raster(load_npy(path))
+        named, step = split_step(variable, ())
+        if named is not None:
+            raise SceneError(f"{path} holds one array, which has no name; only a step of time can be told: {path}:0")
+        return Raster(take_step(load_npy(path), step, dims, str(path)))
     if ending != ".hdr":
-        return Raster(load_named(path, variable, dims))
+        values, notes = load_named(path, variable, dims)
+        return Raster(values, notes=notes)
     cube, known = open_envi_cube(path), None
     if cube.header.wavelength_nm is not None:
         known = BandWavelengths(cube.header.wavelength_nm, cube.header.fwhm_nm, f"wavelengths from {path}")
@@ -257,6 +288,19 @@ def _of_any_size() -> Iterator[None]:
             yield
         finally:
             Image.MAX_IMAGE_PIXELS = before
+
+
+def image_shape(path: Path) -> tuple[int, int, int]:
+    """(y, x, band) of a picture by its head (SceneError: it is damaged, or of another kind than its ending)."""
+    try:
+        with _of_any_size(), Image.open(path, formats=_FORMATS) as image:
+            return (
+                image.size[1],
+                image.size[0],
+                1 if image.mode in ("1", "L", "LA", "La", "F") or "I" in image.mode else 3,
+            )
+    except Exception as error:  # decoders raise anything at all on damaged bytes
+        raise SceneError(f"{path} cannot be read as {path.suffix.lower()}: {error}; is it damaged?") from error
 
 
 def _is_deep_colour(path: Path) -> bool:

@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,10 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
+from pipeline.geometry.grid import UNLABELLED
 from pipeline.readings import MOST_STEPS, MOST_VALUE, beyond_range, find_beyond
 from pipeline.simulator.scenes.scene import BRIGHT_PERCENTILE
 from storage.archive.staging import file_hash
 from storage.readers.cube_sources import BLOCK_LINES, Raster, machine_bytes, scene_lines
+from storage.readers.label_matching import find_label
 from storage.readers.labels import Labels, load_frame_or_raster, load_labels
 from storage.readers.raster_files import split_variable
 from storage.readers.scan_files import known_bands, open_cube_source, reader_of
@@ -47,6 +49,19 @@ class SceneFile:
     light_hash: str  # of values and wavelengths alone: labels do not change what a camera sees
     provenance: tuple[str, ...]  # one sentence for each thing assumed or left out
     geobox: GeoBox | None = None  # where the pixels lie on the earth
+    labels_found: bool = False  # by the file's name: nobody stated them
+
+    def without_labels(self, note: str) -> SceneFile:
+        """The same scene as if it had no labels; the note says why."""
+        return replace(
+            self,
+            labels=None,
+            class_names=(),
+            class_colours=self.class_colours[:0],
+            class_values=(),
+            content_hash=self.light_hash,
+            provenance=(*self.provenance, note),
+        )
 
     def with_labels(self, labels: NDArray[np.uint8], note: str) -> SceneFile:
         """The same scene with other labels; hash and provenance say so."""
@@ -60,21 +75,25 @@ def load_scene_file(
     labels: str | Path | None = None,
     bands: Sequence[int] | None = None,
     wavelengths: Sequence[float] | None = None,
+    classes: Mapping[str, ClassValue] | None = None,
 ) -> SceneFile:
     """Read a scene from an image, .npy, .npz, .mat, ENVI, Zarr or a Headwall folder.
 
-    ``path`` may be ``FILE.mat:VARIABLE`` or ``STORE.zarr:ARRAY``. Axes are y, x, band; two axes are one band. What
-    comes in lines with dark and white frames is taken over the white panel. What is given here wins over the
-    ``scene.toml`` beside the file, and that over what the file says: a file of class numbers or colours on the same
-    pixels (frames of HyKo2 and RANUS bring their own), bands to use, counted from 0, and wavelengths [nm], one for each
-    band used or for each of the file. Raises SceneError: a file is missing, damaged, of a kind or shape that cannot be
-    used, or the labels do not fit. WavelengthError: wavelengths are missing, or their number, unit or range is wrong.
+    ``path`` may be ``FILE.mat:VARIABLE`` or ``STORE.zarr:ARRAY``, and end in a step of time, ``FILE.npy:STEP``. Axes
+    are y, x, band; two axes are one band. What comes in lines with dark and white frames is taken over the white panel.
+    What is given here wins over the ``scene.toml`` beside the file, and that over what the file says: a file of class
+    numbers or colours on the same pixels (frames of HyKo2 and RANUS bring their own, others are found by their names),
+    bands to use, counted from 0, and wavelengths [nm], one for each band used or for each of the file. ``classes`` are
+    those of a scene.toml that states none. Raises SceneError: a file is missing, damaged, of a kind or shape that
+    cannot be used, or the labels do not fit. WavelengthError: wavelengths are missing, or their number, unit or range
+    is wrong.
     """
     file, variable = split_variable(path)
     raster, layout = load_frame_or_raster(path) if reader_of(path) == "raster" else (load_scan(path), None)
     settings = find_scene_settings(file)
     cube = raster.three_axes(file)
     chosen, bad_note = _chosen_bands(bands, settings, cube.shape[2], file, raster.bad_bands)
+    _refuse_bands_first(file, cube.shape, wavelengths or settings.wavelengths_nm)
     light = settle_wavelengths(
         file,
         chosen,
@@ -87,9 +106,13 @@ def load_scene_file(
     nodata = raster.nodata if settings.nodata is None else settings.nodata
     gaps, gap_notes = _gaps(raster)
     values, notes = _as_float(cube, chosen, nodata, file, gaps)
-    found, label_note = _labels(file, (cube.shape[0], cube.shape[1]), labels, settings)
-    if layout is not None and labels is None and settings.labels is None:
+    shape = (cube.shape[0], cube.shape[1])
+    by_name = labels is None and settings.labels is None
+    label_note: tuple[str, ...]
+    if layout is not None and by_name:
         found, label_note = layout.labels, (layout.label_note,)
+    else:
+        found, label_note = _labels(file, shape, labels, settings, classes or {})
     count, widths = cube.shape[2], None if light.fwhm_nm is None else light.fwhm_nm.tolist()
     some_bands = () if chosen == list(range(count)) else (f"bands {bands_text(chosen)} of {count}, counted from 0",)
     stated: tuple[str, ...] = () if settings.nodata is None else (f"nodata {settings.nodata!r}",)
@@ -112,6 +135,7 @@ def load_scene_file(
         light_hash=light_hash,
         provenance=(*some_bands, *bad_note, *raster.notes, light.origin, *gap_notes, *notes, *label_note),
         geobox=raster.geobox,
+        labels_found=by_name and layout is None and found is not None,
     )
 
 
@@ -142,6 +166,16 @@ def load_scan(address: str | Path) -> Raster:
         geobox=source.geobox,
         bad_bands=source.bad_bands,
     )
+
+
+def _refuse_bands_first(path: Path, shape: tuple[int, ...], wavelengths: Sequence[float] | None) -> None:
+    """Refuse a cube that has as many rows as there are wavelengths, and other bands (SceneError)."""
+    count = 0 if wavelengths is None else len(wavelengths)
+    if count > 1 and shape[0] == count != shape[2] and shape[1] != shape[2]:
+        raise SceneError(
+            f"{path} has the axes {shape}, read as (y, x, band), and there are {count} wavelengths: its bands come"
+            " first; store it with the bands last, np.moveaxis(values, 0, -1)"
+        )
 
 
 def _content_hash(file: Path, raster: Raster) -> str:
@@ -269,24 +303,55 @@ def _dark_note(values: NDArray[np.float32]) -> tuple[str, ...]:
     )
 
 
+def label_file(scene: Path, settings: SceneSettings) -> tuple[Path | None, str]:
+    """Where the labels of a scene lie, by scene.toml or else by their name; and why there are none, if that is told.
+
+    Raises SceneError: scene.toml asks for a number that the scene's name lacks, or several files may be meant.
+    """
+    if settings.labels is None or settings.path is None:
+        return find_label(scene), ""
+    if not settings.labels:
+        return None, ""
+    number = scene_number(scene)
+    if "{number}" in settings.labels and number is None:
+        raise SceneError(
+            f"{scene} has no number in its name, which labels = {settings.labels!r} in scene.toml asks for; write"
+            " {name} for the whole name"
+        )
+    told = settings.labels.replace("{number}", number or "").replace("{name}", scene.stem)
+    address = settings.path.parent / told
+    if told != settings.labels and not address.is_file():
+        return None, f"no labels: there is no {address}"
+    return address, ""
+
+
 def _labels(
-    scene: Path, shape: tuple[int, int], stated: str | Path | None, settings: SceneSettings
+    scene: Path,
+    shape: tuple[int, int],
+    stated: str | Path | None,
+    settings: SceneSettings,
+    classes: Mapping[str, ClassValue],
 ) -> tuple[Labels | None, tuple[str, ...]]:
-    address = stated
-    if address is None and settings.labels is not None and settings.path is not None:
-        numbered, number = "{number}" in settings.labels, scene_number(scene)
-        if numbered and number is None:
-            raise SceneError(
-                f"{scene} has no number in its name, which labels = {settings.labels!r} in scene.toml asks for"
-            )
-        address = settings.path.parent / settings.labels.replace("{number}", number or "")
-        if numbered and not address.is_file():
-            return None, (f"no labels: there is no {address}",)
+    address, why_none = (stated, "") if stated is not None else label_file(scene, settings)
     if address is None:
-        return None, ()
-    found = load_labels(address, shape, classes=settings.classes, unlabelled=settings.unlabelled)
+        return None, (why_none,) if why_none else ()
+    found = load_labels(address, shape, classes=settings.classes or classes, unlabelled=settings.unlabelled)
     how = f"classes from {settings.path}" if settings.classes else f"{len(found.names)} classes as found in the file"
-    return found, (f"labels from {address}, {how}",)
+    by_name = "" if stated is not None or settings.labels is not None else ", found by its name"
+    return found, (f"labels from {address}{by_name}, {how}", *_one_class_note(found))
+
+
+def _one_class_note(found: Labels) -> tuple[str, ...]:
+    """Question labels that are all alike: the one value may stand for what nobody has labelled."""
+    there = np.unique(found.index[found.index != UNLABELLED])
+    if len(there) != 1:
+        return ()
+    name, value = found.names[there[0]], found.values[there[0]]
+    told = value if isinstance(value, int) else list(value)
+    return (
+        f"all labels are {name}: if {told} in the label file stands for no class, write unlabelled = {told} into a"
+        f" {SETTINGS_NAME}",
+    )
 
 
 def scene_number(path: Path) -> str | None:

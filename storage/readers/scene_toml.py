@@ -16,6 +16,7 @@ from pipeline.errors import SceneError, WavelengthError
 from storage.archive.staging import read_toml
 
 SETTINGS_NAME = "scene.toml"
+IMAGE_FOLDERS = ("images", "image", "imgs", "img", "pictures", "photos")  # a scene.toml stands above such a one
 
 Colour = tuple[int, int, int]
 ClassValue = int | Colour
@@ -31,7 +32,7 @@ class SceneSettings:
     wavelengths_file: Path | None = None  # rows of nm and FWHM, all bands of the file and the dropped ones
     dropped_bands: tuple[int, ...] = ()  # rows of wavelengths_file that the file leaves out, counted from 1
     nodata: float | None = None  # the number that stands for no value
-    labels: str | None = None  # relative to the folder of scene.toml; may hold {number}
+    labels: str | None = None  # relative to the folder of scene.toml; may hold {number}, {name}; "": there are none
     unlabelled: ClassValue | None = None
     classes: Mapping[str, ClassValue] = field(default_factory=dict)
 
@@ -40,15 +41,20 @@ KNOWN_KEYS = tuple(one.name for one in fields(SceneSettings) if one.name != "pat
 
 
 def find_scene_settings(scene: Path) -> SceneSettings:
-    """Read the ``scene.toml`` beside a scene file, or above it where the file lies in a folder ``images``.
+    """Read the ``scene.toml`` beside a scene file, or above it where that lies in a folder such as ``images``.
 
     Raises SceneError: the file is no TOML, has a key that is not known, or a value of the wrong kind.
     """
     candidates = [scene.parent / SETTINGS_NAME]
-    if scene.parent.name == "images":
+    if is_image_folder(scene.parent):
         candidates.append(scene.parent.parent / SETTINGS_NAME)
     found = next((path for path in candidates if path.is_file()), None)
     return SceneSettings() if found is None else load_scene_settings(found)
+
+
+def is_image_folder(folder: Path) -> bool:
+    """Whether a folder's name says that images lie in it, and what belongs to them beside it."""
+    return folder.name.lower() in IMAGE_FOLDERS
 
 
 def load_scene_settings(path: Path) -> SceneSettings:

@@ -9,7 +9,7 @@ import base64
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +22,14 @@ from pipeline.errors import SceneError
 from pipeline.rig.camera.camera_texts import MICROMETRES, NANOMETRES, UNSAID
 from storage.arrays.georeference import find_geobox
 from storage.arrays.layout import missing_codec
+from storage.readers.array_files import split_step
 from storage.readers.cube_sources import BLOCK_LINES, Bands, CubeSource, LineFacts, ReadLines
 from storage.readers.zarr_checks import check_array, check_blocks, check_store, open_options
 
 ROWS = ("y", "line", "lines", "row", "rows", "lat", "latitude", "northing")
 COLUMNS = ("x", "sample", "samples", "column", "columns", "col", "lon", "longitude", "easting")
 BANDS = ("band", "bands", "wavelength", "wavelengths", "channel", "channels", "spectral")
+TIMES = ("time", "t", "date", "dates", "step", "visit")
 WAVELENGTHS = ("wavelength", "wavelengths", "radiation_wavelength")
 METRES = {"m", "meter", "meters", "metre", "metres"}
 FRAMES = ("dark", "white", "panel", "bad", "flat")
@@ -47,7 +49,8 @@ def open_zarr_cube(path: Path, variable: str | None = None) -> CubeSource:
     """Open one array of a store, or of the ``cube.zarr`` in a folder, as a cube.
 
     Of this project: raw cubes (with their references), ingested cubes, mosaics. Of anyone's: the only array with three
-    axes of numbers, or the one named; wavelengths come from a coordinate of that name, or of the band axis with a unit.
+    axes of numbers, or the one named, at the step of time named (``values:3`` or ``3``); wavelengths come from a
+    coordinate of that name, or of the band axis with a unit.
     Raises SceneError: the store is damaged, holds no such array, has dims that are not known, a codec that is not
     allowed, or claims to hold far more than lies on the disk.
     """
@@ -57,15 +60,21 @@ def open_zarr_cube(path: Path, variable: str | None = None) -> CubeSource:
         node = zarr.open(path, mode="r", **open_options(path))
         group = node if isinstance(node, zarr.Group) else None
         arrays: dict[str, Any] = dict(node.arrays()) if isinstance(node, zarr.Group) else {"": node}
-        name = _chosen(arrays, variable, path)
+        named, step = split_step(variable, arrays)
+        name = _chosen(arrays, named, path, series=step is not None)
         array = arrays[name]
         for used in [name, *sorted({"fwhm", *FRAMES, *OF_LINES, *WAVELENGTHS, *_dims(array)} & set(arrays) - {name})]:
             check_array(arrays[used], path, used)
-        order, notes = _axes(array, path)
-        check_blocks(array, path, [BLOCK_LINES if axis == order[0] else size for axis, size in enumerate(array.shape)])
+        moment = _moment(array, step, path, name)
+        order, notes = _axes(array, path, moment)
+        parts = [BLOCK_LINES if axis == order[0] else size for axis, size in enumerate(array.shape)]
+        if moment is not None:
+            parts[moment.axis] = 1
+        check_blocks(array, path, parts)
         attributes = {} if group is None else dict(group.attrs)
-        source = _source(path, array, order, arrays, attributes, notes)
-    return _placed(source, {**attributes, **dict(array.attrs)}, arrays, _dims(array) or ["y", "x", "band"], order)
+        source = _source(path, array, order, arrays, attributes, notes, moment)
+    dims = _dims(array) or (["y", "x", "band"] if moment is None else ["time", "y", "x", "band"])
+    return _placed(source, {**attributes, **dict(array.attrs)}, arrays, dims, order)
 
 
 def _placed(
@@ -95,13 +104,40 @@ def _named(path: Path) -> Iterator[None]:
         raise SceneError(f"{path} cannot be read as Zarr: {type(error).__name__}: {error}; is it damaged?") from error
 
 
-def _chosen(arrays: Mapping[str, zarr.Array[Any]], variable: str | None, path: Path) -> str:
+@dataclass(frozen=True)
+class _Moment:
+    """One step of an axis of time."""
+
+    axis: int
+    step: int
+
+
+def _moment(array: zarr.Array[Any], step: int | None, path: Path, name: str) -> _Moment | None:
+    """The step that is meant, of an array with an axis of time (SceneError: none is named, or one that it lacks)."""
+    words = [word.lower() for word in _dims(array)]
+    unnamed = 0 if array.ndim == 4 and not any(words) else None
+    known = set(words) & set(ROWS) and set(words) & set(COLUMNS)
+    axis = next((at for at, word in enumerate(words) if known and word in TIMES), unnamed)
+    address = f"{path}:{name}" if name else str(path)
+    if axis is None:
+        if step is not None:
+            raise SceneError(f"{address} has the shape {array.shape} and no axis of time; leave :{step} out")
+        return None
+    steps = array.shape[axis]
+    if step is None and steps > 1:
+        raise SceneError(f"{address} has {steps} steps of time; name one, {address}:0 to {address}:{steps - 1}")
+    if step is not None and step >= steps:
+        raise SceneError(f"{address} has {steps} steps of time, counted from 0; got :{step}")
+    return _Moment(axis, step or 0)
+
+
+def _chosen(arrays: Mapping[str, zarr.Array[Any]], variable: str | None, path: Path, *, series: bool) -> str:
     listing = ", ".join(f"{name} {array.shape}" for name, array in arrays.items()) or "none"
     if variable is not None:
         if variable not in arrays:
             raise SceneError(f"{path} has no array {variable}; it has {listing}")
         return variable
-    cubes = [name for name, array in arrays.items() if array.ndim == 3 and array.dtype.kind in "buif"]
+    cubes = [name for name, array in arrays.items() if array.ndim == 3 + series and array.dtype.kind in "buif"]
     own = [name for name in ("dn", "values") if name in cubes]
     if own or len(cubes) == 1:
         return (own or cubes)[0]
@@ -109,21 +145,24 @@ def _chosen(arrays: Mapping[str, zarr.Array[Any]], variable: str | None, path: P
         raise SceneError(f"{path} has several arrays with three axes; it has {listing}; name one: {path.name}:ARRAY")
     if list(arrays) == [""]:
         return ""
+    over_time = [name for name, array in arrays.items() if array.ndim == 4 and array.dtype.kind in "buif"]
+    if len(over_time) == 1:
+        return over_time[0]
     raise SceneError(f"{path} has no array of numbers with the axes y, x and band; it has {listing}")
 
 
-def _axes(array: zarr.Array[Any], path: Path) -> tuple[tuple[int, ...], tuple[str, ...]]:
+def _axes(array: zarr.Array[Any], path: Path, moment: _Moment | None) -> tuple[tuple[int, ...], tuple[str, ...]]:
     """Which axes of the array are rows, columns and (where there are some) bands; and notes."""
-    named = _dims(array)
-    if array.ndim not in (2, 3):
+    named, own = _dims(array), [axis for axis in range(array.ndim) if moment is None or axis != moment.axis]
+    if len(own) not in (2, 3):
         raise SceneError(f"{path} holds shape {array.shape}; expected y, x and band; store one time or level")
     if not any(named):
-        return tuple(range(array.ndim)), ("dims have no names, read as y, x, band",)
-    words = [name.lower() for name in named]
-    found = [[at for at, word in enumerate(words) if word in known] for known in (ROWS, COLUMNS, BANDS)]
-    if any(len(places) != 1 for places in found[: array.ndim]) or (array.ndim == 2 and found[2]):
+        return tuple(own), ("dims have no names, read as y, x, band",)
+    words = {axis: named[axis].lower() for axis in own}
+    found = [[at for at, word in words.items() if word in known] for known in (ROWS, COLUMNS, BANDS)]
+    if any(len(places) != 1 for places in found[: len(own)]) or (len(own) == 2 and found[2]):
         raise SceneError(f"{path} has dims {', '.join(named)}; expected y, x, band (or band, y, x); rename them")
-    return tuple(places[0] for places in found[: array.ndim]), ()
+    return tuple(places[0] for places in found[: len(own)]), ()
 
 
 def _dims(array: zarr.Array[Any]) -> list[str]:
@@ -139,6 +178,7 @@ def _source(
     arrays: Mapping[str, Any],
     attributes: dict[str, Any],
     notes: tuple[str, ...],
+    moment: _Moment | None,
 ) -> CubeSource:
     lines, samples, bands = tuple(array.shape[axis] for axis in order) + ((1,) if len(order) == 2 else ())
     own = "sweep" in attributes or attributes.get("kind") == "ingested cube"
@@ -148,7 +188,7 @@ def _source(
     by_mirror = attributes.get("by_mirror") is True
     x, y = (_small(arrays, f"mirror_{axis}", (lines,)) if by_mirror else None for axis in "xy")
     position = None if x is None or y is None else np.stack([x, y], axis=-1).astype(np.float64)
-    read, kind, fill = _reader(path, array, order)
+    read, kind, fill = _reader(path, array, order, moment)
     void = attributes.get("nodata") if own else None
     return CubeSource(
         name=path.name,
@@ -176,7 +216,7 @@ def _source(
 
 
 def _reader(
-    path: Path, array: zarr.Array[Any], order: tuple[int, ...]
+    path: Path, array: zarr.Array[Any], order: tuple[int, ...], moment: _Moment | None
 ) -> tuple[ReadLines, np.dtype[Any], float | None]:
     """What reads lines, unpacked by CF's scale and offset, its type, and the number that stands for none yet."""
 
@@ -194,9 +234,14 @@ def _reader(
     plain = scale == 1.0 and offset == 0.0
 
     def read(start: int, stop: int) -> NDArray[Any]:
-        selection = tuple(slice(start, stop) if axis == order[0] else slice(None) for axis in range(array.ndim))
+        selection: list[slice | int] = [slice(None)] * array.ndim
+        selection[order[0]] = slice(start, stop)
+        left = order
+        if moment is not None:
+            selection[moment.axis] = moment.step
+            left = tuple(axis - (axis > moment.axis) for axis in order)
         with _named(path):
-            block = np.transpose(np.asarray(array[selection]), order)
+            block = np.transpose(np.asarray(array[tuple(selection)]), left)
         native = np.ascontiguousarray(block, block.dtype.newbyteorder("="))
         if native.ndim == 2:
             native = native[..., None]
@@ -223,7 +268,7 @@ def _small(arrays: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> NDAr
 def _bands(arrays: Mapping[str, Any], array: zarr.Array[Any], order: tuple[int, ...], count: int) -> Bands:
     """Wavelengths and widths of the coordinates that say them, in nm; none in another unit than one of length."""
     named = _dims(array)
-    axis = named[order[2]] if len(order) == 3 and len(named) == 3 else ""
+    axis = named[order[2]] if len(order) == 3 and len(named) == array.ndim else ""
     found = next((name for name in WAVELENGTHS if _is_line(arrays, name, count)), None)
     if found is None and _is_line(arrays, axis, count):
         about = arrays[axis].attrs

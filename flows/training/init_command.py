@@ -1,0 +1,228 @@
+"""What `spectralzoom init` does: it looks at images and labels, and writes a scene.toml of what they do not say."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+
+from flows.cli.app import AsJson, Switch, stderr
+from flows.terminal.processes import DONE, writing
+from flows.terminal.progress import StageProgress, put_out
+from pipeline.errors import SettingsError
+from pipeline.readings import MOST_VALUE
+from storage.archive.whole_files import write_whole
+from storage.readers.label_matching import listed_names
+from storage.readers.raster_files import split_variable
+from storage.readers.scene_drafts import FoundClass, SceneDraft, draft_scene
+from storage.readers.scene_toml import SETTINGS_NAME
+
+TITLES = {"look": "looking at labels"}
+NO_READING = -999.0  # at and below it an edge is filled, not seen
+
+
+def init(source: str, *, force: Switch = False, as_json: AsJson = False) -> int:
+    """Look at the images and labels of SOURCE, and write a scene.toml beside them that can be read and changed.
+
+    Asks nothing, and says what it could not see and which command comes next.
+
+    Parameters
+    ----------
+    source
+        A folder of images with their labels, or one image or cube.
+    force
+        Write a new scene.toml in the place of one that is there, which is kept as scene.toml.old.
+    """
+    put_out(run_init(source, stderr, force=force), _show, as_json=as_json)
+    return DONE
+
+
+def run_init(source: str, console: Console, *, force: bool = False) -> dict[str, Any]:
+    """Write a scene.toml for a folder or file, with progress on ``console``; give what was found, as --json prints it.
+
+    Raises SettingsError: there is a scene.toml and ``force`` is not given; ArchiveError: the folder cannot be written
+    to; else as `draft_scene`.
+    """
+    place, _ = split_variable(source)
+    path = (place if place.is_dir() and place.suffix.lower() != ".zarr" else place.parent) / SETTINGS_NAME
+    if path.exists() and not force:
+        raise SettingsError(f"there is a {path} already; change it by hand, or write a new one with --force")
+    with writing(path.parent, "folder"), _set_aside(path):
+        with StageProgress(console, TITLES) as progress:
+            draft = draft_scene(source, lambda done, name: progress.show("look", done, name, ended=done == 1))
+        write_whole(path, scene_text(draft))
+    return _record(source, path, draft)
+
+
+@contextmanager
+def _set_aside(path: Path) -> Iterator[None]:
+    """Keep what is there under another name: unread, and put back where no new one is written."""
+    kept = path.with_name(path.name + ".old")
+    there = path.exists()
+    if there:
+        path.replace(kept)
+    try:
+        yield
+    except BaseException:
+        if there:
+            kept.replace(path)
+        raise
+
+
+def scene_text(draft: SceneDraft) -> str:
+    """The lines of a scene.toml, each with a comment on where it comes from."""
+    parts = [
+        [
+            f"# What {_counted(len(draft.files.images), 'image')} here cannot say, as `spectralzoom init` saw it.",
+            "# Any line may be changed or taken away; what comes after a # is a comment.",
+        ],
+        _label_lines(draft),
+        _wavelength_lines(draft),
+        _nodata_lines(draft),
+        _class_lines(draft.classes, draft.legend),
+    ]
+    return "\n\n".join("\n".join(lines) for lines in parts if lines) + "\n"
+
+
+def _label_lines(draft: SceneDraft) -> list[str]:
+    images, labels = draft.files.images, draft.files.labels
+    if not labels:
+        return ['# labels = "labels/{name}.png"   # no label files were found: {name} is an image\'s name']
+    if draft.pattern is None:
+        pair = next(iter(labels.items()))
+        return [
+            f"# {len(labels)} of {len(images)} images have labels, found by their names: {_said(pair[0].name)}"
+            f" has {_said(pair[1].name)}"
+        ]
+    return [f"labels = {_quoted(draft.pattern)}   # of {len(labels)} of {len(images)} images"]
+
+
+def _wavelength_lines(draft: SceneDraft) -> list[str]:
+    bands = draft.shape[2]
+    if draft.wavelength_nm is None:
+        return [
+            f"# {bands} bands, and nothing says their wavelengths: write them, and take away the #",
+            f"# wavelengths_nm = [450.0, ...]   # {bands} numbers [nm]",
+        ]
+    if "assumed" not in draft.wavelength_origin:
+        low, high = draft.wavelength_nm.min(), draft.wavelength_nm.max()
+        return [f"# {bands} bands, {low:g}-{high:g} nm: {_said(draft.wavelength_origin)}"]
+    listed = ", ".join(repr(float(nm)) for nm in draft.wavelength_nm)
+    return [f"# wavelengths_nm = [{listed}]   # assumed of its colours: if you know better, take away the first #"]
+
+
+def _nodata_lines(draft: SceneDraft) -> list[str]:
+    lines = []
+    if draft.missing:
+        lines.append(f"# {draft.missing:.1%} of the values looked at are NaN, and count as missing")
+    if draft.nodata is not None:
+        lines.append(f"# the file itself says that {draft.nodata:g} is no data")
+    elif draft.edge is not None:
+        value, share = draft.edge
+        sure = value <= NO_READING or value > MOST_VALUE
+        told = f"nodata = {value!r}   # {share:.0%} of the first image's edge"
+        lines.append(told if sure else f"# {told}; if it stands for no data there, take away the first #")
+    return lines
+
+
+def _class_lines(classes: tuple[FoundClass, ...], legend: Path | None) -> list[str]:
+    if not classes:
+        return []
+    void = [one for one in classes if one.no_class]
+    guess = [] if void else [one for one in classes if one.value in (0, 255, (0, 0, 0), (255, 255, 255))]
+    lines = [f"unlabelled = {_value(one)}   # {one.name}: {one.share:.1%}" for one in void[:1]]
+    lines += [
+        f"# unlabelled = {_value(one)}   # if it stands for no class: take away the #, and its line below"
+        for one in guess[:1]
+    ]
+    named = f"names from {_said(legend.name)}" if legend is not None else "rename them as you like"
+    lines += ["", f"[classes]   # name = value in the label files, share of all pixels; {named}"]
+    return lines + [f"{_key(one.name)} = {_value(one)}   # {one.share:.1%}" for one in classes if one not in void[:1]]
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}{'s' if count != 1 else ''}"
+
+
+def _value(one: FoundClass) -> str:
+    return str(one.value) if isinstance(one.value, int) else str(list(one.value))
+
+
+def _key(name: str) -> str:
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _quoted(name)
+
+
+def _quoted(text: str) -> str:
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _said(text: str) -> str:
+    """Words in a comment, which ends with its line."""
+    return "".join(letter if letter.isprintable() else "?" for letter in text)
+
+
+def _record(source: str, path: Path, draft: SceneDraft) -> dict[str, Any]:
+    found = draft.files
+    return {
+        "file": str(path),
+        "images": len(found.images),
+        "labelled": len(found.labels),
+        "labels": draft.pattern,
+        "shape": list(draft.shape),
+        "wavelengths_nm": None if draft.wavelength_nm is None else np.asarray(draft.wavelength_nm).tolist(),
+        "wavelength_origin": draft.wavelength_origin,
+        "classes": [{"name": one.name, "value": one.value, "share": one.share} for one in draft.classes],
+        "notes": list(draft.notes),
+        "unseen": _unseen(draft),
+        "next": _next(source, draft),
+    }
+
+
+def _unseen(draft: SceneDraft) -> list[str]:
+    """What somebody has to look at: what could not be told from the files, or does not fit."""
+    found, told = draft.files, []
+    if found.labels and found.bare:
+        images = _counted(len(found.bare), "image")
+        told.append(f"labels of {images}, left out of the training: {listed_names(found.bare)}")
+    if not found.labels:
+        told.append("label files: beside an image NAME.png they are called NAME_mask.png, or labels/NAME.png")
+    if found.alone:
+        told.append(f"the image of {_counted(len(found.alone), 'label file')}: {listed_names(found.alone)}")
+    if draft.wavelength_nm is None:
+        told.append(f"the wavelengths of {draft.shape[2]} bands: write wavelengths_nm into {SETTINGS_NAME}")
+    if len(draft.classes) == 1:
+        told.append(f"a second class: all labels are {draft.classes[0].name}")
+    return [*told, *draft.unseen]
+
+
+def _next(source: str, draft: SceneDraft) -> str:
+    place, _ = split_variable(source)
+    name = re.sub(r"[^\w.-]+", "-", place.resolve().stem).strip("-") or "mine"
+    if len(draft.classes) > 1:
+        return shlex.join(["spectralzoom", "train", source, "-o", f"{name}.safetensors"])
+    scene = source if not place.is_dir() else str(draft.files.images[0])
+    return shlex.join(["spectralzoom", "survey", "--scene", scene, "--weights", "WEIGHTS.safetensors"])
+
+
+def _show(record: dict[str, Any], console: Console) -> None:
+    height, width, bands = record["shape"]
+    images = _counted(record["images"], "image")
+    names = ", ".join(one["name"] for one in record["classes"][:8])
+    more = f" and {len(record['classes']) - 8} more" if len(record["classes"]) > 8 else ""
+    console.print(f"{images}, {record['labelled']} with labels; the first has {height} x {width} px, {bands} bands")
+    if names:
+        console.print(escape(f"classes: {names}{more}"), soft_wrap=True)
+    for note in record["notes"]:
+        console.print(escape(f"note: {note}"), soft_wrap=True)
+    for words in record["unseen"]:
+        console.print(escape(f"not seen: {words}"), soft_wrap=True)
+    console.print(escape(f"written: {record['file']}"), soft_wrap=True)
+    console.print(escape(f"next: {record['next']}"), soft_wrap=True)

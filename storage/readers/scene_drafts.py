@@ -1,0 +1,196 @@
+"""What files of images and labels show of themselves, looked at before anybody has written a scene.toml for them."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import PipelineError, SceneError
+from pipeline.readings import edge_fill
+from storage.readers.cube_sources import CubeSource
+from storage.readers.label_matching import MatchedFiles, find_label, image_folder, is_label_name, match_folder
+from storage.readers.labels import MIXED, MOST_FOUND_CLASSES, load_codes, shown_value, value_of_code
+from storage.readers.legends import Legend, find_legend
+from storage.readers.raster_files import IMAGE_ENDINGS, TIFF_ENDINGS, image_shape, open_tiff_rows, split_variable
+from storage.readers.scan_files import open_cube_source
+from storage.readers.scene_files import scene_number
+from storage.readers.scene_toml import ClassValue
+
+Report = Callable[[float, str], None]  # how far it is, 0..1, and at which file
+NO_CLASS = ("unlabelled", "unlabeled", "void", "ignore", "ignored", "undefined", "nodata", "no data", "none")
+_ROWS_OF_EDGE = 32  # whose first and last pixels are looked at
+
+
+@dataclass(frozen=True)
+class FoundClass:
+    """A value of the label files: what a scene.toml may call it, and its share of all their pixels."""
+
+    name: str
+    value: ClassValue
+    share: float
+    no_class: bool = False  # its own name says that it stands for none
+
+
+@dataclass(frozen=True)
+class SceneDraft:
+    """What was seen of the scenes that one scene.toml speaks for."""
+
+    folder: Path  # of scene.toml
+    files: MatchedFiles
+    shape: tuple[int, int, int]  # of the first image, (y, x, band)
+    pattern: str | None  # of all label files by their images' names, relative to ``folder``
+    wavelength_nm: NDArray[np.float64] | None  # (band,)
+    wavelength_origin: str
+    nodata: float | None  # as the file itself says
+    edge: tuple[float, float] | None  # value that fills the edge, and its share of it
+    missing: float  # share of NaN among the values looked at
+    classes: tuple[FoundClass, ...] = ()
+    legend: Path | None = None
+    notes: tuple[str, ...] = ()  # what readers made of the first image
+    unseen: tuple[str, ...] = field(default=())  # what could not be read or does not fit, one sentence each
+
+
+def draft_scene(address: str | Path, report: Report = lambda done, name: None) -> SceneDraft:
+    """Look at the images and labels of a folder, or at one file and its labels.
+
+    Of images the first is read, of the others the sizes; of label files all are read. Raises SceneError: there is
+    nothing to look at, the first image cannot be read, labels may belong to several images, or have no classes because
+    their values are mixed.
+    """
+    path, _ = split_variable(address)
+    alone = not path.is_dir() or path.suffix.lower() == ".zarr"
+    if not path.exists():
+        raise SceneError(f"there is no file or folder {path}; check the name (seen from {Path.cwd()})")
+    found = _one_file(path) if alone else match_folder(image_folder(path))
+    if not found.images:
+        raise SceneError(f"{path} holds no image that is read; give a folder of images, or with a folder images/")
+    folder = path.parent if alone else path
+    source = open_cube_source(address if alone else found.images[0])
+    legend = find_legend([folder, *(label.parent for label in found.labels.values())], list(found.labels.values()))
+    unseen: list[str] = []
+    classes = _classes(found, source.shape, legend, unseen, report)
+    edge, missing = _look_at_edge(source)
+    return SceneDraft(
+        folder=folder,
+        files=found,
+        shape=source.shape,
+        pattern=_pattern(found, folder),
+        wavelength_nm=source.bands.wavelength_nm,
+        wavelength_origin=source.bands.origin,
+        nodata=source.nodata,
+        edge=edge,
+        missing=missing,
+        classes=classes,
+        legend=None if legend is None else legend.path,
+        notes=source.notes,
+        unseen=tuple(unseen),
+    )
+
+
+def _one_file(path: Path) -> MatchedFiles:
+    label = None if is_label_name(path) else find_label(path)
+    return MatchedFiles((path,), {} if label is None else {path: label}, ())
+
+
+def _pattern(found: MatchedFiles, folder: Path) -> str | None:
+    """The ``labels`` of a scene.toml that tells each image its own file, and others none; None where none does."""
+    for image, label in list(found.labels.items())[:1]:
+        place = os.path.relpath(label.parent, folder)
+        number = scene_number(image)
+        tried = [label.name.replace(image.stem, "{name}", 1)] if image.stem in label.name else []
+        tried += [label.name.replace(number, "{number}", 1)] if number and number in label.name else []
+        tried += [label.name] if len(found.images) == 1 else []
+        for name in tried:
+            pattern = Path(place, name).as_posix()
+            places = {one: (folder / _filled(pattern, one)).resolve() for one in found.images}
+            fits = all(places[one] == own.resolve() for one, own in found.labels.items())
+            if fits and not any(places[one].exists() for one in found.bare):
+                return pattern
+    return None
+
+
+def _filled(pattern: str, image: Path) -> str:
+    return pattern.replace("{number}", scene_number(image) or "").replace("{name}", image.stem)
+
+
+def _classes(
+    found: MatchedFiles, shape: tuple[int, int, int], legend: Legend | None, unseen: list[str], report: Report
+) -> tuple[FoundClass, ...]:
+    """All values of the label files, as classes; what cannot be read or has another size than its image is told."""
+    by_number = legend is not None and bool(legend.listed or any(isinstance(one, int) for one in legend.names))
+    counts: Counter[int] = Counter()
+    greys: Counter[int] = Counter()  # of files without colours, while others have some
+    for number, (image, label) in enumerate(found.labels.items()):
+        report(number / len(found.labels), label.name)
+        try:
+            codes, is_colour = load_codes(label, by_number=by_number)
+            size = shape if image == found.images[0] else _shape(image)
+        except PipelineError as error:
+            unseen.append(str(error))
+            continue
+        if size[2] != shape[2]:
+            unseen.append(f"{image} has {size[2]} bands, the first image {shape[2]}: train on images of one camera")
+        if codes.shape != size[:2]:
+            unseen.append(f"{label} is {codes.shape[0]} x {codes.shape[1]} px, its image {size[0]} x {size[1]} (y x x)")
+        values, number_of = np.unique(codes, return_counts=True)
+        _refuse_mixed(label, values, number_of, is_colour=is_colour)
+        into = counts if is_colour else greys
+        into.update({int(value): int(count) for value, count in zip(values, number_of, strict=True) if value >= 0})
+    if found.labels:
+        report(1.0, "")
+    of_colours = bool(counts)
+    counts.update({code * (0x010101 if of_colours else 1): count for code, count in greys.items()})
+    _refuse_many(counts)
+    values_found = [value_of_code(code, is_colour=of_colours) for code in sorted(counts)]
+    every = counts.total()
+    classes = []
+    for place, (code, value) in enumerate(zip(sorted(counts), values_found, strict=True)):
+        told = None if legend is None else legend.name_of(value, place, values_found)
+        name = told or (f"colour_{code:06x}" if of_colours else f"class_{code}")
+        classes.append(FoundClass(name, value, counts[code] / every, (told or "").lower() in NO_CLASS))
+    if len({one.name for one in classes}) < len(classes):
+        unseen.append(f"{legend.path if legend else 'a legend'} gives one name to two values; classes are numbered")
+        classes = [FoundClass(f"{one.name}_{at}", one.value, one.share, one.no_class) for at, one in enumerate(classes)]
+    return tuple(classes)
+
+
+def _refuse_mixed(label: Path, values: NDArray[np.int64], counts: NDArray[np.int64], *, is_colour: bool) -> None:
+    if len(values) <= MOST_FOUND_CLASSES:
+        return
+    most = np.argsort(-counts)[:4]
+    shown = ", ".join(f"{shown_value(values[at], is_colour=is_colour)} {counts[at] / counts.sum():.0%}" for at in most)
+    what = "colours" if is_colour else "numbers"
+    told = f" (most of it: {shown})" if counts[most].sum() > counts.sum() / 2 else ""
+    raise SceneError(f"{label} has {len(values)} different {what}{told}: {MIXED}")
+
+
+def _refuse_many(counts: Counter[int]) -> None:
+    if len(counts) > MOST_FOUND_CLASSES:
+        raise SceneError(
+            f"the label files have {len(counts)} different values together, at most {MOST_FOUND_CLASSES} are taken for"
+            f" classes: {MIXED}"
+        )
+
+
+def _shape(image: Path) -> tuple[int, int, int]:
+    """(y, x, band) of an image, by its head where it has one."""
+    if image.suffix.lower() in IMAGE_ENDINGS:
+        return image_shape(image)
+    rows = open_tiff_rows(image) if image.suffix.lower() in TIFF_ENDINGS else None
+    return open_cube_source(image).shape if rows is None else rows.shape
+
+
+def _look_at_edge(source: CubeSource) -> tuple[tuple[float, float] | None, float]:
+    """What fills the edge of a cube, and the share of NaN in the rows that were read for it."""
+    height = source.shape[0]
+    starts = sorted({round(at) for at in np.linspace(0, height - 1, min(_ROWS_OF_EDGE, height))})
+    rows: Sequence[NDArray[np.generic]] = [source.read(start, start + 1) for start in starts]
+    edge = np.concatenate([rows[0][0], rows[-1][0], *(row[0][[0, -1]] for row in rows)])
+    missing = float(np.mean([np.isnan(row).mean() for row in rows])) if source.dtype.kind == "f" else 0.0
+    return edge_fill(edge), missing

@@ -1,0 +1,272 @@
+"""Mistakes of people with data of their own: each ends in one message that says what to do, or simply works."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from flows.settings.load import load_settings
+from storage.archive.archive import Archive
+from storage.readers.datasets import load_data_set
+from storage.readers.raster_files import image_shape
+from storage.readers.scene_files import load_scene_file
+from tests.conftest import WeightsMaker
+from tests.flows.conftest import command_line
+from tests.users.mistaken_files import NM, write_files
+
+__all__ = ["command_line"]
+
+SURVEY = "survey --engine plain --no-controls --no-accuracy --out never --weights w.safetensors --scene "
+TRAIN = "train --steps 1 --dim 16 --layers 1 --heads 2 -o new.safetensors "
+BANDS = f" --wavelengths {NM}"
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory, weights: Path, make_weights: WeightsMaker) -> Path:
+    """A folder with every mistaken file."""
+    here = tmp_path_factory.mktemp("mistakes")
+    write_files(here)
+    shutil.copy(weights, here / "w.safetensors")
+    shutil.copy(make_weights(names=("soil", "crop")), here / "soil.safetensors")
+    shutil.copy(make_weights((1500.0, 1700.0)), here / "infrared.safetensors")
+    Archive.open(here / "kept")
+    (here / "cut.safetensors").write_bytes(weights.read_bytes()[:4000])
+    return here
+
+
+CASES = {
+    # a scene
+    "missing file": (1, SURVEY + "none.png", "there is no file none.png"),
+    "missing file and no weights": (1, "survey --scene none.png", "no file none.png"),
+    "missing weights": (2, "survey --scene field.png", "weights is missing.* train some"),
+    "folder": (1, SURVEY + "apart", "apart is a folder, expected a file"),
+    "empty folder": (1, SURVEY + "empty", "empty"),
+    "unknown ending": (1, SURVEY + "field.jp2", "ends in .jp2, which is not read; use .png"),
+    "document": (1, SURVEY + "field.pdf", "ends in .pdf"),
+    "no ending": (1, SURVEY + "no_ending", "no header beside no_ending.*ending of another kind"),
+    "png called tif": (1, SURVEY + "field.tif", "begins as a .png file does; give it that ending"),
+    "link to itself": (1, SURVEY + "loop.png", "a link that leads nowhere, loop.png"),
+    "cut off picture": (1, SURVEY + "cut.png", "cut.png cannot be read as .png.*truncated"),
+    "text as picture": (1, SURVEY + "text.png", "text.png cannot be read as .png.*save it as PNG"),
+    "empty file": (1, SURVEY + "empty.png", "empty.png cannot be read as .png"),
+    "cut off array": (1, SURVEY + "cut.npy" + BANDS, "cut.npy cannot be read as .npy"),
+    "cut off MATLAB": (1, SURVEY + "cut.mat" + BANDS, "cut.mat cannot be read as .mat.*cut off"),
+    "objects": (1, SURVEY + "objects.npy" + BANDS, "Python objects"),
+    "words": (1, SURVEY + "words.npy --wavelengths 550", "expected whole or floating numbers"),
+    "complex": (1, SURVEY + "complex.npy" + BANDS, "complex numbers; store their magnitude"),
+    "empty array": (1, SURVEY + "empty.npy" + BANDS, "empty array of shape"),
+    "one row": (1, SURVEY + "row.npy" + BANDS, r"shape \(5,\); expected \(y, x, band\)"),
+    "five axes": (1, SURVEY + "five_axes.npy" + BANDS, r"shape \(2, 2, 3, 3, 2\); expected \(y, x, band\)"),
+    "bands first": (1, SURVEY + "band_first.npy" + BANDS, r"\(5, 12, 16\).* its bands come first.*moveaxis"),
+    "NaN everywhere": (1, SURVEY + "nothing.npy" + BANDS, "no finite number"),
+    "infinite everywhere": (1, SURVEY + "infinite.npy" + BANDS, "no finite number"),
+    "fill values": (1, SURVEY + "filled.npy" + BANDS, "write nodata = 1e"),
+    "header without data": (1, SURVEY + "alone.hdr" + BANDS, "no data file beside"),
+    "archive as a scene": (1, SURVEY + "packed.zip", "ends in .zip"),
+    "folder called zarr": (1, SURVEY + "hollow.zarr", "hollow.zarr has no array"),
+    "weights as a scene": (1, SURVEY + "w.safetensors", "ends in .safetensors"),
+    # which array
+    "several arrays": (1, SURVEY + "two.npz" + BANDS, r"north \(12, 16, 5\), south.*name one: two.npz:VARIABLE"),
+    "several cubes": (1, SURVEY + "two_cubes.mat" + BANDS, r"north \(12, 16, 5\).*two_cubes.mat:VARIABLE"),
+    "no such variable": (1, SURVEY + "two_cubes.mat:west" + BANDS, r"no array west; it has north \(12, 16, 5\)"),
+    "a table": (1, "ingest table.mat never", "table of 198 x 10000 numbers.*reshape"),
+    "a table as a scene": (1, SURVEY + "table.npy --wavelengths 550", "table of 198 x 10000"),
+    "series without a step": (1, SURVEY + "series.npy" + BANDS, "time, y, x, band.*series.npy:0 to .*series.npy:2"),
+    "series in a pack": (1, SURVEY + "series.npz" + BANDS, "series.npz:visits:0 to .*:1"),
+    "series in a store": (1, SURVEY + "series.zarr" + BANDS, "2 steps of time; name one, .*series.zarr:values:0"),
+    "step that is not there": (1, SURVEY + "series.npy:3" + BANDS, "3 steps of time, counted from 0; got :3"),
+    "step of a store that is not there": (1, SURVEY + "series.zarr:9" + BANDS, "2 steps of time.* got :9"),
+    "step of what is no series": (1, SURVEY + "cube.npy:0" + BANDS, "no axis of time"),
+    "name in an array file": (1, SURVEY + "cube.npy:red" + BANDS, "one array, which has no name"),
+    # wavelengths and bands
+    "no wavelengths": (1, SURVEY + "cube.npy", "nothing says their wavelengths; give --wavelengths"),
+    "too few wavelengths": (1, SURVEY + "cube.npy --wavelengths 460,550", "expected 5 wavelengths.* got 2"),
+    "micrometres": (2, SURVEY + "cube.npy --wavelengths .46,.55,.64,.7,.8", "micrometres"),
+    "metres": (2, SURVEY + "cube.npy --wavelengths 4.6e-7,5e-7,6e-7,7e-7,8e-7", "from 150 to 30000 nm"),
+    "wavelengths as words": (2, SURVEY + "cube.npy --wavelengths red,green", "got 'red'"),
+    "band that is not there": (1, SURVEY + "cube.npy --bands 0,5 --wavelengths 460,550", "band 5, but .*0..4"),
+    "band twice": (2, SURVEY + "cube.npy --bands 1,1 --wavelengths 460,550", "names a band twice"),
+    "negative band": (2, SURVEY + "cube.npy --bands=-1 --wavelengths 460", "bands"),
+    # labels
+    "labels missing": (1, SURVEY + "field.png --labels none.png", "no file none.png"),
+    "labels of another size": (1, SURVEY + "field.png --labels small_labels.png", "20 x 32 px, the scene is 24 x 32"),
+    "labels with fractions": (1, SURVEY + "plane.npy --wavelengths 550 --labels float_labels.npy", "fractions"),
+    "labels as JPEG": (1, SURVEY + "field.png --labels labels.jpg", "different colours.*JPEG.* PNG"),
+    "the picture as labels": (1, SURVEY + "field.png --labels field.png", "is this the picture itself"),
+    "classes of other weights": (
+        1,
+        SURVEY + "field.png --labels rgba_labels.png",
+        "class 'colour_000000', the weights",
+    ),
+    "labels of a farm": (2, "survey --labels two_classes.png --engine plain --out never", "brings its own"),
+    "colour that is no class": (
+        1,
+        TRAIN + "no_class",
+        r"colour \[9, 9, 9\], which is no class.* add it to \[classes\]",
+    ),
+    # weights
+    "name too long": (1, SURVEY + "x" * 5000 + ".png", "cannot be the name of a file"),
+    "no such weights": (1, "survey --scene field.png --weights no.safetensors --out never", "no weights at no.safe"),
+    "weights cut off": (1, "survey --scene field.png --weights cut.safetensors --out never", "not a readable"),
+    "picture as weights": (1, "survey --scene field.png --weights field.png --out never", "field.png"),
+    "weights of other bands": (
+        1,
+        "survey --scene field.png --weights infrared.safetensors --out never",
+        "for 1500-1700 nm; the scene's bands lie at 460-640 nm",
+    ),
+    # settings
+    "unknown setting": (2, "survey unknown.toml", "buget"),
+    "broken settings": (2, "survey broken.toml", "broken.toml.*line 1"),
+    "settings not in UTF-8": (2, "survey latin.toml", "latin.toml.*utf-8"),
+    "setting twice": (2, "survey twice.toml", "twice.toml"),
+    "settings missing": (2, "survey none.toml", "none.toml"),
+    "budget 0": (2, SURVEY + "field.png --budget 0", "above 0 and at most 1, got '0'"),
+    "budget 2": (2, SURVEY + "field.png --budget 2", "above 0 and at most 1, got '2'"),
+    "budget in percent": (2, SURVEY + "field.png --budget 50%", "got '50%'; for 50 % write 0.5"),
+    "budget NaN": (2, SURVEY + "field.png --budget nan", "got 'nan'"),
+    "negative seed": (2, SURVEY + "field.png --seed=-1", "seed must be .* from 0"),
+    "unknown flag": (2, SURVEY + "field.png --budgets 1", "Unknown option"),
+    "unknown verb": (2, "surveys field.png", "surveys"),
+    "out is a file": (
+        1,
+        SURVEY.replace("never", "a_file") + "field.png --budget 1",
+        "a_file is .*file, expected a folder",
+    ),
+    "out below a file": (1, SURVEY.replace("never", "a_file/new") + "field.png --budget 1", "lies below a file"),
+    "scene as settings": (2, "survey field.png", "a scene is given as --scene field.png"),
+    # training
+    "nothing to train on": (1, TRAIN + "none", "no file or folder none"),
+    "empty folder to train on": (1, TRAIN + "empty", "holds no scene"),
+    "folder without pictures": (1, TRAIN + "notes", "holds no scene"),
+    "no labels at all": (1, TRAIN + "bare", "no labels; training needs them.* labels/001.png"),
+    "several label files": (1, TRAIN + "several", "001_labels.png and .*001_mask.png; keep one"),
+    "two files of one stem": (1, TRAIN + "one_stem", "001.png and .*001.tif would both have the labels"),
+    "labels of one class": (1, TRAIN + "soil", "two or more classes.* unlabelled = "),
+    "soft labels": (1, TRAIN + "soft", "at most 64.* hard edges"),
+    "labels of other sizes": (1, TRAIN + "sizes", "9 x 32 px, the scene is 24 x 32"),
+    "scenes of other bands": (1, TRAIN + "other_bands", "other bands"),
+    "unknown key of scene.toml": (1, TRAIN + "bad_key", "unknown key label; known are"),
+    "classes of two kinds": (1, TRAIN + "two_kinds", "some classes are numbers and some are colours"),
+    "number that names lack": (1, TRAIN + "no_number", r"no number in its name.*\{name\}"),
+    "training into no folder": (2, TRAIN.replace("new.", "none/new.") + "apart", "folder none does not exist"),
+    "no steps": (2, TRAIN.replace("--steps 1", "--steps 0") + "apart", "--steps must be above 0"),
+    "negative seed of training": (2, TRAIN + "apart --seed=-1", "--seed must be 0 or more"),
+    "unknown scene held out": (1, TRAIN + "apart --hold-out 9", "no scene 9 to hold out; it has 001, 002"),
+    # init
+    "init of nothing": (1, "init none", "no file or folder none"),
+    "init of an empty folder": (1, "init empty", "holds no image"),
+    "init of a broken picture": (1, "init text.png", "text.png cannot be read"),
+    "init of soft labels": (1, "init soft", "768 different colours.* hard edges"),
+    "init twice": (2, "init bad_key", "there is a bad_key/scene.toml already.*--force"),
+    "init of several label files": (1, "init several", "several files of labels"),
+    # archives
+    "no archive": (1, "export none -o maps", "none"),
+    "archive is a file": (1, "ls a_file", "a_file"),
+    "folder that is no archive": (1, "export apart -o maps", "apart"),
+    "ingest of nothing": (1, "ingest none.hdr never", "no file none.hdr"),
+    "unknown run": (1, "explain kept yesterday", "yesterday"),
+    "run of what is no archive": (1, "evaluate empty latest", "no archive"),
+    "export of an archive without runs": (2, "export kept -o maps", "no published run; survey into it first"),
+    "wavelengths of a farm": (2, "survey --wavelengths 460 --engine plain --out never", "brings its own"),
+    "mask without a policy": (2, SURVEY + "field.png --policy mask", "needs a mask file"),
+    "mask of another size": (
+        1,
+        SURVEY + "field.png --budget 1 --policy mask --mask small_labels.png",
+        "one of its size",
+    ),
+    "plan of a missing scene": (1, "plan --scene none.png", "there is no file none.png"),
+    "evaluation without weights": (2, "evaluate apart", "give --weights FILE"),
+    "evaluation without labels": (1, "evaluate bare --weights w.safetensors", "has no labels"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_mistake_ends_in_one_message(
+    case: str, files: Path, command_line: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One line that says what to do, the right exit code, no traceback, and nothing written."""
+    code, words, message = CASES[case]
+    monkeypatch.chdir(files)
+    before = sorted(files.rglob("*"))
+    command_line(*words.split()).refused(code, message)
+    assert sorted(files.rglob("*")) == before
+
+
+WORKS = {  # what is read, with which wavelengths, as what (y, x, band), and what is said of it
+    "upper-case ending": ("FIELD_2.PNG", None, (24, 32, 3), ""),
+    "spaces": ("a field.png", None, (24, 32, 3), ""),
+    "umlauts": ("Rüben.png", None, (24, 32, 3), ""),
+    "line ends in a name": ("two\nlines.png", None, (24, 32, 3), ""),
+    "one pixel": ("one_px.png", None, (1, 1, 3), ""),
+    "constant picture": ("constant.png", None, (24, 32, 3), ""),
+    "negative reflectance": ("negative.npy", NM, (12, 16, 5), ""),
+    "percent": ("percent.npy", NM, (12, 16, 5), ""),
+    "scaled whole numbers": ("scaled.npy", NM, (12, 16, 5), ""),
+    "some NaN": ("holes.npy", NM, (12, 16, 5), "60 of 960 samples are missing"),
+    "two axes": ("plane.npy", "550", (12, 16, 1), ""),
+    "one cube beside vectors": ("one_cube.mat", NM, (12, 16, 5), r"array cube of the file, which also has wl \(1, 5\)"),
+    "MATLAB 7.3": ("seven.mat", NM, (12, 16, 5), ""),
+    "named variable": ("two_cubes.mat:north", NM, (12, 16, 5), ""),
+    "step of a series": ("series.npy:1", NM, (12, 16, 5), ""),
+    "step of a pack": ("series.npz:1", NM, (12, 16, 5), "array visits of the file"),
+    "step of a named array": ("series.npz:visits:0", NM, (12, 16, 5), ""),
+    "step of a store": ("series.zarr:values:1", NM, (12, 16, 5), ""),
+    "Zarr v2 of another tool": ("old.zarr", NM, (12, 16, 5), "dims have no names"),
+    "micrometres in a header": ("micro.hdr", None, (12, 16, 5), "micrometre|micro"),
+    "GeoTIFF": ("geo.tif", NM, (12, 16, 5), ""),
+}
+
+
+@pytest.mark.parametrize("case", WORKS)
+def test_what_is_no_mistake_works(case: str, files: Path) -> None:
+    """It is read as it is, and what was assumed is said."""
+    address, listed, shape, words = WORKS[case]
+    nm = None if listed is None else [float(one) for one in listed.split(",")]
+    scene = load_scene_file(f"{files}/{address}", wavelengths=nm)
+    assert scene.values.shape == shape
+    assert re.search(words, "; ".join(scene.provenance))
+
+
+def test_a_picture_beyond_the_limit_of_pillow_is_read(files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is large is a mosaic, not an attack; looking at its size alone says so, too."""
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)
+    assert load_scene_file(files / "field.png").values.shape == (24, 32, 3)
+    assert image_shape(files / "field.png") == (24, 32, 3)
+
+
+def test_a_step_is_that_step(files: Path) -> None:
+    """Steps are counted from 0, and of the first axis; a store has them wherever its axis of time is."""
+    nm = [float(one) for one in NM.split(",")]
+    cube = np.load(files / "cube.npy")
+    for address, more in {"series.npy:2": 2, "series.npz:1": 1, "series.zarr:1": 1}.items():
+        np.testing.assert_array_equal(load_scene_file(f"{files}/{address}", wavelengths=nm).values, cube + more)
+
+
+def test_a_mark_at_the_beginning_of_settings_is_read(files: Path) -> None:
+    """Editors of Windows write a byte order mark."""
+    assert load_settings(files / "bom.toml").budget == 0.8
+
+
+FOLDERS = {  # names of scenes and of their labels
+    "apart": {"001": "labels/001.png", "002": "labels/002.png"},
+    "beside": {"A 1": "A 1_mask.png", "b": "B_labels.PNG"},
+    "lacking": {"001": "masks/001.png", "002": None},
+    "hidden": {"001": "labels/001.png"},
+    "stems": {"001.png": None, "001.tif": None},
+    "palette": {"001": "001_mask.png"},
+}
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_images_find_their_labels_by_name(folder: str, files: Path) -> None:
+    """Equal names, words such as _mask, capitals; what is hidden or has no image is nobody's scene."""
+    data = load_data_set(files / folder)
+    found = {name: data.label_files.get(name) for name in data.names}
+    root = files / folder
+    assert {name: path and path.relative_to(root).as_posix() for name, path in found.items()} == FOLDERS[folder]

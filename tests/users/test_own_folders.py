@@ -1,0 +1,174 @@
+"""A folder of pictures and labels becomes a scene.toml, weights and a survey, without anybody reading the source."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from flows.settings.load import load_settings
+from flows.survey.scene import open_scene
+from flows.training.data import open_training_data
+from pipeline.geometry.camera import LineCamera
+from pipeline.readings import edge_fill
+from storage.readers.datasets import load_data_set
+from storage.readers.legends import read_legend
+from storage.readers.scene_files import load_scene_file
+from storage.readers.scene_toml import load_scene_settings
+from tests.flows.conftest import command_line
+from tests.users.mistaken_files import write_files
+
+__all__ = ["command_line"]
+
+SMALL = ["--steps", "1", "--dim", "16", "--layers", "1", "--heads", "2", "--batch", "1", "--crop", "16"]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folders of somebody with data of their own; tests copy what they change."""
+    here = tmp_path_factory.mktemp("folders")
+    write_files(here)
+    return here
+
+
+@pytest.mark.parametrize("folder", ["apart", "beside", "lacking", "tiles", "hidden"])
+def test_what_init_writes_reads_as_the_folder_did(folder: str, made: Path, command_line: Any) -> None:
+    """With its scene.toml every image has the labels that it had by its name, in the same classes."""
+    path = made / folder
+    before = load_data_set(path)
+    seen = {name: before.load(name).labels for name in before.label_files}
+    ended = command_line("init", path, "--json")
+    assert ended.code == 0, ended.err
+    after = load_data_set(path)
+    assert (after.names, after.label_files, after.alone) == (before.names, before.label_files, before.alone)
+    for name, labels in seen.items():
+        np.testing.assert_array_equal(after.load(name).labels, labels)
+    assert tuple(load_scene_settings(path / "scene.toml").classes) == after.load(next(iter(seen))).class_names
+    assert json.loads(ended.out)["next"].startswith("spectralzoom train ")
+
+
+def test_init_takes_names_from_a_legend_and_keeps_what_is_there(made: Path, command_line: Any) -> None:
+    """classes.txt names the numbers; a scene.toml goes aside with --force, and stays where none is written."""
+    (made / "bad_key" / "classes.txt").write_text("soil\ncrop\n")
+    (made / "bad_key" / "labels").mkdir()
+    for name in ("001", "002"):
+        Image.fromarray(np.eye(32, dtype=np.uint8)[:24]).save(made / "bad_key" / "labels" / f"{name}.png")
+    old = (made / "bad_key" / "scene.toml").read_bytes()
+    assert command_line("init", made / "bad_key", "--force").code == 0
+    assert load_scene_settings(made / "bad_key" / "scene.toml").classes == {"soil": 0, "crop": 1}
+    assert (made / "bad_key" / "scene.toml.old").read_bytes() == old
+    command_line("init", made / "palette")
+    assert load_scene_settings(made / "palette" / "scene.toml").classes == {"soil": 0, "sugar beet": 1}
+    scene = load_scene_file(made / "palette" / "001.png")
+    assert scene.labels is not None
+    assert (scene.labels == (scene.values[..., 0] > 99)).all()
+    (made / "soft" / "scene.toml").write_text("nodata = 0\n")
+    command_line("init", made / "soft", "--force").refused(1, "different colours")
+    assert (made / "soft" / "scene.toml").read_text() == "nodata = 0\n"
+
+
+def test_init_says_what_fills_the_edge(tmp_path: Path, command_line: Any) -> None:
+    """A number that no reading is becomes nodata; black at the edge is a question, and stays a comment."""
+    cube = np.random.default_rng(0).uniform(0.1, 1, (20, 20, 3)).astype(np.float32)
+    cube[:6] = -9999
+    np.save(tmp_path / "a.npy", cube)
+    command_line("init", tmp_path / "a.npy")
+    assert load_scene_settings(tmp_path / "scene.toml").nodata == -9999
+    np.save(tmp_path / "a.npy", np.where(cube < 0, 0, cube))
+    command_line("init", tmp_path / "a.npy", "--force")
+    assert load_scene_settings(tmp_path / "scene.toml").nodata is None
+    assert "# nodata = 0.0" in (tmp_path / "scene.toml").read_text()
+
+
+def test_init_tells_what_it_could_not_see(made: Path, command_line: Any) -> None:
+    """Images without labels, labels without images, other sizes and bands, one class, and unknown wavelengths."""
+    for folder, words in {
+        "lacking": ["labels of 1 image, left out", "the image of 1 label file: 009.png"],
+        "sizes": ["002.png is 9 x 32 px, its image 24 x 32"],
+        "other_bands": ["002.png has 1 bands, the first image 3"],
+        "soil": ["a second class: all labels are class_0"],
+        "bare": ["label files: beside an image NAME.png"],
+    }.items():
+        told = json.loads(command_line("init", made / folder, "--json", "--force").out)["unseen"]
+        assert [one for one in words if not any(one in line for line in told)] == []
+    told = json.loads(command_line("init", made / "cube.npy", "--json", "--force").out)["unseen"]
+    assert "the wavelengths of 5 bands: write wavelengths_nm into scene.toml" in told
+    (made / "scene.toml").unlink()
+
+
+LEGENDS = {
+    "0 soil\n1 sugar beet\n": {0: "soil", 1: "sugar beet"},
+    "soil: 0\ncrop: 1": {0: "soil", 1: "crop"},
+    "name,r,g,b\nsoil,0,0,0\ncrop,0,255,0\n": {(0, 0, 0): "soil", (0, 255, 0): "crop"},
+    "0 0 0\tsoil\n0 255 0\tcrop\n": {(0, 0, 0): "soil", (0, 255, 0): "crop"},
+    "#000000 soil\n#00ff00 crop\n": {(0, 0, 0): "soil", (0, 255, 0): "crop"},
+    '{"0": "soil", "1": "crop"}': {0: "soil", 1: "crop"},
+    '{"soil": [0, 0, 0], "crop": [0, 255, 0]}': {(0, 0, 0): "soil", (0, 255, 0): "crop"},
+    '{"classes": [{"name": "soil", "id": 3}, {"name": "crop", "color": "#00ff00"}]}': {3: "soil", (0, 255, 0): "crop"},
+}
+
+
+@pytest.mark.parametrize("text", LEGENDS)
+def test_legends_are_read_as_people_write_them(text: str, tmp_path: Path) -> None:
+    """Numbers or colours before or after the name, in text, CSV or JSON."""
+    path = tmp_path / ("legend.json" if text.startswith("{") else "legend.txt")
+    path.write_text(text)
+    legend = read_legend(path)
+    assert legend is not None
+    assert legend.names == LEGENDS[text]
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_are_a_legend_or_none(tmp_path_factory: pytest.TempPathFactory, content: bytes) -> None:
+    """Whatever lies under such a name, it is read or passed over."""
+    folder = tmp_path_factory.getbasetemp()
+    for name in ("legend.txt", "legend.json"):
+        (folder / name).write_bytes(content)
+        assert read_legend(folder / name) is None or read_legend(folder / name)
+
+
+@given(st.integers(0, 40), st.sampled_from([0.0, -9999.0, 1e30]))
+def test_what_fills_a_tenth_of_the_edge_is_told(filled: int, value: float) -> None:
+    """Values of all bands count, and no others; below a tenth nothing is told."""
+    edge = np.random.default_rng(1).uniform(1, 2, (40, 3))
+    edge[:filled] = value
+    edge[filled:, 0] = value  # of one band alone
+    assert edge_fill(edge) == (None if filled < 4 else (value, filled / 40))
+
+
+def test_training_leaves_out_and_says_so(made: Path, tmp_path: Path, command_line: Any) -> None:
+    """Scenes without labels are no part of it; tiles that lack a class are, in the classes of all tiles."""
+    out = tmp_path / "mine.safetensors"
+    ended = command_line("train", made / "lacking", "-o", out, *SMALL)
+    assert ended.code == 0
+    assert "note: of 2 scenes 1 without labels left out: 002.png" in ended.err
+    assert "note: label files without a scene, 1: 009.png" in ended.err
+    (made / "tiles" / "scene.toml").unlink(missing_ok=True)
+    data = open_training_data(str(made / "tiles"), 0, None, LineCamera())
+    assert {scene.class_names for scene in data.scenes(data.train)} == {("class_0", "class_1", "class_2")}
+
+
+def test_labels_that_nobody_stated_are_left_out_where_the_weights_know_others(made: Path) -> None:
+    """Found by their name and of other classes they refuse no survey: a note says so; of the same, they judge."""
+    scene = str(made / "apart" / "images" / "001.png")
+    settings = load_settings(None, {"scene": scene, "weights": "mine.safetensors"})
+    (made / "apart" / "scene.toml").unlink(missing_ok=True)
+    found, notes = open_scene(settings, ("soil", "crop"))
+    assert found.labels is None
+    assert any("the labels beside the scene are left out" in note for note in notes)
+    assert open_scene(settings, ("class_0", "class_1"))[0].labels is not None
+
+
+def test_labels_that_are_all_alike_are_questioned(made: Path) -> None:
+    """One value may be what nobody labelled: the scene says so, and what to write."""
+    scene = load_scene_file(made / "field.png", labels=made / "black.png")
+    assert any("all labels are class_0: if 0 in the label file" in note for note in scene.provenance)
+    assert not any(
+        "all labels" in note for note in load_scene_file(made / "field.png", labels=made / "two_classes.png").provenance
+    )
