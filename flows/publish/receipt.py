@@ -105,6 +105,7 @@ class Receipt(TypedDict):
     pointing: NotRequired[dict[str, Any]]  # only where the mirror may look beside the plan
     lines: NotRequired[dict[str, Any]]  # sweeps with lines lost, repeated, out of order, late or invalid
     ground: NotRequired[dict[str, Any]]  # only with a pose: grid and hectares
+    unknown: NotRequired[dict[str, Any]]  # pixels unlike what the weights were trained on, where they know what is
     pixels: NotRequired[dict[str, int]]  # only where some have no value, no reading or no class: how many
     products: dict[str, str]
 
@@ -124,7 +125,7 @@ class Header:
 
 
 COSTS = ("lines", "samples", "bytes_raw", "bytes_stored", "capture_s", "tokens", "multiply_adds")
-FINDINGS = ("plan", "scans", "memory", "pointing", "lines", "ground", "pixels")
+FINDINGS = ("plan", "scans", "memory", "pointing", "lines", "ground", "unknown", "pixels")
 _SAVING_FIELDS = ("done", "full", "ratio", "full_is")
 _SPLIT_FIELDS = ("glance", "score", "encode", "decode")
 _STAGE_FIELDS = ("name", "key", "state", "wall_s", "cpu_s", "peak_rss_bytes", "bytes_in", "bytes_out")

@@ -307,6 +307,10 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
         }
     class_map = products.of("draw_map")
     classes = load_class_map(class_map.path / "class_map.zarr").classes
+    if (rate := run.settings.unknown_rate) is not None and run.familiar is not None:
+        count = int(np.count_nonzero(classes == run.described.config.classes))
+        told_pixels = int(np.count_nonzero(classes != UNLABELLED))
+        found["unknown"] = {"pixels": count, "share": count / told_pixels if told_pixels else 0.0, "rate": rate}
     pixels = {
         "scene_without_a_value": run.scene.filled_px,
         "coarse_px_no_reading": 0,
