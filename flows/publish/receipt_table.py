@@ -181,8 +181,8 @@ def _unknown_words(unknown: Mapping[str, Any], accuracy: Mapping[str, Any] | Non
         text += f" {format_count(accuracy['unknown_px'])} such pixels have a label and count as wrong."
     if unknown["share"] > FOREIGN:
         text += (
-            " These weights do not know this field: train some on labelled scenes of it (spectralzoom train DATASET), or"
-            " leave the class out with --unknown off."
+            " These weights do not know this field: train some on labelled scenes of it"
+            " (spectralzoom train DATASET), or leave the class out with --unknown off."
         )
     return text
 

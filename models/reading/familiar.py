@@ -52,7 +52,7 @@ class Familiar:
     shot: Exact  # (component, column, column) what light leaves in a reading of the reference exposure
     read: Exact  # (column, column) what the reading leaves in it
     limits: Limits
-    bands: int  # of the camera in training; fewer make columns as noisy as less light does
+    bands: int  # of the camera in training; columns of fewer are noisier
 
     def __post_init__(self) -> None:
         count, columns = self.centres.shape
@@ -60,7 +60,7 @@ class Familiar:
         if shapes != ((count, columns, columns), (count, columns, columns), (columns, columns)):
             raise ShapeError(f"{count} components of {columns} columns have covariances of {shapes}")
 
-    def lit(self, light: float, readings: int = 1) -> LitFamiliar:
+    def lit(self, light: float, readings: float = 1.0) -> LitFamiliar:
         """The components as a look shows them whose pixels are means of so many readings of an exposure ``light``."""
         noise = (self.shot / light + self.read / light**2) / readings
         spread = self.covariance + noise
@@ -78,9 +78,9 @@ class Familiar:
         ``light``: Exposure as a share of the reference. ``step``: As of `Limits.at`. ``bands``: Of the camera.
         ``factor``: Readings that a pixel of a coarse pass is the mean of. A pixel without columns is not unknown.
         """
-        worth = light * min(1.0, bands / self.bands)
-        limit = self.limits.at(rate, worth, step)
-        distance = self.lit(worth, factor if step is None else 1).distance(columns)
+        limit = self.limits.at(rate, light, step)
+        readings = (factor if step is None else 1) * min(1.0, bands / self.bands)  # fewer bands are as fewer readings
+        distance = self.lit(light, readings).distance(columns)
         with np.errstate(invalid="ignore"):
             return np.asarray(distance > limit, np.bool_)
 
