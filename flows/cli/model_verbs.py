@@ -16,6 +16,7 @@ from flows.evaluate.command import run_evaluate
 from flows.evaluate.frames import SHARES, USUAL, EvaluateRequest
 from flows.terminal.progress import print_json
 from flows.tradeoff.command import run_tradeoff
+from flows.training.measure_familiar import FamiliarRequest, run_measure_familiar
 from flows.training.remember import JUDGED_LANDS, LANDS, MemoryRequest, run_remember
 from flows.training.train import TrainRequest, asked_command, run_train, usual_crop
 from models.training.memory import MemoryTraining
@@ -68,6 +69,7 @@ def train(
     positions: Literal["2d", "paper"] = "2d",
     init: Path | None = None,
     remember: Path | None = None,
+    familiar: Path | None = None,
     dim: int = 128,
     layers: int = 4,
     heads: int = 4,
@@ -126,6 +128,11 @@ def train(
         against a later look. Called WEIGHTS.memory.safetensors and put beside WEIGHTS.safetensors, surveys with --prior
         use it. Of the other flags it takes --scenes, --steps, --minutes, --seed and --validation; it begins anew where
         it was stopped. Takes 4 GB; looking at the lands before takes half an hour on top of --minutes.
+    familiar
+        Weights to measure what is familiar to, and nothing else: it looks at the scenes of their training again, which
+        DATASET has to be. Called WEIGHTS.familiar.safetensors and put beside WEIGHTS.safetensors, surveys by it call
+        pixels unknown that are unlike all of them. New weights have it from their training, if scenes were kept for
+        validation.
     dim
         Width of the transformer, the numbers that a patch becomes; 192 and 384 are those of ViT-Tiny and ViT-Small.
     layers
@@ -163,7 +170,6 @@ def train(
         if as_json:
             print_json(record)
         return 0
-    size = crop if crop is not None else usual_crop(dataset, preset)
     choices = {
         "labels": labels,
         "bands": parse_wholes(bands, "--bands"),
@@ -171,6 +177,12 @@ def train(
         "train_mask": train_mask,
         "mask_classes": parse_wholes(mask_classes, "--mask-classes"),
     }
+    if familiar is not None:
+        known = run_measure_familiar(FamiliarRequest(dataset, familiar, out, choices, asked_command()), stderr)
+        if as_json:
+            print_json(known)
+        return 0
+    size = crop if crop is not None else usual_crop(dataset, preset)
     request = TrainRequest(
         dataset,
         out,

@@ -108,6 +108,7 @@ class Receipt(TypedDict):
     ground: NotRequired[dict[str, Any]]  # only with a pose or a placed scene: grid, hectares
     zones: NotRequired[dict[str, Any]]  # only where zones leave something out: what is kept
     plots: NotRequired[list[dict[str, Any]]]  # only where plots are given: ground, classes, confidence of each
+    unknown: NotRequired[dict[str, Any]]  # pixels unlike what the weights were trained on, where they know what is
     pixels: NotRequired[dict[str, int]]  # only where some have no value, no reading or no class: how many
     products: dict[str, str]
 
@@ -127,7 +128,7 @@ class Header:
 
 
 COSTS = ("lines", "samples", "bytes_raw", "bytes_stored", "capture_s", "tokens", "multiply_adds")
-FINDINGS = ("field", "plan", "scans", "memory", "pointing", "lines", "ground", "zones", "plots", "pixels")
+FINDINGS = ("field", "plan", "scans", "memory", "pointing", "lines", "ground", "zones", "plots", "unknown", "pixels")
 _SAVING_FIELDS = ("done", "full", "ratio", "full_is")
 _SPLIT_FIELDS = ("glance", "score", "encode", "decode")
 _STAGE_FIELDS = ("name", "key", "state", "wall_s", "cpu_s", "peak_rss_bytes", "bytes_in", "bytes_out")

@@ -165,6 +165,8 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
             words.append(_sentence(plan["orientation"]["sentence"]))
     if memory := found.get("memory"):
         words.append(_memory_words(memory))
+    if unknown := found.get("unknown"):
+        words.append(_unknown_words(unknown, found.get("accuracy")))
     if scans := found.get("scans"):
         words.append(_scans_words(scans))
     for name, one in found.get("pointing", {}).items():
@@ -195,6 +197,25 @@ def _field_words(field: Mapping[str, Any]) -> str:
         f"{view}{away}: {area_words(field['hectares'])} at {format_metres(field['ground_pixel_m'])} a pixel, {pace:.3g}"
         f" ha an hour of the camera ({SECONDS_PER_HOUR / pace:.3g} s a hectare)."
     )
+
+
+FOREIGN = 0.2  # share of a map that is unknown from which on its weights are the wrong ones
+
+
+def _unknown_words(unknown: Mapping[str, Any], accuracy: Mapping[str, Any] | None) -> str:
+    """How much of a map is unlike what the weights were trained on, and what to do about much of it."""
+    text = (
+        f"{format_percent(unknown['share'])} of the map is unknown, unlike all that the weights were trained on; of "
+        f"what they know it would be about {format_percent(unknown['rate'])}."
+    )
+    if accuracy and accuracy.get("unknown_px"):
+        text += f" {format_count(accuracy['unknown_px'])} such pixels have a label and count as wrong."
+    if unknown["share"] > FOREIGN:
+        text += (
+            " These weights do not know this field: train some on labelled scenes of it"
+            " (spectralzoom train DATASET), or leave the class out with --unknown off."
+        )
+    return text
 
 
 MOST_CHANGES = 4  # told in words

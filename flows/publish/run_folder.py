@@ -305,6 +305,10 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     drawn = load_class_map(class_map.path / "class_map.zarr")
     found |= placed_findings(run, drawn) | find_zones(run, drawn)
     unclassed = drawn.classes == UNLABELLED
+    if (rate := run.settings.unknown_rate) is not None and run.familiar is not None:
+        count = int(np.count_nonzero(drawn.classes == run.described.config.classes))
+        told_pixels = int(np.count_nonzero(~unclassed))
+        found["unknown"] = {"pixels": count, "share": count / told_pixels if told_pixels else 0.0, "rate": rate}
     if run.zones.left_out is not None:
         unclassed &= ~run.zones.left_out
     pixels = {

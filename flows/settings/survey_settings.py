@@ -13,6 +13,8 @@ from typing import Annotated, Any, Literal, cast
 from pydantic import PlainValidator
 
 from flows.settings.values import (
+    UNKNOWN_AUTO,
+    UNKNOWN_OFF,
     Bands,
     Budget,
     Bytes,
@@ -24,10 +26,12 @@ from flows.settings.values import (
     Scheduler,
     Size,
     Tolerance,
+    Unknown,
     Wavelengths,
     parse_tolerance,
 )
 from models.policies.policies import Policy
+from models.reading.familiar import RATE
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import CostModel
 from pipeline.ground.view import RigPose
@@ -153,6 +157,11 @@ class Settings:
     weights: str | None = stated(
         None, "Model weights (.safetensors); those for `farm` are built in", example="weights.safetensors"
     )
+    unknown: Unknown = stated(
+        "auto",
+        "Pixels unlike all that the weights were trained on get the class unknown: auto (where the weights know "
+        "what is familiar to them, at 0.5%), off, or the share of known pixels that may be called unknown: 0.5%",
+    )
     threshold: float | None = stated(
         None,
         "Least gain (per px, summed over seats) in a second of the fine pass, the receipt's score_per_second; for the "
@@ -233,6 +242,12 @@ class Settings:
     def plain(self) -> bool:
         """Whether the field is scanned once, whole, in the place of a coarse and a fine pass."""
         return any(getattr(self, name) is not None for name in PLAIN)
+
+    @property
+    def unknown_rate(self) -> float | None:
+        """Share of known pixels that may be called unknown; None where none is to be."""
+        usual = {UNKNOWN_AUTO: RATE, UNKNOWN_OFF: None}
+        return usual[self.unknown] if self.unknown in usual else float(self.unknown.removesuffix("%")) / 100
 
     @property
     def crew(self) -> Crew:

@@ -244,9 +244,28 @@ def parse_scene(value: object) -> str:
     return value
 
 
+UNKNOWN_AUTO, UNKNOWN_OFF = "auto", "off"
+LEAST_UNKNOWN, MOST_UNKNOWN = 0.05, 5.0  # percent
+
+
+def parse_unknown(value: object) -> str:
+    """``auto``, ``off``, or the share of known pixels that may be called unknown, such as 0.5%."""
+    word = str(value).strip().lower()
+    if word in (UNKNOWN_AUTO, UNKNOWN_OFF):
+        return word
+    percent = _to_float(word.removesuffix("%")) if word.endswith("%") else None
+    if percent is None or not LEAST_UNKNOWN <= percent <= MOST_UNKNOWN:
+        raise ValueError(
+            f"must be auto, off, or the share of known pixels that may be called unknown, {LEAST_UNKNOWN:g}% to"
+            f" {MOST_UNKNOWN:g}%, such as 0.5%; got {value!r}"
+        )
+    return f"{percent:g}%"
+
+
 Name = Annotated[str, PlainValidator(parse_name)]
 SceneName = Annotated[str, PlainValidator(parse_scene)]
 Budget = Annotated[float, PlainValidator(parse_budget)]
+Unknown = Annotated[str, PlainValidator(parse_unknown)]
 Goal = Annotated[str, PlainValidator(parse_goal)]
 Bytes = Annotated[int, PlainValidator(parse_bytes)]
 Memory = Annotated[int, PlainValidator(parse_memory)]

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.survey.field_work import FieldWork, WeightsFile, look_at, seat_columns
+from models.reading.familiar import Familiar
 from models.reading.inference import CoarseLook, segment
 from models.reading.regions import Region
 from models.reading.remembered import (
@@ -30,6 +31,7 @@ from models.reading.remembered import (
     recall,
 )
 from models.weights.files import Weights
+from pipeline.geometry.grid import UNLABELLED
 from pipeline.rectify.registration.field_shift import FieldShift, field_shift
 from storage.arrays.beliefs import BeliefStore, write_belief_tile
 from storage.arrays.class_maps import write_class_tile
@@ -53,6 +55,7 @@ class Drawing:
     step: int  # pixels from such a line to the next
     memory: FieldMemory | None = None  # what is remembered of the field
     left_out: Path | None = None  # (y, x) pixels of which zones have no map drawn
+    unknown: UnknownRule | None = None  # which pixels are called unknown
 
     def __call__(self, region: Region) -> Drawn:
         """Read what was seen of the region coarsely and finely, and store the part of the map that is kept."""
@@ -62,8 +65,13 @@ class Drawing:
         strange = np.zeros(region.grid.seat_shape, np.int64)
         seats, columns = seat_columns(weights, store, store.wavelength_nm, seen, region, strange=strange.ravel())
         drawn = segment(weights, seen, columns, seats, every_class=True)
-        del columns  # a memory takes their room
         assert drawn.log_probability is not None
+        unknown = None
+        if self.unknown is not None:
+            familiar, bands = self.weights.load_familiar(), len(store.wavelength_nm)
+            unknown = self.unknown.pixels(familiar, seen, columns, seats, bands) & (drawn.classes != UNLABELLED)
+            drawn.log_probability[unknown] = np.nan  # of what these pixels show the classes say nothing
+        del columns  # a memory takes their room
         looked = self._looked(region, self._within_zones(region, drawn.log_probability), seats, seen)
         classes, confidence = drawn.classes, drawn.confidence
         comparison, changed = None, None
@@ -75,6 +83,8 @@ class Drawing:
             classes, confidence = after.classes()
             comparison = compare(remembered, looked, after, region.kept_here)
             changed = changed_shares(remembered, after, region.grid.patch)
+        if self.unknown is not None and unknown is not None:
+            classes[unknown], confidence[unknown] = self.unknown.number, np.nan
         origin = region.kept.top, region.kept.left
         write_class_tile(self.out, origin, region.crop(classes), region.crop(confidence))
         write_belief_tile(self.belief, origin, *map(region.crop, (after.log_probability, after.age_days, after.light)))
@@ -96,6 +106,33 @@ class Drawing:
         detailed.ravel()[seats] = True
         pixels = np.repeat(np.repeat(detailed, grid.patch, axis=0), grid.patch, axis=1)[: grid.height, : grid.width]
         return Looked(log_probability, pixels, seen.columns, self.light, self.step)
+
+
+@dataclass(frozen=True)
+class UnknownRule:
+    """Which pixels are called unknown: at which rate, in which light, and by which number."""
+
+    number: int  # of the class, after those of the weights
+    rate: float  # of known pixels that may be
+    light: float  # of a line that is read in detail, as a share of the reference
+    coarse_light: float  # of a coarse line
+    step: int
+
+    def pixels(
+        self, familiar: Familiar, seen: CoarseLook, patches: NDArray[np.float32], seats: NDArray[np.int64], bands: int
+    ) -> NDArray[np.bool_]:
+        """Unknown pixels of a region's scene, (y, x): by its patches, and by the coarse look beside them."""
+        grid, p = seen.grid, seen.grid.patch
+        found = np.zeros(grid.padded_shape, np.bool_)
+        if len(seats) < len(grid.valid_seats()):
+            coarse = familiar.unknown(
+                seen.columns, rate=self.rate, light=self.coarse_light, step=None, bands=bands, factor=grid.factor
+            )
+            found[...] = np.repeat(np.repeat(coarse, grid.factor, axis=0), grid.factor, axis=1)
+        fine = familiar.unknown(patches, rate=self.rate, light=self.light, step=self.step, bands=bands)
+        for patch, (y, x) in zip(fine, grid.seat_origin(seats), strict=True):
+            found[y : y + p, x : x + p] = patch
+        return found[: grid.height, : grid.width]
 
 
 @dataclass(frozen=True)

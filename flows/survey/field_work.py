@@ -18,8 +18,10 @@ from flows.survey.run import SurveyRun, weights_path
 from models.network.sizes import saliency_bytes
 from models.policies.policies import IMAGE_POLICIES, NETWORK_POLICIES, score_seats
 from models.policies.vgg_file import VggFile
+from models.reading.familiar import Familiar
 from models.reading.inference import CoarseLook, Glance, look_coarsely, read_glance
 from models.reading.regions import HALO_CELLS, REGION_PX, Region, most_bytes, plan_regions, whole_field
+from models.weights.familiar_files import familiar_key, familiar_path, load_familiar
 from models.weights.files import Weights, content_key, describe_weights, load_weights
 from models.weights.memory_files import load_memory, memory_key, memory_path
 from pipeline.errors import SettingsError, WeightsError
@@ -53,6 +55,16 @@ class WeightsFile:
         if memory_key(path) != self.reader_key:
             raise WeightsError(f"the reader of memories {path} has changed since the survey began; start it again")
         return found.reader
+
+    familiar_key: str | None = None  # of what is familiar to them, where that is asked
+
+    @lru_cache(maxsize=1)  # noqa: B019 - the record is a value
+    def load_familiar(self) -> Familiar:
+        """Read what is familiar to them, once a process. WeightsError as `load`."""
+        found = load_familiar(self.path, describe_weights(self.path))
+        if familiar_key(familiar_path(self.path)) != self.familiar_key:
+            raise WeightsError(f"{familiar_path(self.path)} has changed since the survey began; start it again")
+        return found.familiar
 
     @lru_cache(maxsize=1)  # noqa: B019 - the record is a value
     def load(self) -> Weights:
@@ -152,9 +164,8 @@ class FieldWork:
     @staticmethod
     def of(run: SurveyRun) -> FieldWork:
         """Take from a survey what the regions of its field need."""
-        file = WeightsFile(
-            weights_path(run.settings).resolve(), run.weights_key, None if run.reader is None else run.reader.key
-        )
+        reader, familiar = (None if one is None else one.key for one in (run.reader, run.familiar))
+        file = WeightsFile(weights_path(run.settings).resolve(), run.weights_key, reader, familiar)
         return FieldWork(file, plan_regions(run.grid, SHARD), run.settings.crew, run.settings.memory, run.vgg)
 
     def score(self, policy: str, mosaic: Path, report: Callable[[float], None]) -> NDArray[np.float64]:

@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
+from flows.settings.values import UNKNOWN_AUTO, UNKNOWN_OFF
+from flows.survey.beyond_training import beyond_training
 from flows.survey.capture_plan import CapturePlan, plan_capture
 from flows.survey.memory import AUTO, NONE, Prior, find_prior
 from flows.survey.scan_choice import ScanChoice, choose_plain_scan
@@ -30,6 +32,7 @@ from flows.survey.scene import (
 )
 from flows.survey.zones import SurveyZones, open_zones, place_of_field
 from models.policies.vgg_file import VggFile
+from models.weights.familiar_files import FamiliarFile, describe_familiar, familiar_path, load_familiar
 from models.weights.files import (
     Description,
     Weights,
@@ -40,6 +43,7 @@ from models.weights.files import (
     unsealed_note,
 )
 from models.weights.memory_files import ReaderFile, describe_reader, load_memory
+from models.weights.trained_on import TRAINED_ON, TrainedOn
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
@@ -131,6 +135,7 @@ class SurveyRun(CaptureRun):
     zones: SurveyZones  # what the survey keeps to, and plots
     prior: Prior | None = None  # the run whose belief is gone on from
     reader: ReaderFile | None = None  # the reader of memories beside the weights, where there is one
+    familiar: FamiliarFile | None = None  # what is familiar to the weights, where pixels may be called unknown
     notes: tuple[str, ...] = ()
     refused: str | None = None  # why this machine would refuse the survey; it is planned nevertheless
 
@@ -192,12 +197,18 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     if not planning:  # what the rig would find there: no stage's work
         scene.raster.drawn()
         scene.light()
-    band_notes = _check_bands(scene, described, path)
+    _check_bands(scene, described, path)
     label_notes = check_labels(scene, described)
     grid = SceneGrid(*scene.shape, described.config.patch, described.config.factor)
     zones = open_zones(settings, place_of_field(settings, scene), grid)
     settings, scans = choose_plain_scan(settings, described, path, grid, len(scene.wavelength_nm), zones.shown)
     plan = plan_capture(settings, grid, zones.shown)
+    key = content_key(path)
+    familiar = describe_familiar(path, described, key)
+    outside = beyond_training(settings, scene, described, _trained_on(described, familiar), path)
+    familiar = _asked_familiar(settings, familiar, path)
+    if familiar is not None and not planning:
+        load_familiar(path, described)  # refuses tensors that are not those that were written
     if settings.mask is not None:
         check_mask(settings.mask, scene.shape)
     sealing = () if described.sealed else (unsealed_note(path),)
@@ -212,7 +223,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     simulated, planned = make_source(scene, settings), (*plan.coarse, *plan.full)
     source = field_source(scene, settings, simulated, planned)
     check_memory(settings, simulated, grid, plan)
-    key, archive = content_key(path), open_archive(settings.out) if archive is None else archive
+    archive = open_archive(settings.out) if archive is None else archive
     name = settings.name or Path(scene.name).stem
     prior, prior_notes = find_prior(archive, settings, name, grid, described.class_names)
     if settings.prior != AUTO:  # what is meant when it is asked for again
@@ -233,7 +244,8 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
         zones=zones,
         prior=prior,
         reader=reader,
-        notes=(*notes, *zones.notes, *prior_notes, *sealing, *band_notes, *vgg_notes, *label_notes),
+        familiar=familiar,
+        notes=(*notes, *zones.notes, *prior_notes, *sealing, *outside, *vgg_notes, *label_notes),
         refused=refused,
     )
 
@@ -269,7 +281,8 @@ def shipped_weights() -> Path:
     return Path(str(resources.files("models") / "shipped" / "farm.safetensors"))
 
 
-def _check_bands(scene: RasterScene, weights: Description, path: Path) -> tuple[str, ...]:
+def _check_bands(scene: RasterScene, weights: Description, path: Path) -> None:
+    """Refuse weights of which no spectral column is reached by a band (WeightsError)."""
     _, reached = weights.basis.matrix(scene.wavelength_nm)
     if not reached.any():
         low, high = weights.basis.low_nm, weights.basis.high_nm
@@ -277,9 +290,23 @@ def _check_bands(scene: RasterScene, weights: Description, path: Path) -> tuple[
             f"the weights {path.name} are for {low:.0f}-{high:.0f} nm; the scene's bands lie at"
             f" {scene.wavelength_nm.min():.0f}-{scene.wavelength_nm.max():.0f} nm: use weights trained on such data"
         )
-    if reached.all():
-        return ()
-    return (f"the bands reach {reached.sum()} of the weights' {len(reached)} spectral columns: expect a poorer map",)
+
+
+def _trained_on(described: Description, familiar: FamiliarFile | None) -> TrainedOn | None:
+    """What the weights were trained on, by their record, or by the file beside them; None where neither tells."""
+    if TRAINED_ON in described.record:
+        return TrainedOn.read(described.record[TRAINED_ON])
+    return None if familiar is None else familiar.trained_on
+
+
+def _asked_familiar(settings: Settings, familiar: FamiliarFile | None, path: Path) -> FamiliarFile | None:
+    """What is familiar, where pixels may be called unknown. Raises WeightsError: nobody knows it, but it is asked."""
+    if settings.unknown not in (UNKNOWN_AUTO, UNKNOWN_OFF) and familiar is None:
+        raise WeightsError(
+            f"--unknown {settings.unknown}: nobody measured what is familiar to {path.name}; do so with: spectralzoom"
+            f" train DATASET --familiar {path} -o {familiar_path(path)}, or leave --unknown out"
+        )
+    return None if settings.unknown == UNKNOWN_OFF else familiar
 
 
 def now() -> str:

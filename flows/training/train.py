@@ -25,6 +25,7 @@ from flows.training.data import (
     pack_mask,
     trained_pixels,
 )
+from flows.training.familiarity import SeenScenes, measured_calibration, save_beside, trained_on
 from flows.training.figures import judge_scans, validate
 from flows.training.look import observe_scene
 from models.network.segmenter import Segmenter
@@ -34,8 +35,9 @@ from models.training.examples import Example, Observation, measured_normalisatio
 from models.training.looks import REFERENCE_MS, Looks
 from models.training.start_weights import StartFile
 from models.training.train import Progress, TrainingSettings, train
-from models.weights.files import AnyWeights, Weights, save_weights, with_record
+from models.weights.files import CALIBRATION, AnyWeights, Weights, save_weights, with_record
 from models.weights.sealed_files import read_checkpoint
+from models.weights.trained_on import TRAINED_ON
 from pipeline.errors import SceneError, SettingsError, ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
@@ -97,7 +99,7 @@ def train_weights(
     refuse_seen(start, data)
     for note in data.notes:
         tell(note)
-    seen, about = _observe_all(request, data, data.train, "looking at scenes", report)
+    seen, about = observe_all(request, data, data.train, "looking at scenes", report)
     _question_labels(about, request.dataset, tell)
     normalisation = measured_normalisation(seen, math.sqrt(request.settings.darkest_ms * REFERENCE_MS))
     reached = np.ones(about.basis.columns, bool)
@@ -130,11 +132,14 @@ def train_weights(
         checkpoint=checkpoint,
     )
     weights = AnyWeights(model, about.basis, normalisation, about.names, about.colours)
-    kept, _ = _observe_all(request, data, data.validation, "looking at validation scenes", report, about)
+    kept, _ = observe_all(request, data, data.validation, "looking at validation scenes", report, about)
     frames = [normalised(one, normalisation, reached) for one in kept]
+    whole = SeenScenes(examples, frames, about.wavelength_nm, request.settings.darkest_ms, request.settings.seed)
+    told = trained_on(data, whole, about.names)
     record = {
         "command": request.command,
         "data": data.law,
+        TRAINED_ON: told.as_dict(),
         "split": split,
         "settings": asdict(request.settings),
         "camera": asdict(request.camera),
@@ -144,7 +149,17 @@ def train_weights(
     }
     save_weights(with_record(weights, **record), request.out)
     checkpoint.unlink(missing_ok=True)
+    if isinstance(model, Segmenter):
+        why = save_beside(_two_scale(weights), request.out, whole, told, {"command": request.command}, report)
+        record = record if why is None else {**record, "familiar": why}
     return record
+
+
+def _two_scale(weights: AnyWeights, **entries: Any) -> Weights:
+    """Weights of a segmenter as what they are, with entries in their record."""
+    assert isinstance(weights.network, Segmenter)
+    own = (weights.basis, weights.normalisation, weights.class_names, weights.class_colours)
+    return Weights(weights.network, *own, entries)
 
 
 def _figures(
@@ -152,10 +167,13 @@ def _figures(
 ) -> dict[str, Any]:
     """What the record says of scenes kept for validation; of plain scans too, where training saw such looks."""
     figures = {"validation": validate(weights, frames, seed, lambda row: report("validating", 0.0, row))}
-    if looks is None or not isinstance(weights.network, Segmenter):
+    if not isinstance(weights.network, Segmenter):
         return figures
-    own = (weights.basis, weights.normalisation, weights.class_names, weights.class_colours)
-    two_scale = Weights(weights.network, *own)
+    calibration = measured_calibration(_two_scale(weights), frames, seed)
+    figures |= {} if calibration is None else {CALIBRATION: calibration}
+    if looks is None:
+        return figures
+    two_scale = _two_scale(weights, calibration=calibration or {})
     scans = judge_scans(two_scale, frames, looks, seed, lambda row, done: report("judging scans", done, row))
     return figures if scans is None else figures | {"scans": scans}
 
@@ -174,7 +192,7 @@ def _check_places(out: Path, checkpoint: Path) -> None:
 
 
 @dataclass
-class _About:
+class About:
     """What all scenes of a data set have in common, and what training saw of each."""
 
     basis: SpectralBasis
@@ -187,14 +205,15 @@ class _About:
     alike: dict[str, str] = field(default_factory=dict)  # scene -> class, where all its labels are one
 
 
-def _observe_all(
+def observe_all(
     request: TrainRequest,
     data: TrainingData,
     names: tuple[str, ...],
     what: str,
     report: Report,
-    about: _About | None = None,
-) -> tuple[list[Observation], _About]:
+    about: About | None = None,
+) -> tuple[list[Observation], About]:
+    """Look at named scenes of the data, and say what they have in common with each other, and with earlier ones."""
     seen = []
     for number, (name, scene) in enumerate(zip(names, data.scenes(names), strict=True)):
         report(what, number / len(names), name)
@@ -215,7 +234,7 @@ def _observe_all(
     return seen, about
 
 
-def _question_labels(about: _About, dataset: str, tell: Callable[[str], None]) -> None:
+def _question_labels(about: About, dataset: str, tell: Callable[[str], None]) -> None:
     """Tell which scenes have labels of one class (SceneError: all of them, and of the same)."""
     notes = alike_notes(about.alike)
     if len(about.alike) == len(about.keys) and len(notes) == 1:
@@ -224,14 +243,14 @@ def _question_labels(about: _About, dataset: str, tell: Callable[[str], None]) -
         tell(note)
 
 
-def _common(request: TrainRequest, scene: RasterScene) -> _About:
+def _common(request: TrainRequest, scene: RasterScene) -> About:
     trained_pixels(scene)  # refuses a scene without labels
     if len(scene.class_names) < 2:
         notes = alike_notes({scene.name: scene.class_names[0]})
         raise SceneError(f"{request.dataset}: training needs two or more classes, and {notes[0]}")
     basis = SpectralBasis.spanning(scene.wavelength_nm, request.columns)
     patch = request.patch or suggested_patch(scene.shape, built_in=request.dataset in FARM_NAMES)
-    about = _About(basis, scene.class_names, scene.class_colours, patch, scene.wavelength_nm)
+    about = About(basis, scene.class_names, scene.class_colours, patch, scene.wavelength_nm)
     _config(request, about)  # refuses sizes that do not fit before the first look
     return about
 
@@ -248,14 +267,14 @@ def usual_crop(dataset: str, preset: Preset) -> int:
     return WHOLE_CROP if preset == "paper" else FARM_CROP if dataset in FARM_NAMES else FRAME_CROP
 
 
-def _check_alike(scene: RasterScene, about: _About) -> None:
+def _check_alike(scene: RasterScene, about: About) -> None:
     if scene.class_names != about.names:
         raise SceneError(f"scene {scene.name} has classes {scene.class_names}, the scenes before it {about.names}")
     if not np.array_equal(scene.wavelength_nm, about.wavelength_nm):
         raise SceneError(f"scene {scene.name} has other bands than the scenes before it; train on scenes of one camera")
 
 
-def _config(request: TrainRequest, about: _About) -> SegmenterConfig:
+def _config(request: TrainRequest, about: About) -> SegmenterConfig:
     try:
         return SegmenterConfig(
             classes=len(about.names),
@@ -394,6 +413,8 @@ def asked_command() -> str:
 def _print_figures(record: dict[str, Any], request: TrainRequest, console: Console) -> None:
     out = request.out
     console.print(f"weights: {out} ({out.stat().st_size / 1e6:.1f} MB), {record['training']['steps']} steps")
+    if "familiar" in record:
+        console.print(record["familiar"], markup=False, soft_wrap=True)
     figures = record["validation"]
     if figures is None:
         given = "--weights" if request.preset == "two-scale" else "--weights OTHERS --control"

@@ -74,21 +74,26 @@ def mean_iou_of_each(counts: NDArray[np.integer]) -> NDArray[np.float64]:
     return mean
 
 
-def miou_of_shown_classes(counts: NDArray[np.int64]) -> float:
+def miou_of_shown_classes(counts: NDArray[np.int64], known: int | None = None) -> float:
     """Mean IoU over the classes that labels or map show, false ones as 0: the definition of before; NaN without any.
+
+    Of the first ``known`` classes, where those behind them say that a pixel is of none.
 
     Of two maps the one whose every class is better may have the lower mean: not to be compared, kept for old figures.
     """
     held = labelled_classes(counts)
-    shown = held | (counts.sum(axis=0) > 0)
+    shown = (held | (counts.sum(axis=0) > 0))[:known]
     return mean_iou(counts) * float(held.sum() / shown.sum()) if shown.any() else float("nan")
 
 
-def agreement(counts: NDArray[np.int64]) -> dict[str, float]:
-    """Give the figures that stand side by side wherever a map is scored: mIoU, by both definitions, and the pixels'."""
+def agreement(counts: NDArray[np.int64], known: int | None = None) -> dict[str, float]:
+    """Give the figures that stand side by side wherever a map is scored: mIoU, by both definitions, and the pixels'.
+
+    ``known``: as of `miou_of_shown_classes`.
+    """
     return {
         "miou": mean_iou(counts),
-        "miou_of_shown_classes": miou_of_shown_classes(counts),
+        "miou_of_shown_classes": miou_of_shown_classes(counts, known),
         "overall_accuracy": overall_accuracy(counts),
     }
 

@@ -238,7 +238,7 @@ def _draw_pack(
     looks = [look for look, _, _ in pack]
     readings = readings_of(weights, looks, precision=precision)
     padded = [
-        draw_coarse(reading.logits.float(), look.grid, every_class=every_class)
+        draw_coarse(_tempered(reading.logits.float(), weights), look.grid, every_class=every_class)
         for reading, look in zip(readings, looks, strict=True)
     ]
     places = (
@@ -248,9 +248,10 @@ def _draw_pack(
     )
     parts = [own for _, own, _ in pack], [torch.from_numpy(seats) for *_, seats in pack]
     p = weights.config.patch
-    for logits in weights.segmenter.eval().read_fine_packed(readings, *parts, [origin_of(look) for look in looks]):
-        confidence, classes = (part.numpy() for part in decide(logits.float(), dim=1))
-        every = logits.float().log_softmax(dim=1).permute(0, 2, 3, 1).numpy() if every_class else confidence
+    for read in weights.segmenter.eval().read_fine_packed(readings, *parts, [origin_of(look) for look in looks]):
+        logits = _tempered(read.float(), weights)
+        confidence, classes = (part.numpy() for part in decide(logits, dim=1))
+        every = logits.log_softmax(dim=1).permute(0, 2, 3, 1).numpy() if every_class else confidence
         for sure, values, own, (drawn, (y, x)) in zip(confidence, classes, every, places, strict=False):
             drawn.classes[y : y + p, x : x + p] = values
             drawn.confidence[y : y + p, x : x + p] = sure
@@ -258,6 +259,11 @@ def _draw_pack(
                 drawn.log_probability[y : y + p, x : x + p] = own
     for drawn, look in zip(padded, looks, strict=True):
         yield drawn.of_scene(look.grid)
+
+
+def _tempered(logits: Tensor, weights: Weights) -> Tensor:
+    """Logits by which maps are as sure of themselves as they may be; the likeliest class stays what it is."""
+    return logits if weights.temperature == 1 else logits / weights.temperature
 
 
 def captured(patches: NDArray[np.floating], seats: NDArray[np.int64]) -> tuple[NDArray[np.floating], NDArray[np.int64]]:

@@ -93,8 +93,14 @@ class Looks:
         if rng.random() >= self.own_coarse:
             return plain, means
         light = _drawn_light(max(self.darkest_ms, DARKEST_COARSE_MS), rng)
+        return plain, self.coarse_pass(coarse, noise, factor, light=light, rng=rng)
+
+    def coarse_pass(
+        self, coarse: Columns, noise: ColumnNoise, factor: int, *, light: float, rng: np.random.Generator
+    ) -> Columns:
+        """Show a coarse pass of the reference exposure as one of another, ``light`` its share of the reference."""
         own = self._noisy(coarse @ self.unwhiten, noise, light, rng, samples=factor, readings=factor)
-        return plain, np.asarray(own @ self.normalisation.whitening, np.float32)
+        return np.asarray(own @ self.normalisation.whitening, np.float32)
 
     def scan(
         self, fine: Columns, noise: ColumnNoise, factor: int, *, light: float, step: int, rng: np.random.Generator

@@ -41,6 +41,7 @@ NORMALISATION = ("centre", "spread", "whitening")
 FORMAT, UNSEALED = "spectralzoom-weights/2", "spectralzoom-weights/1"  # the earlier one has no hashes
 KEY_DIGITS = 20
 SPREAD = "normalisation.spread"
+CALIBRATION = "calibration"  # of a record: how sure of themselves maps may be, and the temperature, where one is needed
 KINDS = {"F32": "torch.float32", "U8": "torch.uint8"}  # by safetensors' names
 Learned = TypeVar("Learned", bound="AnyWeights")
 
@@ -76,6 +77,11 @@ class AnyWeights:
     def config(self) -> SegmenterConfig:
         """Sizes of the network, and which one it is."""
         return self.network.config
+
+    @property
+    def temperature(self) -> float:
+        """What logits of maps are divided by; 1 unless the record of training has another."""
+        return float((self.record.get(CALIBRATION) or {}).get("temperature", 1.0))
 
     def columns(self, values: NDArray[np.floating], wavelength_nm: NDArray[np.floating]) -> NDArray[np.float32]:
         """Normalised spectral columns of pixels, (..., band) -> (..., column) float32.

@@ -47,6 +47,15 @@ class ClassNames:
     colours: NDArray[np.uint8]  # (class, 3)
 
 
+UNKNOWN, UNKNOWN_COLOUR = "unknown", (200, 0, 200)
+
+
+def with_unknown(legend: ClassNames) -> ClassNames:
+    """The classes with one more behind them, for pixels that are unlike all that the weights were trained on."""
+    name = UNKNOWN if UNKNOWN not in legend.names else f"{UNKNOWN}_spectrum"
+    return ClassNames((*legend.names, name), np.vstack([legend.colours, np.array([UNKNOWN_COLOUR], np.uint8)]))
+
+
 def write_class_map(path: Path, found: ClassMap) -> None:
     """Store classes with their names and colours, and the confidence.
 

@@ -181,7 +181,7 @@ def value_span(path: Path, bands: Sequence[int], share: float = 0.02) -> tuple[f
 
     Of at most 512 x 512 pixels of the file.
     """
-    with rasterio.open(path) as file:
+    with importlib.import_module("rasterio").open(path) as file:
         y, x = (min(size, TILE) for size in file.shape)
         values = file.read(list(bands), out_shape=(len(bands), y, x), masked=True).astype(np.float64).filled(np.nan)
     known = values[np.isfinite(values)]

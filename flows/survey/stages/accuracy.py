@@ -75,10 +75,11 @@ def evaluate(
     labels = _moved(run, off)
 
     def build(path: Path) -> None:
-        classes = load_class_map(class_map.path / "class_map.zarr").classes
+        drawn = load_class_map(class_map.path / "class_map.zarr")
+        classes = drawn.classes
         judged = np.where(classes == UNLABELLED, np.uint8(UNLABELLED), labels)  # what has no class is not
         seen = glance_at(run, mosaic)
-        counts = confusion(judged, classes, run.weights.config.classes)
+        counts = confusion(judged, classes, len(drawn.names))  # with the class unknown, which no label has
         result: dict[str, Any] = _figures(run, counts)
         empty = np.empty((0, run.grid.patch, run.grid.patch, run.weights.basis.columns), np.float32)
         none = segment(run.weights, seen, empty, np.empty(0, np.int64))
@@ -208,14 +209,17 @@ def _seconds(work: Callable[[], object]) -> float:
 def _figures(run: SurveyRun, counts: NDArray[np.int64]) -> dict[str, Any]:
     """What is said of a map; every map of a run is judged by the same labels, and so over the same classes."""
     names = run.weights.class_names
-    false = zip(names, false_pixels(counts).tolist(), strict=True)
+    known = len(names)
+    false = zip(names, false_pixels(counts)[:known].tolist(), strict=True)
+    unknown = {} if len(counts) == known else {"unknown_px": int(counts[:, known].sum())}
     return {
-        **agreement(counts),
+        **agreement(counts, known),
         "average_accuracy": average_accuracy(counts),
         "kappa": kappa(counts),
         "pixels": int(counts.sum()),
-        "per_class_iou": dict(zip(names, iou_per_class(counts).tolist(), strict=True)),
+        "per_class_iou": dict(zip(names, iou_per_class(counts)[:known].tolist(), strict=True)),
         "false_classes": {name: pixels for name, pixels in false if pixels},
+        **unknown,
     }
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.survey.drawing import Drawing, FieldMemory, draw_field, memory_lies, whole_pixels
+from flows.survey.drawing import Drawing, FieldMemory, UnknownRule, draw_field, memory_lies, whole_pixels
 from flows.survey.field_work import FieldWork, look_at, region_params, seat_columns
 from flows.survey.run import SurveyRun
 from flows.survey.stage import Product, Wanted, stage
@@ -24,7 +24,7 @@ from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table, write_table
 from storage.arrays.beliefs import UNKNOWN, create_belief, write_changes
 from storage.arrays.blank_pixels import NO_CLASS, blank_pixels
-from storage.arrays.class_maps import ClassNames, create_class_map, load_class_map
+from storage.arrays.class_maps import ClassNames, create_class_map, load_class_map, with_unknown
 from storage.arrays.ground_maps import BLOCK, GroundMapWriter
 from storage.arrays.layout import SHARD_ROWS, open_group, read_array, read_bands
 from storage.arrays.mosaics import open_patches
@@ -64,7 +64,7 @@ def draw_map(run: SurveyRun, mosaic: StageRef, patches: StageRef) -> Wanted:
             blank_pixels(out, run.zones.left_out, NO_CLASS)
         (path / LEFT_OUT).unlink(missing_ok=True)
 
-    prior = run.prior
+    prior, unknown = run.prior, _unknown_rule(run)
     params = {
         "weights": run.weights_key,
         "grid": asdict(run.grid),
@@ -72,6 +72,8 @@ def draw_map(run: SurveyRun, mosaic: StageRef, patches: StageRef) -> Wanted:
         **run.place_key,
         **run.zones.key,
     }
+    if run.familiar is not None and unknown is not None:
+        params["unknown"] = {"familiar": run.familiar.key, **asdict(unknown)}
     if prior is not None:
         reader = None if run.reader is None else run.reader.key
         params |= {"days": prior.days, "classes": list(prior.classes), "reader": reader, "light": _light(run)}
@@ -94,7 +96,9 @@ def _drawing(
 ) -> Drawing:
     """What workers need to draw the map, into stores that are begun here."""
     legend, shape = ClassNames(run.weights.class_names, run.weights.class_colours), (run.grid.height, run.grid.width)
-    create_class_map(path / "class_map.zarr", shape, legend, grid=run.angular_grid())
+    unknown = _unknown_rule(run)
+    shown = legend if unknown is None else with_unknown(legend)
+    create_class_map(path / "class_map.zarr", shape, shown, grid=run.angular_grid())
     create_belief(path / "belief.zarr", shape, legend, grid=run.angular_grid())
     prior = run.prior
     memory = None
@@ -105,7 +109,18 @@ def _drawing(
     made = (path / "class_map.zarr").resolve(), (path / "belief.zarr").resolve()
     light, step = _light(run)
     left_out = None if run.zones.left_out is None else (path / LEFT_OUT).resolve()
-    return Drawing(work.weights, *seen, *made, light, step, memory, left_out)
+    return Drawing(work.weights, *seen, *made, light, step, memory, left_out, unknown)
+
+
+def _unknown_rule(run: SurveyRun) -> UnknownRule | None:
+    """Which pixels are called unknown; None where the weights do not know what is familiar, or nobody asks."""
+    rate, settings = run.settings.unknown_rate, run.settings
+    if run.familiar is None or rate is None:
+        return None
+    light, step = _light(run)
+    coarse_ms = settings.scan_exposure_ms if run.plan.plain else settings.coarse_exposure_ms
+    coarse_light = (coarse_ms or run.camera.exposure_ms) / DEFAULT_EXPOSURE_MS
+    return UnknownRule(run.described.config.classes, rate, light, coarse_light, step)
 
 
 def _light(run: SurveyRun) -> tuple[float, int]:

@@ -60,6 +60,7 @@ FARM_LAW, REMOVED_LAW = "farm@2", "farm@1"
 FARM_NAMES = ("farm", FARM_LAW)
 PIXEL_M = 0.12  # on the ground
 FARM_SHAPE = (1024, 1280)  # (y, x) unless another is asked for [px]
+FARM_PIXEL_M = 0.12  # of the ground that a pixel shows
 USUAL_DAY, USUAL_HOUR = 172, 11.0  # the 21st of June, an hour before noon
 WIDTHS = {"margin": (2.0, 4.5), "hedge": (4.5, 6.5), "ditch": (1.3, 2.2), "road": (3.0, 5.0)}  # half, px
 BANKS = {"margin": (0.0, 0.0), "hedge": (0.0, 0.0), "ditch": (2.5, 4.5), "road": (1.0, 2.5)}

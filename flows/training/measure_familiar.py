@@ -1,0 +1,139 @@
+"""`spectralzoom train --familiar`: what is familiar to weights that were trained before such was measured.
+
+Looks at the scenes of their training again, as their record names them, and writes a file to put beside the weights:
+they and all that was made with them stay what they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from flows.terminal.progress import StageProgress
+from flows.training.data import TrainingData, open_training_data
+from flows.training.familiarity import SeenScenes, measured_calibration, save_beside, trained_on
+from flows.training.train import TrainRequest, observe_all
+from models.training.examples import Example, normalised
+from models.training.looks import REFERENCE_MS
+from models.training.train import TrainingSettings
+from models.weights.familiar_files import familiar_path
+from models.weights.files import CALIBRATION, Weights, load_weights
+from pipeline.errors import SettingsError
+from pipeline.geometry.camera import LineCamera
+from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES
+
+Report = Callable[[str, float, str], None]
+
+
+@dataclass(frozen=True)
+class FamiliarRequest:
+    """For which weights, where to, and the data that they were trained on."""
+
+    dataset: str
+    weights: Path
+    out: Path
+    choices: dict[str, Any] = field(default_factory=dict)  # of load_data_set: labels, bands, wavelengths, masks
+    command: str = ""
+
+
+def measure_familiar(request: FamiliarRequest, report: Report = lambda what, done, figure: None) -> dict[str, Any]:
+    """Measure what is familiar to some weights and save it; give the record that stands in the file.
+
+    Raises SettingsError: a place that cannot be written to, other data than the weights were trained on, or no scene
+    that was kept for validation; WeightsError: the weights cannot be read.
+    """
+    if not request.out.parent.is_dir() or request.out.is_dir():
+        raise SettingsError(f"-o {request.out}: expected the name of a file in a folder that exists")
+    weights = load_weights(request.weights)
+    data = _data_of(weights, request)
+    seen = _looked_at(weights, data, request, report)
+    report("drawing maps of validation scenes", 0.0, "")
+    told = trained_on(data, seen, weights.class_names)
+    record = {
+        "command": request.command,
+        "scenes": len(seen.train),
+        "validation": len(seen.validation),
+        CALIBRATION: measured_calibration(weights, seen.validation, seen.seed),
+    }
+    why = save_beside(weights, request.weights, seen, told, record, report, out=request.out)
+    if why is not None:
+        raise SettingsError(f"--familiar {request.weights}: {why}")
+    return record
+
+
+def _data_of(weights: Weights, request: FamiliarRequest) -> TrainingData:
+    """The scenes of the weights' training. Raises SettingsError: the data set is another."""
+    split = weights.record.get("split") or {}
+    own = [name for name in split.get("train", {}) if ": " not in name]  # others are those of what they began from
+    scenes = len(own) if request.dataset in FARM_NAMES else None
+    camera = LineCamera(**weights.record.get("camera", {}))
+    held_out = {} if scenes else {"hold_out": tuple(split.get("held_out", ()))}
+    data = open_training_data(
+        request.dataset, len(split.get("validation", ())), scenes, camera, **held_out, **request.choices
+    )
+    if list(data.train) != own or list(data.validation) != list(split.get("validation", ())):
+        raise SettingsError(
+            f"--familiar {request.weights}: these weights were trained on {weights.record.get('data', 'other data')},"
+            f" {len(own)} scenes{f', the first {own[0]}' if own else ''}; {request.dataset} has others: give the data"
+            " set of their training"
+        )
+    return data
+
+
+def _looked_at(weights: Weights, data: TrainingData, request: FamiliarRequest, report: Report) -> SeenScenes:
+    settings, config = weights.record.get("settings", {}), weights.config
+    seed, darkest_ms = int(settings.get("seed", 0)), float(settings.get("darkest_ms", REFERENCE_MS))
+    how = TrainRequest(
+        request.dataset,
+        request.out,
+        patch=config.patch,
+        factor=config.factor,
+        columns=config.columns,
+        choices=request.choices,
+        settings=TrainingSettings(seed=seed),
+        camera=data.camera,
+    )
+    reached = np.ones(config.columns, np.bool_)
+    looks: list[list[Example]] = []
+    about = None
+    for what, names in (("looking at scenes", data.train), ("looking at validation scenes", data.validation)):
+        if not names:
+            raise SettingsError(
+                f"--familiar {request.weights}: no scene was kept for validation when these weights were trained, so"
+                " that nobody can say how often a known pixel would be unknown; train them with --validation 1 or more"
+            )
+        found, about = observe_all(how, data, names, what, report, about)
+        looks.append([normalised(one, weights.normalisation, reached) for one in found])
+        if (about.basis, about.names) != (weights.basis, weights.class_names):
+            raise SettingsError(f"{request.dataset} has other bands or classes than {request.weights} was trained on")
+    assert about is not None
+    return SeenScenes(looks[0], looks[1], about.wavelength_nm, darkest_ms, seed)
+
+
+def run_measure_familiar(request: FamiliarRequest, console: Console) -> dict[str, Any]:
+    """Measure with a progress bar on ``console``; give the record kept in the file."""
+    last = ""
+    with StageProgress(console) as progress:
+
+        def report(what: str, done: float, figure: str) -> None:
+            nonlocal last
+            if last not in ("", what):
+                progress.show(last, 1.0, ended=True)
+            last = what
+            progress.show(what, done, figure)
+
+        record = measure_familiar(request, report)
+        progress.show(last, 1.0, ended=True)
+    words = f"what is familiar: {request.out}, of {record['scenes']} scenes"
+    beside = familiar_path(request.weights)
+    if request.out.resolve() != beside.resolve():
+        words += f"; surveys use it when it is called {beside.name} and lies beside the weights"
+    console.print(words, markup=False, soft_wrap=True)
+    error = record[CALIBRATION]["expected_error"]
+    console.print(f"confidence is off by {100 * error:.2f} points on {record['validation']} scenes", soft_wrap=True)
+    return record

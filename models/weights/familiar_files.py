@@ -1,0 +1,170 @@
+"""What weights take for familiar, on disk: a sealed file beside the weights that it was measured for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from safetensors import safe_open
+
+from models.reading.familiar import Familiar, Limits
+from models.weights.files import Description, content_key, unusable
+from models.weights.sealed_files import (
+    DAMAGED,
+    broken_seal,
+    changed_tensor,
+    hash_without_seal,
+    read_about,
+    write_sealed,
+)
+from models.weights.trained_on import TrainedOn
+from pipeline.errors import WeightsError
+from pipeline.lazy import deferred
+
+if TYPE_CHECKING:
+    import torch
+else:
+    torch = deferred("torch")
+
+FORMAT = "spectralzoom-familiar/1"
+SUFFIX = ".familiar.safetensors"
+KEY_DIGITS = 20
+OF_COMPONENTS = ("centres", "covariance", "shot", "read")
+OF_LIMITS = ("rates", "light", "fine", "coarse")
+
+
+@dataclass(frozen=True)
+class FamiliarWeights:
+    """What is familiar to some weights, and what they were trained on and how sure of themselves they may be."""
+
+    familiar: Familiar
+    weights_key: str
+    trained_on: TrainedOn
+    record: Mapping[str, Any] = field(default_factory=dict)  # command, scenes, calibration
+
+
+@dataclass(frozen=True)
+class FamiliarFile:
+    """The same by its file: where it lies, what it holds, and which rates its limits are known for."""
+
+    path: Path
+    key: str
+    rates: tuple[float, float]
+    trained_on: TrainedOn
+
+
+def familiar_path(weights: Path) -> Path:
+    """Where what is familiar to some weights lies: beside them, by their name."""
+    return weights.with_name(weights.name.removesuffix(".safetensors") + SUFFIX)
+
+
+def save_familiar(made: FamiliarWeights, path: Path) -> None:
+    """Write the file, sealed; whole or absent. Raises WeightsError where the disk refuses."""
+    familiar, limits = made.familiar, made.familiar.limits
+    arrays = {name: getattr(familiar, name) for name in OF_COMPONENTS}
+    arrays |= {name: getattr(limits, name) for name in OF_LIMITS}
+    about = {
+        "format": FORMAT,
+        "weights_key": made.weights_key,
+        "bands": familiar.bands,
+        "columns": familiar.centres.shape[1],
+        "steps": list(limits.steps),
+        "rates": [float(limits.rates[0]), float(limits.rates[-1])],
+        "trained_on": made.trained_on.as_dict(),
+        "record": dict(made.record),
+    }
+    try:
+        tensors = {name: torch.from_numpy(np.ascontiguousarray(one, np.float32)) for name, one in arrays.items()}
+        write_sealed(path, about, tensors)
+    except OSError as error:
+        raise WeightsError(f"cannot write what is familiar to {path}: {error.strerror}; choose another -o") from error
+
+
+def describe_familiar(weights: Path, described: Description, weights_key: str) -> FamiliarFile | None:
+    """What is familiar to some weights, by what the file beside them says; None where there is none.
+
+    Reads no tensor, and takes no torch. Raises WeightsError as `load_familiar` where the description is wrong.
+    """
+    path = familiar_path(weights)
+    if not path.is_file():
+        return None
+    with _opened(path, "np") as file:
+        about = _checked(path, _described(path, file), described, weights_key)
+    low, high = map(float, about["rates"])
+    return FamiliarFile(path, familiar_key(path), (low, high), TrainedOn.read(about["trained_on"]))
+
+
+def familiar_key(path: Path) -> str:
+    """Name the file by what it holds, 20 hexadecimal digits. Raises WeightsError where it cannot be read."""
+    try:
+        return hash_without_seal(path, {"format": FORMAT})[:KEY_DIGITS]
+    except (*DAMAGED, KeyError, TypeError, ValueError) as error:
+        raise _refused(path, str(error)[:120]) from error
+
+
+def load_familiar(weights: Path, described: Description) -> FamiliarWeights:
+    """Read a file that `save_familiar` wrote beside some weights. No pickle is involved.
+
+    Raises WeightsError where it is damaged, of another format, or was measured for other weights.
+    """
+    path = familiar_path(weights)
+    with _opened(path, "pt") as file:
+        about = _checked(path, _described(path, file), described, content_key(weights))
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+    if wrong := changed_tensor(about, tensors) or unusable(tensors, spreads=("light", "rates")):
+        raise _refused(path, wrong)
+    try:
+        arrays = {name: tensors[name].double().numpy() for name in (*OF_COMPONENTS, *OF_LIMITS)}
+        steps = tuple(map(int, about["steps"]))
+        limits = Limits(arrays["rates"], arrays["light"], steps, arrays["fine"], arrays["coarse"])
+        familiar = Familiar(**{name: arrays[name] for name in OF_COMPONENTS}, limits=limits, bands=int(about["bands"]))
+        familiar.lit(float(limits.light[0]))  # a covariance that is none is told here
+    except (KeyError, ValueError) as error:
+        raise _refused(path, str(error)[:120]) from error
+    return FamiliarWeights(familiar, about["weights_key"], TrainedOn.read(about["trained_on"]), about["record"])
+
+
+@contextmanager
+def _opened(path: Path, framework: str) -> Iterator[Any]:
+    try:
+        with safe_open(path, framework=framework) as file:
+            yield file
+    except DAMAGED as error:
+        raise _refused(path, str(error)[:120]) from error
+
+
+def _described(path: Path, file: Any) -> dict[str, Any]:
+    """What the file says of itself, as it was written."""
+    about = read_about(file)
+    if about.get("format") != FORMAT:
+        raise _refused(path, f"it holds {about.get('format', 'no format mark')}, expected {FORMAT}")
+    if wrong := broken_seal(about):
+        raise _refused(path, wrong)
+    return about
+
+
+def _checked(path: Path, about: dict[str, Any], described: Description, weights_key: str) -> dict[str, Any]:
+    """The description, which is of these very weights."""
+    try:
+        TrainedOn.read(about["trained_on"])
+        key, columns, _ = str(about["weights_key"]), int(about["columns"]), (about["steps"], about["record"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise _refused(path, f"its description lacks {error}") from error
+    if key != weights_key or columns != described.config.columns:
+        raise WeightsError(
+            f"{path} says what is familiar to other weights ({key}, {columns} columns) than those beside it"
+            f" ({weights_key}, {described.config.columns}): move it away, or measure it for them with"
+            f" spectralzoom train DATASET --familiar WEIGHTS -o {path.name}"
+        )
+    return about
+
+
+def _refused(path: Path, why: str) -> WeightsError:
+    return WeightsError(
+        f"{path} does not say what is familiar to weights ({why}); move it away, or make it again with"
+        f" spectralzoom train DATASET --familiar WEIGHTS -o {path.name}"
+    )

@@ -1,0 +1,144 @@
+"""What the class unknown costs on farms that training never saw, and how much of other fields it finds.
+
+Farms of other seeds and days than any that weights or limits were made with, looked at in four ways; each map is drawn
+with the class and without it, of the same lines. Other fields have spectra that no farm has: invented ones, a farm's in
+shuffled bands, grey boards, and Indian Pines (AVIRIS; `SPECTRALZOOM_PINES` names its folder) brought to the farm's
+brightness.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy
+from measure import Row
+from numpy.typing import NDArray
+from rich.console import Console
+
+from flows.publish.survey_command import run_survey
+from flows.settings.load import load_settings
+from pipeline.geometry.camera import LineCamera
+from pipeline.simulator.scenes.farm.farm_scene import farm_scene
+
+SEEDS, DAYS, SIZE = (21, 22, 23), (120, 172, 250), "640x512"
+LOOKS: dict[str, dict[str, Any]] = {
+    "every line, 100 ms": {"scan_step": 1},
+    "survey --seconds 25": {"seconds": 25},
+    "two passes, budget 0.5": {"budget": 0.5},
+    "every line, 5 ms": {"scan_step": 1, "scan_exposure_ms": 5},
+}
+WEIGHTS = Path(__file__).resolve().parents[2] / "models" / "shipped" / "farm.safetensors"
+BANDS_NM = np.linspace(405.0, 995.0, 60)
+BRIGHTNESS = 0.22  # mean reflectance of farms
+Values = NDArray[np.float32]
+Judged = dict[str, float]
+
+
+def rows() -> list[Row]:
+    """Unknown pixels of known and of other fields, in percent: mean (least - most)."""
+    found = []
+    for name, look in LOOKS.items():
+        judged = [_farm(seed, day, look) for seed in SEEDS for day in DAYS]
+        shares = [100 * one["share"] for one in judged]
+        found.append(Row(f"farms, {name}: unknown", _figure(shares, "%"), "<= 1 % each", max(shares) <= 1))
+        change = [one["change"] for one in judged]
+        mean = float(np.mean(change))
+        found.append(Row(f"farms, {name}: mIoU with it - without", _figure(change, "points"), ">= -0.1", mean >= -0.1))
+        spent, without = (sum(one[what] for one in judged) for what in ("cpu_s", "cpu_without_s"))
+        more = 100 * (spent / without - 1)
+        found.append(Row(f"farms, {name}: processor time of draw_map", f"{more:+.1f} %", "<= 5 %", more <= 5))
+        print(*(f"{row.what}: {row.figure}" for row in found[-3:]), sep="\n", flush=True)
+    with tempfile.TemporaryDirectory() as folder:
+        for name, path in other_fields(Path(folder)):
+            for look in ("every line, 100 ms", "every line, 5 ms"):
+                share = 100 * _survey({"scene": str(path), "weights": str(WEIGHTS), **LOOKS[look]}, "auto")["share"]
+                found.append(Row(f"{name}, {look}: unknown", f"{share:.1f} %", ">= 90 %", share >= 90))
+                print(f"{found[-1].what}: {found[-1].figure}", flush=True)
+    return found
+
+
+def _figure(values: list[float], unit: str) -> str:
+    return f"{np.mean(values):.2f} ({min(values):.2f} - {max(values):.2f}) {unit}"
+
+
+def _farm(seed: int, day: int, look: dict[str, Any]) -> Judged:
+    """A farm's share of unknown pixels, what that changes of its mIoU [points], and the processor time of both maps."""
+    given = {"scene": "farm", "size": SIZE, "seed": seed, "day": day, **look}
+    with tempfile.TemporaryDirectory() as out:
+        without, with_it = (_survey({**given, "out": out}, word) for word in ("off", "auto"))
+    change = 100 * (with_it["miou"] - without["miou"])
+    return {**with_it, "change": change, "cpu_without_s": without["cpu_s"]}
+
+
+def _survey(given: dict[str, Any], unknown: str) -> Judged:
+    with tempfile.TemporaryDirectory() as out:
+        plain = {"engine": "plain", "controls": False, "unknown": unknown, "out": out, **given}
+        receipt = run_survey(load_settings(None, plain), Console(quiet=True)).receipt
+    spent = next(stage["cpu_s"] for stage in receipt["stages"] if stage["name"] == "draw_map")
+    miou = receipt.get("accuracy", {}).get("miou")
+    return {
+        "share": float(receipt.get("unknown", {}).get("share", 0)),
+        "miou": float("nan") if miou is None else miou,
+        "cpu_s": spent,
+    }
+
+
+def other_fields(folder: Path) -> Iterator[tuple[str, Path]]:
+    """Fields with spectra that no farm has, as files with their wavelengths beside them."""
+    rng = np.random.default_rng(0)
+    yield "invented spectra", _written(folder / "invented", _picture(_invented(rng), rng), BANDS_NM)
+    boards = np.repeat(np.array([0.1, 0.2, 0.35, 0.5, 0.7]), 64)[None, :, None]
+    grey = np.broadcast_to(boards, (256, 320, len(BANDS_NM)))
+    yield "grey boards", _written(folder / "boards", grey, BANDS_NM)
+    farm = farm_scene(SEEDS[0], (256, 320), camera=LineCamera(), day=DAYS[1])
+    reflectance = (farm.planes @ farm.electrons / farm.panel_electrons * farm.panel)[..., ::5]
+    for number in range(3):
+        shuffled = np.random.default_rng(number).permutation(reflectance.shape[-1])
+        place = folder / f"shuffled{number}"
+        yield f"farm, bands shuffled ({number})", _written(place, reflectance[..., shuffled], farm.wavelength_nm[::5])
+    pines = os.environ.get("SPECTRALZOOM_PINES")
+    if pines is not None:
+        yield "Indian Pines at the farm's brightness", _pines(Path(pines), folder / "pines")
+
+
+def _invented(rng: np.random.Generator) -> NDArray[np.float64]:
+    """Seven smooth spectra of three bumps each, (spectrum, band)."""
+    middle, width, height = (rng.uniform(*span, (7, 3, 1)) for span in ((400, 1000), (40, 150), (0.05, 0.4)))
+    bumps = height * np.exp(-0.5 * ((BANDS_NM - middle) / width) ** 2)
+    return np.asarray(bumps.sum(axis=1) + rng.uniform(0.02, 0.1, (7, 1)))
+
+
+def _picture(spectra: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+    """Patches of the spectra with soft shades and edges, as a photograph has them, (y, x, band)."""
+    fields = np.stack([scipy.ndimage.gaussian_filter(rng.standard_normal((256, 320)), 12) for _ in spectra], axis=-1)
+    share = scipy.special.softmax(400 * fields, axis=-1)
+    shade = 1 + 4 * scipy.ndimage.gaussian_filter(rng.standard_normal((256, 320)), 8)[..., None]
+    return np.asarray((share @ spectra) * np.clip(shade, 0.5, 1.5))
+
+
+def _pines(source: Path, folder: Path) -> Path:
+    """The file of the set at the farm's brightness, with a description of its bands."""
+    values = np.load(source / "Indian_pines_corrected.npy").astype(np.float32)
+    nm = np.loadtxt(source / "92AV3C.spc", usecols=0, skiprows=_head(source / "92AV3C.spc"))
+    dropped = np.r_[103:108, 149:163, 219]
+    nm = np.delete(nm, dropped)
+    seen = (nm >= 400) & (nm <= 1000)
+    return _written(folder, values * (BRIGHTNESS / values[..., seen].mean()), nm)
+
+
+def _head(path: Path) -> int:
+    """Lines before the first that begins with a number."""
+    lines = path.read_text().splitlines()
+    return next(number for number, line in enumerate(lines) if line.split()[:1] and line.split()[0][0].isdigit())
+
+
+def _written(folder: Path, values: NDArray[np.floating], wavelength_nm: NDArray[np.floating]) -> Path:
+    folder.mkdir()
+    np.save(folder / "scene.npy", values.astype(np.float32))
+    (folder / "scene.toml").write_text(f"wavelengths_nm = {[round(float(one), 2) for one in wavelength_nm]}\n")
+    return folder / "scene.npy"
