@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.archive.export_layers import ExportedRun, map_product
+from pipeline.ground.field_scale import M2_PER_HECTARE
 from pipeline.products.areas import ShareEstimate, probable_shares, stratified_shares
 from storage.archive.whole_files import write_whole
 from storage.arrays.beliefs import BeliefStore
 from storage.arrays.georeference import load_geobox
-from storage.arrays.ground_maps import M2_PER_HECTARE, open_image
+from storage.arrays.ground_maps import open_image
 from storage.arrays.layout import SHARD_ROWS
 from storage.export.map_scale import MapScale
 
