@@ -13,6 +13,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -23,11 +24,13 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from storage.readers.cube_sources import DEFLATE_RATIO, check_claim, check_memory
+from storage.readers.scene_toml import MICROMETRES, BandWavelengths, check_wavelengths
 
 _HEADER = 128  # bytes before the first variable
 _MATRIX, _PACKED, _INT32 = 14, 15, 5  # types of elements
 _LOOK = 1 << 14  # bytes in which a variable says its class, axes and name
 _MOST_AXES = 32
+_OF_WAVELENGTHS = ("wavelength", "wavelengths", "wavelength_nm", "wavelengths_nm", "wl", "lambda", "nm")
 _CLASSES = {6: 8, 7: 4, 8: 1, 9: 1, 10: 2, 11: 2, 12: 4, 13: 4, 14: 8, 15: 8}  # of numbers -> bytes of each
 _OLD_TYPES = {0: 8, 1: 4, 2: 4, 3: 2, 4: 2, 5: 1}  # of version 4
 
@@ -172,11 +175,21 @@ def load_npy(path: Path) -> NDArray[Any]:
     return values
 
 
-def load_named(path: Path, variable: str | None, dims: int) -> tuple[NDArray[Any], tuple[str, ...]]:
-    """Read one array of a .npz or .mat file: the one named, or the only one with ``dims`` axes; and notes.
+@dataclass(frozen=True)
+class NamedArray:
+    """One array of a file with several, and what the others say of it."""
 
-    ``variable`` may be a step of time, or end in one: see :func:`take_step`. Raises SceneError: there is no such array,
-    or several; or it claims more than the file or the machine can hold.
+    values: NDArray[Any]
+    notes: tuple[str, ...] = ()
+    wavelengths: BandWavelengths | None = None
+
+
+def load_named(path: Path, variable: str | None, dims: int) -> NamedArray:
+    """Read one array of a .npz or .mat file: the one named, or the only one with ``dims`` axes.
+
+    Of a cube the wavelengths, where another array is called so and has one a band. ``variable`` may be a step of time,
+    or end in one: see :func:`take_step`. Raises SceneError: there is no such array, or several; or it claims more than
+    the file or the machine can hold.
     """
     if path.suffix.lower() == ".npz":
         found = _npz_arrays(path)
@@ -192,7 +205,21 @@ def load_named(path: Path, variable: str | None, dims: int) -> tuple[NDArray[Any
     name = named if named is not None else _only_one(path, found, _AXES[dims, step is not None], listing)
     others = [f"{other} {held.shape}" for other, held in found.items() if other != name]
     notes = (f"array {name} of the file, which also has {', '.join(others)}",) if others and named is None else ()
-    return take_step(found[name].load(), step, dims, f"{path}:{name}"), notes
+    values = take_step(found[name].load(), step, dims, f"{path}:{name}")
+    return NamedArray(values, notes, _wavelengths(path, found, values.shape[2]) if values.ndim == 3 else None)
+
+
+def _wavelengths(path: Path, found: Mapping[str, _Held], bands: int) -> BandWavelengths | None:
+    """Wavelengths that stand beside a cube, in nm or micrometres by their size; None where no array can be those."""
+    for name, held in found.items():
+        if name.lower() not in _OF_WAVELENGTHS or math.prod(held.shape) != bands or max(held.shape) != bands:
+            continue
+        with suppress(SceneError, ValueError, TypeError):
+            centres = np.asarray(held.load(), np.float64).ravel()
+            unit = "micrometres by their size" if centres.max() <= MICROMETRES[1] else "nm"
+            nm = check_wavelengths(centres * (1000 if unit != "nm" else 1), str(path))
+            return BandWavelengths(nm, None, f"wavelengths from {path}:{name}, read as {unit}")
+    return None
 
 
 _AXES = {(3, False): (3, 4, 2), (2, False): (2, 3), (3, True): (4,), (2, True): (3, 4)}  # in the order in which tried

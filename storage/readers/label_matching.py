@@ -83,8 +83,11 @@ def find_label(scene: Path) -> Path | None:
     """The label file of one scene by its name; None where there is none (SceneError: there are several)."""
     if not scene.parent.is_dir() or (scene.is_dir() and not _is_store(scene)):
         return None
-    beside = [entry for entry in scene_entries(scene.parent) if is_label_name(entry) and entry != scene]
-    return _label_of(scene, [*beside, *_in_label_folders(scene.parent)])
+    try:
+        beside = [entry for entry in scene_entries(scene.parent) if is_label_name(entry) and entry != scene]
+        return _label_of(scene, [*beside, *_in_label_folders(scene.parent)])
+    except PermissionError:  # who may read the file need not be allowed to list the folder
+        return None
 
 
 def is_label_name(path: Path) -> bool:

@@ -91,6 +91,7 @@ def _arrays(here: Path, cube: np.ndarray) -> None:
 
 def _containers(here: Path, cube: np.ndarray) -> None:
     scipy.io.savemat(here / "one_cube.mat", {"cube": cube, "wl": np.arange(5.0), "day": 130})
+    scipy.io.savemat(here / "with_nm.mat", {"cube": cube, "wavelengths": [0.46, 0.55, 0.64, 0.7, 0.8]})
     scipy.io.savemat(here / "table.mat", {"X": np.ones((198, 10000), np.float32), "y": np.arange(198.0)})
     scipy.io.savemat(here / "two_cubes.mat", {"north": cube, "south": cube})
     with h5py.File(here / "seven.mat", "w") as file:

@@ -211,6 +211,7 @@ WORKS = {  # what is read, with which wavelengths, as what (y, x, band), and wha
     "some NaN": ("holes.npy", NM, (12, 16, 5), "60 of 960 samples are missing"),
     "two axes": ("plane.npy", "550", (12, 16, 1), ""),
     "one cube beside vectors": ("one_cube.mat", NM, (12, 16, 5), r"array cube of the file, which also has wl \(1, 5\)"),
+    "wavelengths beside the cube": ("with_nm.mat", None, (12, 16, 5), "with_nm.mat:wavelengths, read as micrometres"),
     "MATLAB 7.3": ("seven.mat", NM, (12, 16, 5), ""),
     "named variable": ("two_cubes.mat:north", NM, (12, 16, 5), ""),
     "step of a series": ("series.npy:1", NM, (12, 16, 5), ""),

@@ -18,7 +18,7 @@ from flows.training.data import open_training_data
 from pipeline.geometry.camera import LineCamera
 from pipeline.readings import edge_fill
 from storage.readers.datasets import load_data_set
-from storage.readers.legends import read_legend
+from storage.readers.legends import find_legend, read_legend
 from storage.readers.scene_files import load_scene_file
 from storage.readers.scene_toml import load_scene_settings
 from tests.flows.conftest import command_line
@@ -122,6 +122,20 @@ def test_legends_are_read_as_people_write_them(text: str, tmp_path: Path) -> Non
     legend = read_legend(path)
     assert legend is not None
     assert legend.names == LEGENDS[text]
+
+
+def test_names_stand_beside_label_files_too(tmp_path: Path) -> None:
+    """GDAL's categories, QGIS's style and ENVI's header name the numbers of a label file."""
+    category = "<PAMDataset><PAMRasterBand band='1'><CategoryNames><Category>soil</Category><Category>crop</Category>"
+    (tmp_path / "a.tif.aux.xml").write_text(category + "</CategoryNames></PAMRasterBand></PAMDataset>")
+    (tmp_path / "b.qml").write_text("<qgis><paletteEntry value='7' label='weed' color='#ff0000'/></qgis>")
+    header = "ENVI\nsamples = 2\nlines = 1\nbands = 1\ndata type = 1\nclass names = {soil, crop}\n"
+    (tmp_path / "c.hdr").write_text(header)
+    (tmp_path / "c.img").write_bytes(b"\0\1")
+    found = {name: find_legend([], [tmp_path / name]) for name in ("a.tif", "b.tif", "c.hdr", "none.png")}
+    told = {name: legend and (dict(legend.names), legend.listed) for name, legend in found.items()}
+    listed = ({}, ("soil", "crop"))
+    assert told == {"a.tif": listed, "b.tif": ({7: "weed"}, ()), "c.hdr": listed, "none.png": None}
 
 
 @given(st.binary(max_size=200))
