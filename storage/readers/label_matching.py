@@ -72,8 +72,8 @@ def match_folder(folder: Path) -> MatchedFiles:
     if not images:  # a folder of labels is asked for as such: they are what there is
         images, beside = own, []
     labels = {image: found for image in images if (found := _label_of(image, [*beside, *apart])) is not None}
-    if len(images) == 1 and not labels:
-        labels = dict(zip(images, [entry for entry in beside if entry.stem.lower() in LABEL_WORDS][:1], strict=False))
+    if len(images) == len([*beside, *apart]) == 1:  # they need no name to belong together
+        labels = dict(zip(images, [*beside, *apart], strict=True))
     _refuse_shared(labels)
     alone = tuple(entry for entry in (*beside, *apart) if entry not in set(labels.values()))
     return MatchedFiles(tuple(images), labels, alone)

@@ -259,6 +259,7 @@ FOLDERS = {  # names of scenes and of their labels
     "beside": {"A 1": "A 1_mask.png", "b": "B_labels.PNG"},
     "lacking": {"001": "masks/001.png", "002": None},
     "hidden": {"001": "labels/001.png"},
+    "one_of_each": {"corrected": "site_gt.png"},
     "stems": {"001.png": None, "001.tif": None},
     "palette": {"001": "001_mask.png"},
 }

@@ -37,7 +37,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return here
 
 
-@pytest.mark.parametrize("folder", ["apart", "beside", "lacking", "tiles", "hidden"])
+@pytest.mark.parametrize("folder", ["apart", "beside", "lacking", "tiles", "hidden", "one_of_each"])
 def test_what_init_writes_reads_as_the_folder_did(folder: str, made: Path, command_line: Any) -> None:
     """With its scene.toml every image has the labels that it had by its name, in the same classes."""
     path = made / folder
