@@ -14,6 +14,7 @@ from pipeline.errors import SceneError
 from pipeline.geometry.grid import UNLABELLED
 from storage.readers.label_matching import (
     MatchedFiles,
+    folders_within,
     image_folder,
     is_label_name,
     listed_names,
@@ -208,6 +209,7 @@ def _scenes(path: str | Path, train_mask: str | Path | None) -> _Scenes:
     if not images:
         raise SceneError(
             f"{folder} holds no scene ({', '.join(SCENE_ENDINGS)}); give a folder of images, or with images/ in it"
+            f"{folders_within(folder)}"
         )
     names = _names(images)
     labels = {image: label for image, label in found.labels.items() if label.resolve() not in masks}

@@ -96,6 +96,13 @@ def is_label_name(path: Path) -> bool:
     return stem in LABEL_WORDS or _LABEL_WORD.search(stem) is not None
 
 
+def folders_within(folder: Path) -> str:
+    """Words for the folders of a folder in which images lie, for whoever looks for some; nothing where none does."""
+    inner = [entry for entry in sorted(folder.iterdir()) if entry.is_dir() and not _is_store(entry)]
+    found = [entry for entry in inner if not entry.name.startswith(".") and scene_entries(image_folder(entry))]
+    return f"; there are some in its folders {listed_names(found)}: name one" if found else ""
+
+
 def listed_names(paths: Iterable[Path]) -> str:
     """The first names, and how many more there are."""
     names = [path.name for path in paths]

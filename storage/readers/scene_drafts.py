@@ -17,6 +17,7 @@ from storage.readers.cube_sources import CubeSource
 from storage.readers.label_matching import (
     MatchedFiles,
     find_label,
+    folders_within,
     image_folder,
     is_label_name,
     listed_names,
@@ -76,7 +77,8 @@ def draft_scene(address: str | Path, report: Report = lambda done, name: None) -
         raise SceneError(f"there is no file or folder {path}; check the name (seen from {Path.cwd()})")
     found = _one_file(path) if alone else match_folder(image_folder(path))
     if not found.images:
-        raise SceneError(f"{path} holds no image that is read; give a folder of images, or with a folder images/")
+        within = folders_within(path)
+        raise SceneError(f"{path} holds no image that is read; give a folder of images, or with images/ in it{within}")
     folder = path.parent if alone else path
     source = open_cube_source(address if alone else found.images[0])
     legend = find_legend([folder, *(label.parent for label in found.labels.values())], list(found.labels.values()))

@@ -144,6 +144,7 @@ def _folders(here: Path, picture: np.ndarray) -> None:
     folder("several", {"001.png": picture, "001_mask.png": mask, "001_labels.png": mask})
     folder("one_stem", {"001.png": picture, "001.tif": picture, "masks/001.png": mask})
     folder("stems", {"001.png": picture, "001.tif": picture})
+    folder("season", {"2024-05-01/field.png": picture, "2024-06-01/field.png": picture})
     folder("one_of_each", {"corrected.png": picture, "site_gt.png": mask})
     folder("soil", {**two, "labels/001.png": mask * 0, "labels/002.png": mask * 0})
     folder("soft", {**two, "labels/001.png": picture, "labels/002.png": mask})

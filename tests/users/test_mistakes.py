@@ -162,6 +162,8 @@ CASES = {
     "init of nothing": (1, "init none", "no file or folder none"),
     "init of an empty folder": (1, "init empty", "holds no image"),
     "init of a broken picture": (1, "init text.png", "text.png cannot be read"),
+    "init of a folder of dates": (1, "init season", "in its folders 2024-05-01, 2024-06-01: name one"),
+    "training on a folder of dates": (1, TRAIN + "season", "in its folders 2024-05-01, 2024-06-01: name one"),
     "init of soft labels": (1, "init soft", "768 different colours.* hard edges"),
     "init twice": (2, "init bad_key", "there is a bad_key/scene.toml already.*--force"),
     "init of several label files": (1, "init several", "several files of labels"),

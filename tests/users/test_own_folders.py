@@ -12,9 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from flows.evaluate.frames import EvaluateRequest, open_candidates, open_frames, sort_frames
 from flows.settings.load import load_settings
 from flows.survey.scene import open_scene
-from flows.training.data import open_training_data
+from flows.training.data import alike_notes, open_training_data
+from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.readings import edge_fill
 from storage.readers.datasets import load_data_set
@@ -177,6 +179,27 @@ def test_labels_that_nobody_stated_are_left_out_where_the_weights_know_others(ma
     assert found.labels is None
     assert any("the labels beside the scene are left out" in note for note in notes)
     assert open_scene(settings, ("class_0", "class_1"))[0].labels is not None
+
+
+@pytest.mark.parametrize("folder", ["sizes", "soft", "several"])
+def test_labels_that_nobody_stated_refuse_no_survey(folder: str, made: Path) -> None:
+    """Of another size, of mixed colours, or several: what lies beside a scene is left out of its survey with a note."""
+    (made / folder / "scene.toml").unlink(missing_ok=True)
+    scene = next(path for path in sorted((made / folder).rglob("00*.png")) if "002" in path.name or folder != "sizes")
+    scene = scene.parent.parent / "images" / scene.name if scene.parent.name == "labels" else scene
+    found, notes = open_scene(load_settings(None, {"scene": str(scene), "weights": "w"}), ("class_0", "class_1"))
+    assert found.labels is None
+    assert any("the labels beside the scene are left out" in note for note in notes)
+    with pytest.raises(SceneError):
+        load_scene_file(scene)
+
+
+def test_frames_of_one_class_are_told_when_weights_are_judged(made: Path, weights: Path) -> None:
+    """An evaluation asks whether the value of that class stands for none."""
+    candidates, choices = open_candidates((weights,)), {"labels": None, "bands": None, "wavelengths": None}
+    data = open_frames(str(made / "soil"), (), None, LineCamera(), choices)
+    jobs = sort_frames(EvaluateRequest(str(made / "soil"), (weights,)), data, candidates, [], lambda *words: None)
+    assert alike_notes(jobs.alike)[0].startswith("all labels are class_0 in 001, 002; if its value")
 
 
 def test_labels_that_are_all_alike_are_questioned(made: Path) -> None:
