@@ -92,7 +92,7 @@ def train(
     Parameters
     ----------
     dataset
-        `farm` (`farm@2`), a folder with images, labels and a scene.toml, or a file.
+        `farm` (`farm@2`), a folder of images with their labels (`init` writes a scene.toml for it), or a file.
     out
         File of weights to write (.safetensors).
     hold_out

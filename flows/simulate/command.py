@@ -128,7 +128,9 @@ def open_simulation(settings: Settings, *, coarse: bool = False) -> tuple[Captur
         raise SettingsError(refused)
     scene, notes = open_scene(settings)
     if scene.filled_px:  # a survey goes on without; a simulation would have to invent light
-        file = load_scene_file(settings.scene, bands=settings.bands, wavelengths=settings.wavelengths)
+        file = load_scene_file(
+            settings.scene, bands=settings.bands, wavelengths=settings.wavelengths, labels_needed=False
+        )
         missing = ~np.isfinite(file.values)
         row, column, band = (int(one) for one in np.unravel_index(int(missing.argmax()), missing.shape))
         number = band if settings.bands is None else settings.bands[band]

@@ -68,7 +68,11 @@ def open_scene(settings: Settings, known: Sequence[str] | None = None) -> tuple[
         farm = farm_scene(settings.seed, shape, camera=settings.camera, day=settings.day, hour=settings.hour)
         return farm if settings.bands is None else _some_bands(farm, settings.bands), _notes_of_moment(settings)
     file = load_scene_file(
-        settings.scene, labels=settings.labels, bands=settings.bands, wavelengths=settings.wavelengths
+        settings.scene,
+        labels=settings.labels,
+        bands=settings.bands,
+        wavelengths=settings.wavelengths,
+        labels_needed=False,
     )
     strange = [name for name in file.class_names if known is not None and name not in known]
     if file.labels_found and strange:

@@ -14,6 +14,7 @@ from pipeline.errors import SceneError
 from pipeline.geometry.grid import UNLABELLED
 from storage.readers.label_matching import (
     MatchedFiles,
+    folders_within,
     image_folder,
     is_label_name,
     listed_names,
@@ -208,11 +209,13 @@ def _scenes(path: str | Path, train_mask: str | Path | None) -> _Scenes:
     if not images:
         raise SceneError(
             f"{folder} holds no scene ({', '.join(SCENE_ENDINGS)}); give a folder of images, or with images/ in it"
+            f"{folders_within(folder)}"
         )
     names = _names(images)
+    labels = {image: label for image, label in found.labels.items() if label.resolve() not in masks}
     return _Scenes(
         {name: str(image) for name, image in names.items()},
-        {name: found.labels[image] for name, image in names.items() if image in found.labels},
+        {name: labels[image] for name, image in names.items() if image in labels},
         tuple(one for one in found.alone if one.resolve() not in masks),
     )
 

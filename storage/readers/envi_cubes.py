@@ -108,7 +108,7 @@ def find_envi_pair(path: Path) -> tuple[Path, Path]:
         stem = path.with_suffix("")
         endings = (ending for name in DATA_ENDINGS for ending in {name: None, name.upper(): None})
         data = next((file for file in (stem.with_name(stem.name + end) for end in endings) if file.is_file()), None)
-        if not path.is_file():
+        if not path.exists():
             raise SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
         if data is None:
             raise SceneError(

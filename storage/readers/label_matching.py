@@ -72,8 +72,8 @@ def match_folder(folder: Path) -> MatchedFiles:
     if not images:  # a folder of labels is asked for as such: they are what there is
         images, beside = own, []
     labels = {image: found for image in images if (found := _label_of(image, [*beside, *apart])) is not None}
-    if len(images) == 1 and not labels:
-        labels = dict(zip(images, [entry for entry in beside if entry.stem.lower() in LABEL_WORDS][:1], strict=False))
+    if len(images) == len([*beside, *apart]) == 1:  # they need no name to belong together
+        labels = dict(zip(images, [*beside, *apart], strict=True))
     _refuse_shared(labels)
     alone = tuple(entry for entry in (*beside, *apart) if entry not in set(labels.values()))
     return MatchedFiles(tuple(images), labels, alone)
@@ -83,14 +83,24 @@ def find_label(scene: Path) -> Path | None:
     """The label file of one scene by its name; None where there is none (SceneError: there are several)."""
     if not scene.parent.is_dir() or (scene.is_dir() and not _is_store(scene)):
         return None
-    beside = [entry for entry in scene_entries(scene.parent) if is_label_name(entry) and entry != scene]
-    return _label_of(scene, [*beside, *_in_label_folders(scene.parent)])
+    try:
+        beside = [entry for entry in scene_entries(scene.parent) if is_label_name(entry) and entry != scene]
+        return _label_of(scene, [*beside, *_in_label_folders(scene.parent)])
+    except PermissionError:  # who may read the file need not be allowed to list the folder
+        return None
 
 
 def is_label_name(path: Path) -> bool:
     """Whether a file's name says that it holds labels: ``001_mask.png``, ``labels.png``."""
     stem = path.stem.lower()
     return stem in LABEL_WORDS or _LABEL_WORD.search(stem) is not None
+
+
+def folders_within(folder: Path) -> str:
+    """Words for the folders of a folder in which images lie, for whoever looks for some; nothing where none does."""
+    inner = [entry for entry in sorted(folder.iterdir()) if entry.is_dir() and not _is_store(entry)]
+    found = [entry for entry in inner if not entry.name.startswith(".") and scene_entries(image_folder(entry))]
+    return f"; there are some in its folders {listed_names(found)}: name one" if found else ""
 
 
 def listed_names(paths: Iterable[Path]) -> str:

@@ -260,8 +260,8 @@ def _read(path: Path, ending: str, variable: str | None, dims: int) -> Raster:
             raise SceneError(f"{path} holds one array, which has no name; only a step of time can be told: {path}:0")
         return Raster(take_step(load_npy(path), step, dims, str(path)))
     if ending != ".hdr":
-        values, notes = load_named(path, variable, dims)
-        return Raster(values, notes=notes)
+        named_array = load_named(path, variable, dims)
+        return Raster(named_array.values, notes=named_array.notes, known=named_array.wavelengths)
     cube, known = open_envi_cube(path), None
     if cube.header.wavelength_nm is not None:
         known = BandWavelengths(cube.header.wavelength_nm, cube.header.fwhm_nm, f"wavelengths from {path}")

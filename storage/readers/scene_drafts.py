@@ -14,7 +14,15 @@ from numpy.typing import NDArray
 from pipeline.errors import PipelineError, SceneError
 from pipeline.readings import edge_fill
 from storage.readers.cube_sources import CubeSource
-from storage.readers.label_matching import MatchedFiles, find_label, image_folder, is_label_name, match_folder
+from storage.readers.label_matching import (
+    MatchedFiles,
+    find_label,
+    folders_within,
+    image_folder,
+    is_label_name,
+    listed_names,
+    match_folder,
+)
 from storage.readers.labels import MIXED, MOST_FOUND_CLASSES, load_codes, shown_value, value_of_code
 from storage.readers.legends import Legend, find_legend
 from storage.readers.raster_files import IMAGE_ENDINGS, TIFF_ENDINGS, image_shape, open_tiff_rows, split_variable
@@ -69,11 +77,13 @@ def draft_scene(address: str | Path, report: Report = lambda done, name: None) -
         raise SceneError(f"there is no file or folder {path}; check the name (seen from {Path.cwd()})")
     found = _one_file(path) if alone else match_folder(image_folder(path))
     if not found.images:
-        raise SceneError(f"{path} holds no image that is read; give a folder of images, or with a folder images/")
+        within = folders_within(path)
+        raise SceneError(f"{path} holds no image that is read; give a folder of images, or with images/ in it{within}")
     folder = path.parent if alone else path
     source = open_cube_source(address if alone else found.images[0])
     legend = find_legend([folder, *(label.parent for label in found.labels.values())], list(found.labels.values()))
     unseen: list[str] = []
+    unseen += _polygons(found)
     classes = _classes(found, source.shape, legend, unseen, report)
     edge, missing = _look_at_edge(source)
     return SceneDraft(
@@ -98,6 +108,16 @@ def _one_file(path: Path) -> MatchedFiles:
     return MatchedFiles((path,), {} if label is None else {path: label}, ())
 
 
+def _polygons(found: MatchedFiles) -> list[str]:
+    """Tell of files beside images without labels that may hold outlines, which no reader here draws."""
+    outlines = [
+        one for image in found.bare for one in map(image.with_suffix, (".json", ".xml", ".geojson")) if one.is_file()
+    ]
+    if not outlines:
+        return []
+    return [f"what is in {listed_names(outlines)}: outlines are no labels; draw them as pictures of the same pixels"]
+
+
 def _pattern(found: MatchedFiles, folder: Path) -> str | None:
     """The ``labels`` of a scene.toml that tells each image its own file, and others none; None where none does."""
     for image, label in list(found.labels.items())[:1]:
@@ -110,7 +130,7 @@ def _pattern(found: MatchedFiles, folder: Path) -> str | None:
             pattern = Path(place, name).as_posix()
             places = {one: (folder / _filled(pattern, one)).resolve() for one in found.images}
             fits = all(places[one] == own.resolve() for one, own in found.labels.items())
-            if fits and not any(places[one].exists() for one in found.bare):
+            if fits and pattern.isprintable() and not any(places[one].exists() for one in found.bare):
                 return pattern
     return None
 

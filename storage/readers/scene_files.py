@@ -76,6 +76,7 @@ def load_scene_file(
     bands: Sequence[int] | None = None,
     wavelengths: Sequence[float] | None = None,
     classes: Mapping[str, ClassValue] | None = None,
+    labels_needed: bool = True,
 ) -> SceneFile:
     """Read a scene from an image, .npy, .npz, .mat, ENVI, Zarr or a Headwall folder.
 
@@ -84,7 +85,8 @@ def load_scene_file(
     What is given here wins over the ``scene.toml`` beside the file, and that over what the file says: a file of class
     numbers or colours on the same pixels (frames of HyKo2 and RANUS bring their own, others are found by their names),
     bands to use, counted from 0, and wavelengths [nm], one for each band used or for each of the file. ``classes`` are
-    those of a scene.toml that states none. Raises SceneError: a file is missing, damaged, of a kind or shape that
+    those of a scene.toml that states none. Labels found by their names that cannot be used are left out with a note
+    where no ``labels_needed``. Raises SceneError: a file is missing, damaged, of a kind or shape that
     cannot be used, or the labels do not fit. WavelengthError: wavelengths are missing, or their number, unit or range
     is wrong.
     """
@@ -112,7 +114,12 @@ def load_scene_file(
     if layout is not None and by_name:
         found, label_note = layout.labels, (layout.label_note,)
     else:
-        found, label_note = _labels(file, shape, labels, settings, classes or {})
+        try:
+            found, label_note = _labels(file, shape, labels, settings, classes or {})
+        except SceneError as error:
+            if labels_needed or not by_name:
+                raise
+            found, label_note = None, (f"the labels beside the scene are left out: {error}",)
     count, widths = cube.shape[2], None if light.fwhm_nm is None else light.fwhm_nm.tolist()
     some_bands = () if chosen == list(range(count)) else (f"bands {bands_text(chosen)} of {count}, counted from 0",)
     stated: tuple[str, ...] = () if settings.nodata is None else (f"nodata {settings.nodata!r}",)

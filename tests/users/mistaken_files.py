@@ -91,6 +91,7 @@ def _arrays(here: Path, cube: np.ndarray) -> None:
 
 def _containers(here: Path, cube: np.ndarray) -> None:
     scipy.io.savemat(here / "one_cube.mat", {"cube": cube, "wl": np.arange(5.0), "day": 130})
+    scipy.io.savemat(here / "with_nm.mat", {"cube": cube, "wavelengths": [0.46, 0.55, 0.64, 0.7, 0.8]})
     scipy.io.savemat(here / "table.mat", {"X": np.ones((198, 10000), np.float32), "y": np.arange(198.0)})
     scipy.io.savemat(here / "two_cubes.mat", {"north": cube, "south": cube})
     with h5py.File(here / "seven.mat", "w") as file:
@@ -143,6 +144,8 @@ def _folders(here: Path, picture: np.ndarray) -> None:
     folder("several", {"001.png": picture, "001_mask.png": mask, "001_labels.png": mask})
     folder("one_stem", {"001.png": picture, "001.tif": picture, "masks/001.png": mask})
     folder("stems", {"001.png": picture, "001.tif": picture})
+    folder("season", {"2024-05-01/field.png": picture, "2024-06-01/field.png": picture})
+    folder("one_of_each", {"corrected.png": picture, "site_gt.png": mask})
     folder("soil", {**two, "labels/001.png": mask * 0, "labels/002.png": mask * 0})
     folder("soft", {**two, "labels/001.png": picture, "labels/002.png": mask})
     folder("sizes", {**two, "labels/001.png": mask, "labels/002.png": mask[:9]})

@@ -12,13 +12,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from flows.evaluate.frames import EvaluateRequest, open_candidates, open_frames, sort_frames
 from flows.settings.load import load_settings
 from flows.survey.scene import open_scene
-from flows.training.data import open_training_data
+from flows.training.data import alike_notes, open_training_data
+from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.readings import edge_fill
 from storage.readers.datasets import load_data_set
-from storage.readers.legends import read_legend
+from storage.readers.legends import find_legend, read_legend
 from storage.readers.scene_files import load_scene_file
 from storage.readers.scene_toml import load_scene_settings
 from tests.flows.conftest import command_line
@@ -37,7 +39,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return here
 
 
-@pytest.mark.parametrize("folder", ["apart", "beside", "lacking", "tiles", "hidden"])
+@pytest.mark.parametrize("folder", ["apart", "beside", "lacking", "tiles", "hidden", "one_of_each"])
 def test_what_init_writes_reads_as_the_folder_did(folder: str, made: Path, command_line: Any) -> None:
     """With its scene.toml every image has the labels that it had by its name, in the same classes."""
     path = made / folder
@@ -124,6 +126,20 @@ def test_legends_are_read_as_people_write_them(text: str, tmp_path: Path) -> Non
     assert legend.names == LEGENDS[text]
 
 
+def test_names_stand_beside_label_files_too(tmp_path: Path) -> None:
+    """GDAL's categories, QGIS's style and ENVI's header name the numbers of a label file."""
+    category = "<PAMDataset><PAMRasterBand band='1'><CategoryNames><Category>soil</Category><Category>crop</Category>"
+    (tmp_path / "a.tif.aux.xml").write_text(category + "</CategoryNames></PAMRasterBand></PAMDataset>")
+    (tmp_path / "b.qml").write_text("<qgis><paletteEntry value='7' label='weed' color='#ff0000'/></qgis>")
+    header = "ENVI\nsamples = 2\nlines = 1\nbands = 1\ndata type = 1\nclass names = {soil, crop}\n"
+    (tmp_path / "c.hdr").write_text(header)
+    (tmp_path / "c.img").write_bytes(b"\0\1")
+    found = {name: find_legend([], [tmp_path / name]) for name in ("a.tif", "b.tif", "c.hdr", "none.png")}
+    told = {name: legend and (dict(legend.names), legend.listed) for name, legend in found.items()}
+    listed = ({}, ("soil", "crop"))
+    assert told == {"a.tif": listed, "b.tif": ({7: "weed"}, ()), "c.hdr": listed, "none.png": None}
+
+
 @given(st.binary(max_size=200))
 def test_any_bytes_are_a_legend_or_none(tmp_path_factory: pytest.TempPathFactory, content: bytes) -> None:
     """Whatever lies under such a name, it is read or passed over."""
@@ -163,6 +179,27 @@ def test_labels_that_nobody_stated_are_left_out_where_the_weights_know_others(ma
     assert found.labels is None
     assert any("the labels beside the scene are left out" in note for note in notes)
     assert open_scene(settings, ("class_0", "class_1"))[0].labels is not None
+
+
+@pytest.mark.parametrize("folder", ["sizes", "soft", "several"])
+def test_labels_that_nobody_stated_refuse_no_survey(folder: str, made: Path) -> None:
+    """Of another size, of mixed colours, or several: what lies beside a scene is left out of its survey with a note."""
+    (made / folder / "scene.toml").unlink(missing_ok=True)
+    scene = next(path for path in sorted((made / folder).rglob("00*.png")) if "002" in path.name or folder != "sizes")
+    scene = scene.parent.parent / "images" / scene.name if scene.parent.name == "labels" else scene
+    found, notes = open_scene(load_settings(None, {"scene": str(scene), "weights": "w"}), ("class_0", "class_1"))
+    assert found.labels is None
+    assert any("the labels beside the scene are left out" in note for note in notes)
+    with pytest.raises(SceneError):
+        load_scene_file(scene)
+
+
+def test_frames_of_one_class_are_told_when_weights_are_judged(made: Path, weights: Path) -> None:
+    """An evaluation asks whether the value of that class stands for none."""
+    candidates, choices = open_candidates((weights,)), {"labels": None, "bands": None, "wavelengths": None}
+    data = open_frames(str(made / "soil"), (), None, LineCamera(), choices)
+    jobs = sort_frames(EvaluateRequest(str(made / "soil"), (weights,)), data, candidates, [], lambda *words: None)
+    assert alike_notes(jobs.alike)[0].startswith("all labels are class_0 in 001, 002; if its value")
 
 
 def test_labels_that_are_all_alike_are_questioned(made: Path) -> None:
