@@ -20,7 +20,7 @@ from flows.terminal.figures import counted
 from pipeline.geometry.grid import UNLABELLED
 from storage.archive.keys import StageRef
 from storage.arrays.beliefs import DAY_STEP, NEVER, BeliefStore
-from storage.arrays.class_maps import ClassMap, load_class_map
+from storage.arrays.class_maps import ClassNames
 from storage.arrays.layout import open_group, read_array
 
 CHANGED_SHARE = 0.25  # of a seat's pixels, from which it is said to have changed
@@ -56,34 +56,40 @@ def remembered(prior: Prior | None, drawn: StageRef, receipt: Receipt) -> Earlie
     assert changed is not None
     ages = read_array(open_group(belief), "age")  # packed: all of a belief is many times as much
     days = np.where(ages == NEVER, np.nan, ages * np.float32(DAY_STEP)).astype(np.float32)
-    before = load_class_map(prior.belief.path / "class_map.zarr").classes
+    before = read_array(open_group(prior.belief.path / "class_map.zarr"), "classes")
     return EarlierLook(prior.run, prior.days, names[before], changed, days)
 
 
-def change_pictures(before: EarlierLook | None, drawn: StageRef, patch_px: int) -> list[Picture]:
+def change_pictures(
+    before: EarlierLook | None, now: NDArray[np.uint8], legend: ClassNames, patch_px: int
+) -> list[Picture]:
     """What changed since the run that a map goes on from, with its caption; nothing where it goes on from none.
 
-    ``drawn`` is the store of the class map.
+    ``now`` is the (y, x) class map of today.
     """
     if before is None:
         return []
-    now = load_class_map(drawn.path / "class_map.zarr")
     seats = before.changed >= CHANGED_SHARE
-    png = draw_changes(before.classes, now, seats, patch_px, days_words(before.days))
+    png = draw_changes(before.classes, now, legend, seats, patch_px, days_words(before.days))
     caption = f"What changed since {before.run}: {counted(int(np.count_nonzero(seats)), 'place')} of another class."
     return [Picture(png, caption)]
 
 
 def draw_changes(
-    before: NDArray[np.uint8], now: ClassMap, changed: NDArray[np.bool_], patch_px: int, earlier: str
+    before: NDArray[np.uint8],
+    now: NDArray[np.uint8],
+    legend: ClassNames,
+    changed: NDArray[np.bool_],
+    patch_px: int,
+    earlier: str,
 ) -> bytes:
     """PNG of two class maps of one field; ``changed`` (seat_y, seat_x) are outlined in the later one."""
-    tall = now.classes.shape[0] / now.classes.shape[1]
+    tall = now.shape[0] / now.shape[1]
     figure = Figure(figsize=(WIDTH_IN, WIDTH_IN / 2 * min(max(tall, 0.4), 1.6) + 0.9), dpi=DPI, layout="constrained")
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
-    palette, (y, x) = class_palette(len(now.names), now.colours), now.classes.shape
+    palette, (y, x) = class_palette(len(legend.names), legend.colours), now.shape
     thin = slice(None, None, -(-max(y, x) // MOST_PX))
-    for axes, classes, title in ((left, before, f"as remembered, {earlier}"), (right, now.classes, "now")):
+    for axes, classes, title in ((left, before, f"as remembered, {earlier}"), (right, now, "now")):
         axes.imshow(
             class_rgb(classes[thin, thin], palette), extent=(-0.5, x - 0.5, y - 0.5, -0.5), interpolation="nearest"
         )
@@ -91,11 +97,11 @@ def draw_changes(
         axes.set_xticks([])
         axes.set_yticks([])
     right.add_collection(LineCollection(outline(changed, patch_px, (y, x)), colors=CHANGED, linewidths=1.4))
-    present = sorted((set(np.unique(before).tolist()) | set(np.unique(now.classes).tolist())) - {UNLABELLED})
+    present = sorted((set(np.unique(before).tolist()) | set(np.unique(now).tolist())) - {UNLABELLED})
     patches = [
-        Patch(facecolor=palette[number], edgecolor="0.4", linewidth=0.5, label=now.names[number].replace("_", " "))
+        Patch(facecolor=palette[number], edgecolor="0.4", linewidth=0.5, label=legend.names[number].replace("_", " "))
         for number in present
-        if number < len(now.names)
+        if number < len(legend.names)
     ]
     patches.append(Patch(facecolor="none", edgecolor=CHANGED, linewidth=1.4, label="another class than remembered"))
     figure.legend(handles=patches, loc="outside lower center", ncols=6, fontsize=8, frameon=False)

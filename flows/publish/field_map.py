@@ -202,7 +202,7 @@ def _places_facts(places: PagePlaces) -> dict[str, Any]:
 
 def _notes(field: FieldMap, step: int) -> list[str]:
     """What has to be known to read the map, a sentence each."""
-    found = [] if step == 1 else [f"The map is large: every {step}th pixel of it is shown."]
+    found = [] if step == 1 else [f"The map is large: one of {step} x {step} px is shown."]
     spectra = field.spectra
     if spectra is not None:
         bands = f"{len(spectra.wavelength_nm)} bands"

@@ -6,17 +6,19 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pyproj
 from numpy.typing import NDArray
 
-from pipeline.ground.map_grid import MapFrame
+from pipeline.ground.map_grid import WGS84, MapFrame
+from pipeline.lazy import deferred
 
 if TYPE_CHECKING:
+    import pyproj
     from odc.geo.geobox import GeoBox
+else:
+    pyproj = deferred("pyproj")
 
 Floats = NDArray[np.float64]
 STEP_PX, MOST_STEPS = 32, 32  # between nodes; of a side
-WGS84 = "EPSG:4326"
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,7 @@ from storage.archive.keys import StageRef
 from storage.archive.records import StageRecord, read_run
 from storage.archive.run_folders import RunDraft
 from storage.archive.whole_files import to_json
-from storage.arrays.class_maps import load_class_map
+from storage.arrays.class_maps import load_class_map, load_class_names
 from storage.arrays.cubes import RawCube
 from storage.arrays.ground_maps import load_ground_map
 from storage.arrays.mosaics import load_attention, open_patches
@@ -114,8 +114,9 @@ def _publish(run: SurveyRun, draft: RunDraft, products: Products, plan: FinePlan
     maps = (load_ground_map(ref.path / STORE) for ref in products.there(["ground"]))
     pictures = [Picture(draw_ground(drawn), "The map on the ground, north up.") for drawn in maps]
     before = remembered(run.prior, products.of("draw_map"), receipt)
-    pictures += change_pictures(before, products.of("draw_map"), run.grid.patch)
     field = field_map(run, products, plan, glance, coarse.spectra, before)
+    legend = load_class_names(products.of("draw_map").path / "class_map.zarr")
+    pictures += change_pictures(before, field.classes, legend, run.grid.patch)
     page = render_report(receipt, picture, pictures, looked_twice=looked_twice, field=field)
     (draft.folder / "report.html").write_text(page, encoding="utf-8")
     rests_on = run.archive.manifest_hashes(products.there(products))

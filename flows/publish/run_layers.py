@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from flows.publish.change_picture import EarlierLook
 from flows.publish.field_map import FieldMap, SweepShown
-from flows.publish.page_places import PagePlaces, places_of_pose
+from flows.publish.page_places import PagePlaces, places_of_grid, places_of_pose
 from flows.publish.page_spectra import PageSpectra, page_spectra
 from flows.publish.quicklook import QuicklookData, colours_of
 from flows.publish.receipt_table import days_words
@@ -106,7 +106,9 @@ def _sweep_words(run: SurveyRun, sweep: Sweep, path: Path, place: str) -> str:
 
 
 def _places(run: SurveyRun) -> PagePlaces | None:
-    """Where the run's pixels lie on the earth; None where nothing says so."""
+    """Where the run's pixels lie on the earth, as its scene says or a pose; None where neither does."""
+    if run.scene.geobox is not None:
+        return places_of_grid(run.scene.geobox)
     grid = survey_grid(run)
     return None if grid is None else places_of_pose(grid.frame, (run.grid.height, run.grid.width))
 

@@ -7,10 +7,10 @@ import json
 import shutil
 import subprocess
 import time
+import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import pytest
@@ -28,7 +28,7 @@ QUIETLY = (
     ),
 )
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed: no page can be tried")
-PATIENCE_S = 60.0
+PATIENCE_S = 15.0
 
 
 class Tab:
@@ -83,7 +83,7 @@ class Tab:
     def wait(self, expression: str) -> None:
         """Wait until an expression is true of the page."""
         end = time.monotonic() + PATIENCE_S
-        while not self.run(expression):
+        while not self.run(f"Boolean({expression})"):
             assert time.monotonic() < end, f"{expression} did not come true; {self.troubles}"
             time.sleep(0.03)
 
@@ -120,6 +120,15 @@ class Tab:
         self.call("Input.dispatchTouchEvent", type="touchStart", touchPoints=[{"x": x, "y": y}])
         self.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
 
+    def swipe(self, start: tuple[float, float], end: tuple[float, float]) -> None:
+        """Touch, move the finger, let go."""
+        (x0, y0), (x1, y1) = start, end
+        self.call("Input.dispatchTouchEvent", type="touchStart", touchPoints=[{"x": x0, "y": y0}])
+        for part in (0.1, 0.25, 0.5, 0.75, 1.0):
+            point = {"x": x0 + part * (x1 - x0), "y": y0 + part * (y1 - y0)}
+            self.call("Input.dispatchTouchEvent", type="touchMove", touchPoints=[point])
+        self.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+
     def key(self, name: str, code: int) -> None:
         """Press a key once."""
         words = {"key": name, "code": name, "windowsVirtualKeyCode": code}
@@ -146,7 +155,7 @@ def chromium(profile: Path) -> Iterator[Tab]:
     with subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         try:
             port = _port(profile / "DevToolsActivePort")
-            with _Line(port) as line:
+            with _line_to_page(port) as line:
                 yield Tab(line)
         finally:
             process.terminate()
@@ -160,21 +169,7 @@ def _port(file: Path) -> int:
     return int(lines[0])
 
 
-class _Line:
-    """The line to the first page of a browser."""
-
-    def __init__(self, port: int) -> None:
-        self._port = port
-
-    def __enter__(self) -> ClientConnection:
-        import urllib.request
-
-        with urllib.request.urlopen(f"http://127.0.0.1:{self._port}/json", timeout=PATIENCE_S) as answer:
-            (page, *_) = [one for one in json.load(answer) if one["type"] == "page"]
-        self._held = connect(page["webSocketDebuggerUrl"], max_size=None, compression=None)
-        return self._held
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._held.close()
+def _line_to_page(port: int) -> ClientConnection:
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/json", timeout=PATIENCE_S) as answer:
+        (page, *_) = [one for one in json.load(answer) if one["type"] == "page"]
+    return connect(page["webSocketDebuggerUrl"], max_size=None, compression=None)

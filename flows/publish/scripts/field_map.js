@@ -255,7 +255,7 @@ async function showField() {
   if (typeof DecompressionStream === "undefined") return; // the picture stays
   document.documentElement.classList.add("has-map");
   for (const part of section.querySelectorAll(".moving")) part.hidden = false;
-  const field = new FieldMap(JSON.parse(document.getElementById("field-data").textContent));
+  globalThis.field = new FieldMap(JSON.parse(document.getElementById("field-data").textContent));
   await field.read();
   field.lay();
   field.listen();

@@ -11,8 +11,10 @@ import pytest
 
 from flows.schedule.date_charts import COLOURS, line_chart
 from flows.schedule.history import FieldHistory, read_histories, render_history, render_index, way_to
+from flows.schedule.look_dates import look_of
 from storage.archive.archive import Archive
 from storage.archive.ledger import Ledger
+from storage.archive.records import Run
 from storage.arrays.class_maps import load_class_map
 from tests.flows.conftest import Page
 
@@ -146,3 +148,40 @@ def test_whatever_a_receipt_claims_is_drawn_or_left_out(points: list[tuple[float
     chart = line_chart({"soil": points}, "Share", "%")
     assert (chart.drawing or "").count("<use") == drawn
     assert (chart.drawing is None) == (drawn == 0 and len(points) == 1)
+
+
+@pytest.mark.parametrize(
+    ("settings", "due", "looked"),
+    [
+        ({"visit": "2026-06-21T09:30:00Z", "scene": "farm", "day": 130}, "2026-07-01T00:00:00Z", "2026-06-21 09:30"),
+        ({"visit": "second", "scene": "farm", "day": 130}, "2026-07-01T00:00:00Z", "2026-07-01 00:00"),
+        ({"visit": "second", "scene": "farm", "day": 130}, None, "2026-05-10 11:00"),
+        ({"scene": "farm", "day": 172, "hour": 13.5}, None, "2026-06-21 13:30"),
+        ({"scene": "field.png", "day": 130}, None, "2026-11-22 08:00"),
+        ({"scene": "farm", "day": None}, None, "2026-11-22 08:00"),
+        ({"scene": "farm", "day": 10**9}, None, "2026-11-22 08:00"),
+    ],
+)
+def test_a_look_has_the_date_of_the_look(settings: dict[str, Any], due: str | None, looked: str) -> None:
+    """By its visit's name, by what was due, by the farm's day; the clock is asked last, when the survey began."""
+    receipt = {"settings": settings, "started": "2026-11-22T08:00:00Z"}
+    run = Run(Path("x"), {"created": "2026-11-23T00:00:00Z"}, receipt, None, frozenset())
+    found = look_of(run, due)
+    assert found is not None
+    assert f"{found:%Y-%m-%d %H:%M}" == looked
+
+
+def test_rare_classes_have_a_scale_of_their_own() -> None:
+    """A class of two thousandths fills its chart as one of half the field does; all charts have the same dates."""
+    moments = ("2026-05-10T00:00:00Z", "2026-06-21T00:00:00Z")
+    rows = [
+        {"run": "runs/x", "created": at, "looked": at, "due": None, "attempts": 1, "unit": "share", "colours": {},
+         "areas": {"soil": 0.5, "weed": weed}, "savings": {"capture_s": 0.5}, "miou": None, "overall_accuracy": None,
+         "capture_seconds": {"done": None, "full": None}}
+        for at, weed in zip(moments, (0.001, 0.002), strict=True)
+    ]  # fmt: skip
+    page = render_history(FieldHistory("north", "archive", rows, []), "")
+    weed = page.partition('aria-label="weed"')[2].partition("</svg>")[0]
+    assert ">0.2 %<" in weed
+    assert ">0.2 %<" not in page.partition('aria-label="soil"')[2].partition("</svg>")[0]
+    assert re.findall(r">(2026[^<]*)<", weed)
