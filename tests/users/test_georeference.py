@@ -223,7 +223,7 @@ def test_every_store_opens_without_a_word(tmp_path: Path, weights: Path) -> None
                 warnings.simplefilter("error")
                 content = xr.open_zarr(store)
             for name, array in content.data_vars.items():
-                axes = [axis for axis in array.dims if not str(axis).startswith(("quicklook", "rgb", "class"))]
+                axes = [axis for axis in array.dims if not str(axis).startswith(("quicklook", "rgb"))]
                 assert set(axes) <= set(content.coords), (product, name)
                 assert all("units" in content[axis].attrs for axis in axes), (product, name)
     values = opened(run, "mosaic")["values"]
