@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from flows.survey.run import SurveyRun
+from pipeline.ground.field_scale import M2_PER_HECTARE
 from pipeline.ground.georeference import class_areas_m2, crs_name, pixel_side_m
 from storage.arrays.class_maps import ClassMap
-from storage.arrays.ground_maps import M2_PER_HECTARE, GroundMap
+from storage.arrays.ground_maps import GroundMap
 
 
 def posed_findings(drawn: GroundMap) -> dict[str, Any]:
