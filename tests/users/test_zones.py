@@ -178,7 +178,7 @@ def test_a_visit_with_zones_keeps_the_memory_of_the_rest(
 ) -> None:
     """What was known outside of the area is known afterwards, and no look counts there."""
     first = surveyed_png(tmp_path)
-    second = survey_png(tmp_path, visit="second", prior="latest", accuracy=False, **NARROW, **zones)
+    second = survey_png(tmp_path, visit="second", prior="latest", accuracy=False, **zones)
     before, after = (BeliefStore(tmp_path / one.receipt["products"]["belief"]).read() for one in (first, second))
     away = drawn(tmp_path, second).classes == UNLABELLED
     assert away.any()
