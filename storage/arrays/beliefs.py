@@ -25,6 +25,7 @@ from storage.arrays.layout import (
     open_group,
     read_array,
     whole_shards,
+    write_counts,
     write_image,
 )
 
@@ -40,6 +41,7 @@ def create_belief(path: Path, shape: tuple[int, int], legend: ClassNames, *, gri
     """Begin a store for a field of (y, x) ``shape`` of which nothing is known yet."""
     names = {"class_names": list(legend.names), "class_colours": np.asarray(legend.colours).tolist()}
     group, place = create_placed_group(path, "belief", grid, shape, names)
+    write_counts(group, **{"class": len(legend.names)})
     about: dict[str, Any] = {
         "long_name": "natural logarithm of the probability of each class",
         "units": "1",

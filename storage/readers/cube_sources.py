@@ -132,6 +132,7 @@ class CubeSource:
     nodata: float | None = None
     geobox: GeoBox | None = None  # where (line, sample) lie on the earth
     bad_bands: tuple[int, ...] = ()  # that the files themselves call bad, from 0
+    gaps: bool = False  # some pixels are transparent or masked: NaN
     headers: Mapping[str, str] = field(default_factory=dict)  # file name -> its text
     root: Path | None = None  # of a store whose files' names count, too
     by_names: tuple[tuple[int, ...], ...] = ()  # numbers in the files' names, where lines or times follow from them

@@ -45,7 +45,12 @@ def place_of_file(file: Any) -> tuple[GeoBox | None, Notes]:
         return None, (told,) if other else ()
     if file.crs is None:
         return None, ("it has a transform and no CRS, so that its place on the earth is not known (gdal_edit -a_srs)",)
-    crs = pyproj.CRS.from_wkt(file.crs.to_wkt())
+    if not file.transform.determinant:
+        return None, ("its transform makes a line of its pixels; its place on the earth is not known",)
+    try:
+        crs = pyproj.CRS.from_wkt(file.crs.to_wkt())
+    except Exception as error:  # of PROJ and of GDAL
+        return None, (f"its CRS cannot be read ({error}); its place on the earth is not known",)
     if not (crs.is_projected or crs.is_geographic):
         return None, (f"its CRS, {crs.name!r}, is none of the earth; its place is not known",)
     code = crs.to_epsg()  # the same CRS by whichever words a file has it

@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.errors import SceneError
-from storage.arrays.layout import create_array, create_group, image_spec, write_bands, write_small
+from storage.arrays.georeference import ON_THE_MAP, map_attributes, write_grid_mapping
+from storage.arrays.layout import create_array, create_group, image_spec, write_bands, write_counts, write_small
 from storage.arrays.quicklooks import LineThumbnail, write_quicklook
 from storage.readers.cube_sources import BLOCK_LINES, Bands, CubeSource, LineFacts, check_cube_source
 from storage.readers.envi_cubes import DATA_ENDINGS, find_envi_pair, open_envi_cube
@@ -134,7 +135,8 @@ def _raster_source(address: str | Path) -> CubeSource:
         return _tiff_source(path, open_tiff_rows(path))
     raster, _ = load_frame_or_raster(address)
     values = raster.three_axes(path)
-    if raster.void is not None and raster.void.any():
+    gaps = raster.void is not None and bool(raster.void.any())
+    if raster.void is not None and gaps:
         values = _with_gaps(values, raster.void)
     native = values.dtype.newbyteorder("=")
     return CubeSource(
@@ -148,6 +150,7 @@ def _raster_source(address: str | Path) -> CubeSource:
         nodata=raster.nodata,
         geobox=raster.geobox,
         bad_bands=raster.bad_bands,
+        gaps=gaps,
         notes=raster.notes,
     )
 
@@ -174,6 +177,7 @@ def _tiff_source(path: Path, rows: TiffRows) -> CubeSource:
         nodata=rows.nodata,
         geobox=rows.geobox,
         bad_bands=rows.bad_bands,
+        gaps=gaps,
         notes=rows.notes,
     )
 
@@ -229,8 +233,7 @@ def write_ingested_cube(
     looked_at = source.dtype.kind in "ui" and source.dtype not in (np.uint8, np.uint16)
     begin = 0.3 if looked_at else 0.0
     group = create_group(folder / "cube.zarr", f"{KIND} {name}", _attributes(source, files, name))
-    coordinates = _write_coordinates(group, source)
-    about = {"long_name": "numbers of the file", "units": "1", **({"coordinates": coordinates} if coordinates else {})}
+    about: dict[str, Any] = {"long_name": "numbers of the file", "units": "1", **_write_coordinates(group, source)}
     array = create_array(group, "values", image_spec(("line", "sample", "band"), source.shape, kind.str), about)
     thumbnail = LineThumbnail(
         source.shape, source.bands.wavelength_nm, dark=source.dark, white=source.white, panel=source.panel
@@ -287,13 +290,18 @@ def _attributes(source: CubeSource, files: Sequence[SourceFile], name: str) -> d
         facts["nodata"] = source.nodata
     if source.position is not None:
         facts["by_mirror"] = True
+    if source.bad_bands:
+        facts["bad_bands"] = list(source.bad_bands)
+    if source.geobox is not None:
+        facts |= {**map_attributes(source.geobox), "spatial:dimensions": ["line", "sample"]}
     if source.lines.first_stamp_us is not None:
         facts["first_stamp_us"] = source.lines.first_stamp_us
     return facts
 
 
-def _write_coordinates(group: zarr.Group, source: CubeSource) -> str:
-    """Store what is known of lines and bands, and the reference frames; give the coordinates' names."""
+def _write_coordinates(group: zarr.Group, source: CubeSource) -> dict[str, str]:
+    """Store what is known of lines, bands and place, and the reference frames; give the attributes that name it."""
+    write_counts(group, line=source.shape[0], sample=source.shape[1])
     names: list[str] = []
     if source.bands.wavelength_nm is not None:
         names.append(write_bands(group, source.bands.wavelength_nm, source.bands.fwhm_nm))
@@ -308,7 +316,11 @@ def _write_coordinates(group: zarr.Group, source: CubeSource) -> str:
             write_small(group, name, ("line",), np.asarray(values), about)
             names.append(name)
     _write_references(group, source)
-    return " ".join(names)
+    placed = {} if source.geobox is None else ON_THE_MAP
+    if source.geobox is not None:
+        write_grid_mapping(group, source.geobox)
+        names.append(ON_THE_MAP["coordinates"])
+    return {**placed, **({"coordinates": " ".join(names)} if names else {})}
 
 
 def _write_references(group: zarr.Group, source: CubeSource) -> None:

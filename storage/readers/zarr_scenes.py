@@ -170,6 +170,7 @@ def _source(
         flat=_small(known, "flat", frame),
         position=position,
         nodata=void if void is not None else fill,
+        bad_bands=tuple(int(band) for band in attributes.get("bad_bands", ())) if own else (),
         root=path,
         notes=notes,
     )

@@ -158,7 +158,10 @@ def test_patches_are_of_a_pass_with_its_own_registration(plain: bool) -> None:
     """Of the scan, or of the fine sweeps; what was found of the other pass's pointing has no part in them."""
     stores = {name: StageRef(name, name, Path(name)) for name in ("seen", "scan", "fine", "of scan", "of fine")}
     run: Any = SimpleNamespace(
-        grid=SceneGrid(96, 128, 8, 4), settings=SimpleNamespace(kernel="nearest"), plan=SimpleNamespace(plain=plain)
+        grid=SceneGrid(96, 128, 8, 4),
+        settings=SimpleNamespace(kernel="nearest"),
+        plan=SimpleNamespace(plain=plain),
+        place_key={},
     )
     inputs = STAGES["cut_patches"].needed(run, *stores.values()).inputs
     assert [ref.stage for ref in inputs] == (["seen", "scan", "of scan"] if plain else ["seen", "fine", "of fine"])

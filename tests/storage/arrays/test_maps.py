@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 import zarr
+from affine import Affine
 from odc.geo.geobox import GeoBox
 from pyproj import CRS
 
@@ -133,9 +134,10 @@ def write(path: Path, geobox: GeoBox) -> Path:
 
 @pytest.mark.parametrize("epsg", [32632, 32756, 5041, 3034])
 @pytest.mark.parametrize("resolution", [0.03, 0.007, 1 / 3])
-def test_plain_xarray_sees_the_same_geobox(tmp_path: Path, epsg: int, resolution: float) -> None:
+@pytest.mark.parametrize("turn", [0, 30])
+def test_plain_xarray_sees_the_same_geobox(tmp_path: Path, epsg: int, resolution: float, turn: float) -> None:
     """Opened without this project's code, dataset and image have the grid that was written, to the last bit."""
-    geobox = box(epsg, resolution)
+    geobox = box(epsg, resolution).rotate(turn) if turn else box(epsg, resolution)
     path = write(tmp_path / "a.zarr", geobox)
     with xr.open_zarr(path, consolidated=False) as content:
         assert content.odc.geobox == geobox
@@ -159,6 +161,15 @@ def test_coordinates_and_grid_mapping_are_cfs(tmp_path: Path) -> None:
         assert [float(word) for word in mapping["GeoTransform"].split()][1] == 0.03
         found = content["height"]
         assert "spatial_ref" in found.coords
+
+
+def test_degrees_have_their_own_words(tmp_path: Path) -> None:
+    """Of a geographic CRS the axes are longitude and latitude, and the grid is read as it was written."""
+    geobox = GeoBox((20, 30), Affine(1e-5, 0, 7.5, 0, -1e-5, 52), "EPSG:4326")
+    with xr.open_zarr(write(tmp_path / "a.zarr", geobox), consolidated=False) as content:
+        assert content.x.attrs["standard_name"] == "longitude"
+        assert (content.y.attrs["standard_name"], content.y.attrs["units"]) == ("latitude", "degrees_north")
+        assert content.odc.geobox == load_geobox(tmp_path / "a.zarr") == geobox
 
 
 def test_geozarr_attributes_say_the_same_as_the_grid() -> None:

@@ -1,0 +1,89 @@
+"""Areas and coarser grids of scenes that have a place on the earth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyproj
+import pytest
+from affine import Affine
+from hypothesis import given
+from hypothesis import strategies as st
+from odc.geo.geobox import GeoBox
+
+from pipeline.geometry.grid import SceneGrid, seat_pixels
+from pipeline.ground.georeference import class_areas_m2, georeference_record, pixel_side_m, zoomed_out
+
+pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")
+PLACES = {32632: (8.0, 51.0), 3857: (8.0, 60.0), 3035: (8.0, 51.0), 4326: (8.0, 51.0), 2263: (-74.0, 40.7)}
+
+
+def box(epsg: int, step: float, turn: float = 20, shape: tuple[int, int] = (300, 400)) -> GeoBox:
+    """A turned grid at a usual place of its CRS."""
+    left, top = pyproj.Transformer.from_crs(4326, epsg, always_xy=True).transform(*PLACES[epsg])
+    cos, sin = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+    return GeoBox(shape, Affine(step * cos, step * sin, left, step * sin, -step * cos, top), f"EPSG:{epsg}")
+
+
+@pytest.mark.parametrize(("epsg", "step"), [(32632, 10.0), (3857, 10.0), (3035, 10.0), (4326, 1e-4), (2263, 30.0)])
+def test_areas_are_those_of_the_ellipsoid(epsg: int, step: float) -> None:
+    """In metres, feet and degrees, of any projection: the whole grid is as large as its outline on the ellipsoid."""
+    geobox = box(epsg, step)
+    rows, columns = geobox.shape
+    share = np.linspace(0, 1, 2000)
+    nothing, whole = np.zeros(2000), np.ones(2000)
+    column = np.concatenate([share, whole, 1 - share, nothing]) * columns
+    row = np.concatenate([nothing, share, whole, 1 - share]) * rows
+    a, b, c, d, e, f = geobox.affine[:6]
+    to_degrees = pyproj.Transformer.from_crs(epsg, 4326, always_xy=True)
+    places = to_degrees.transform(a * column + b * row + c, d * column + e * row + f)
+    ellipsoid = pyproj.CRS.from_epsg(epsg).get_geod()
+    assert ellipsoid is not None
+    outline = abs(ellipsoid.polygon_area_perimeter(*places)[0])
+    assert class_areas_m2(geobox, np.zeros((rows, columns), np.uint8), 1)[0] == pytest.approx(outline, rel=1e-5)
+    assert pixel_side_m(geobox) == pytest.approx(np.sqrt(outline / rows / columns), rel=1e-3)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_classes_share_the_ground(seed: int) -> None:
+    """Areas of all classes and of what has none add up, and no class has any of another's."""
+    geobox, rng = box(32632, 0.05, shape=(9, 11)), np.random.default_rng(seed)
+    classes = rng.choice(np.array([0, 1, 2, 255], np.uint8), (9, 11))
+    areas = class_areas_m2(geobox, classes, 3)
+    whole = class_areas_m2(geobox, np.zeros((9, 11), np.uint8), 1)[0]
+    shares = [np.mean(classes == number) for number in range(3)]
+    np.testing.assert_allclose(areas, np.array(shares) * whole, rtol=1e-6, atol=1e-12)
+
+
+@given(st.integers(1, 70), st.integers(1, 70), st.sampled_from([1, 2, 4, 8]), st.floats(-180, 180))
+def test_a_coarser_grid_begins_at_the_same_corner(height: int, width: int, factor: int, turn: float) -> None:
+    """Pixel (y, x) of it begins where pixel (factor y, factor x) of the fine grid does, turned or not."""
+    fine = box(32632, 0.05, turn, (height, width))
+    shape = -(-height // factor), -(-width // factor)
+    coarse = zoomed_out(fine, factor, shape)
+    assert (tuple(coarse.shape), coarse.crs) == (shape, fine.crs)
+    for y, x in ((0, 0), (shape[0] - 1, shape[1] - 1)):
+        there, wanted = (
+            np.array([t.a * column + t.b * row + t.c, t.d * column + t.e * row + t.f])
+            for t, row, column in ((coarse.affine, y, x), (fine.affine, y * factor, x * factor))
+        )
+        np.testing.assert_allclose(there, wanted, atol=1e-6)
+
+
+def test_a_scene_without_a_place_has_none_in_its_keys() -> None:
+    """So that its stores are found again; with one, CRS and transform are there."""
+    assert georeference_record(None) == {}
+    record = georeference_record(box(32632, 0.5, 0))["georeference"]
+    assert (record["crs"], record["transform"][0]) == ("EPSG:32632", 0.5)
+
+
+@given(st.integers(1, 40), st.integers(1, 40), st.integers(1, 9), st.integers(1, 3), st.integers(0, 2**32 - 1))
+def test_seats_hold_every_pixel_once(height: int, width: int, patch: int, factor: int, seed: int) -> None:
+    """What lies at a pixel of the scene lies there in its seat; beyond the scene is nothing."""
+    grid = SceneGrid(height, width, patch, factor)
+    image = np.random.default_rng(seed).random((height, width)) < 0.5
+    seats = seat_pixels(grid, image)
+    assert seats.sum() == image.sum()
+    numbers = np.arange(len(seats))
+    for (y, x), seat in zip(grid.seat_origin(numbers), seats, strict=True):
+        part = image[y : y + patch, x : x + patch]
+        np.testing.assert_array_equal(seat[: part.shape[0], : part.shape[1]], part)
