@@ -203,8 +203,8 @@ def test_a_georeferenced_scene_takes_polygons_by_its_transform(
     published = survey_png(tmp_path / "archive", **flags, **{"zones.area": path, "zones.plots": path})
     rows, columns = np.nonzero(drawn(tmp_path / "archive", published).classes != UNLABELLED)
     assert (rows.min(), rows.max(), columns.min(), columns.max(), len(rows)) == (10, 69, 20, 99, 4800)
-    assert published.receipt["plots"][0]["area_m2"] == pytest.approx(48)
-    assert published.receipt["zones"]["kept_m2"] == pytest.approx(48)
+    assert published.receipt["plots"][0]["area_m2"] == pytest.approx(48, rel=2e-3)
+    assert published.receipt["zones"]["kept_m2"] == pytest.approx(48, rel=2e-3)
 
 
 def test_a_zone_of_the_whole_field_changes_no_bit(survey_png: Survey, surveyed_png: Survey, tmp_path: Path) -> None:
