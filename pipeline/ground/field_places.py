@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.ground.field_scale import FieldScale, scale_of_angles, scale_of_pixels, scale_of_view
+from pipeline.ground.georeference import pixel_rows_m2, pixel_side_m
 from pipeline.ground.map_grid import GroundGrid
 from pipeline.ground.view import GroundView, pixel_places
 from pipeline.lazy import deferred
@@ -111,22 +112,11 @@ class PlacedPicture:
         return shapely.affinity.affine_transform(shape, (~self.geobox.affine).to_shapely())
 
     def pixel_areas_m2(self, rows: slice, columns: slice) -> Floats | None:
-        """The same for all where the CRS is projected; of degrees by row, on the ellipsoid."""
-        size = rows.stop - rows.start, columns.stop - columns.start
-        if not self.crs.is_geographic:
-            metres = self.crs.axis_info[0].unit_conversion_factor
-            return np.full(size, abs(self.geobox.affine.determinant) * metres**2)
-        geod, row = self.crs.get_geod(), np.arange(rows.start, rows.stop)
-        assert geod is not None
-        cells = [self._on_map(shapely.box(columns.start, one, columns.start + 1, one + 1)) for one in row]
-        areas = np.array([abs(geod.geometry_area_perimeter(cell)[0]) for cell in cells])
-        return np.broadcast_to(areas[:, None], size).copy()
+        """Of the ellipsoid, whatever the map's scale."""
+        return np.stack(list(pixel_rows_m2(self.geobox[rows, columns])))
 
     def scale(self, ifov_rad: float) -> FieldScale:
-        rows, columns = self.shape
-        middle = self.pixel_areas_m2(slice(rows // 2, rows // 2 + 1), slice(columns // 2, columns // 2 + 1))
-        assert middle is not None
-        return scale_of_pixels(self.shape, ifov_rad, float(np.sqrt(middle[0, 0])))
+        return scale_of_pixels(self.shape, ifov_rad, pixel_side_m(self.geobox))
 
 
 @dataclass(frozen=True)

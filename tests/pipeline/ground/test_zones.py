@@ -122,7 +122,9 @@ def test_a_georeferenced_picture_takes_polygons_by_its_transform(turn: float) ->
     found = pixels_inside([on_field(field, place.crs, place)], SHAPE)
     assert found[20:50, 10:30].all()
     assert found.sum() == 600
-    assert place.pixel_areas_m2(slice(0, 2), slice(0, 3)) == pytest.approx(np.full((2, 3), 0.25))
+    assert place.pixel_areas_m2(slice(0, 2), slice(0, 3)) == pytest.approx(
+        np.full((2, 3), 0.25), rel=2e-3
+    )  # of the ground, not of the map
 
 
 def test_pixels_of_degrees_have_their_area_on_the_ellipsoid() -> None:
