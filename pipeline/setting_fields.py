@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import Field, field, fields
 from functools import partial
 from typing import Any, Literal
@@ -67,3 +68,9 @@ def check_stated(part: Any, place: str) -> None:
     """Refuse a dataclass with a number out of range or not finite; messages name it as ``place.name``."""
     for name, words in misfits(part):
         raise SettingsError(f"{place}.{name} {words}")
+
+
+def numbers_of(item: object) -> Sequence[object]:
+    """The numbers that one word of a list stands for: ``4-7`` for four of them."""
+    found = re.fullmatch(r"(\d{1,5})-(\d{1,5})", str(item).strip())
+    return [item] if found is None else range(int(found[1]), int(found[2]) + 1)

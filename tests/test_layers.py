@@ -53,7 +53,6 @@ Documented = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
 IN_FUNCTIONS = {  # file -> packages that a function of it imports, and why no file's head does
     "flows/publish/survey_command.py": ("PIL", "for Prefect's pages alone"),
     "flows/survey/prefect_engine.py": ("prefect", "that it cannot be imported is told, and the survey runs plain"),
-    "storage/arrays/ground_maps.py": ("odc xarray", "the import registers the accessor, for maps on the ground alone"),
     "storage/parallel/cluster_work.py": ("dask", "half a second, for crews of processes alone"),
     "storage/remote/object_stores.py": ("obstore", "an extra: that it is missing is told"),
 }

@@ -13,6 +13,7 @@ from flows.cli.app import ArchiveName, AsJson, parse_numbers, stderr
 from flows.terminal.processes import DONE
 from flows.terminal.progress import StageProgress, print_json
 from pipeline.errors import SceneError
+from pipeline.ground.georeference import georeference_record
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.archive.staging import check_name, file_hash
@@ -127,6 +128,9 @@ def _key(name: str | None, source: CubeSource, files: Sequence[SourceFile]) -> d
         "references": [source.dark, source.white],
         "wavelength_nm": None if centres is None else centres.tolist(),
         "fwhm_nm": None if widths is None else widths.tolist(),
+        **georeference_record(source.geobox),
+        **({"bad_bands": source.bad_bands} if source.bad_bands else {}),
+        **({"gaps": True} if source.gaps else {}),
         **({"numbers_in_names": source.by_names} if source.by_names else {}),
     }
 

@@ -13,6 +13,7 @@ from rich.markup import escape
 
 from flows.terminal.progress import on_stderr
 from pipeline.errors import SettingsError
+from pipeline.setting_fields import numbers_of
 
 VERBS = {  # by what is typed: the module of the function, loaded once it is asked for
     "survey": "flows.cli.survey_verbs",
@@ -105,8 +106,8 @@ def parse_numbers(text: str | None, flag: str) -> list[float] | None:
 
 
 def parse_wholes(text: str | None, flag: str) -> list[int] | None:
-    """Whole numbers with commas; SettingsError naming the flag."""
+    """Whole numbers with commas, of which 4-7 is a run; SettingsError naming the flag."""
     try:
-        return None if text is None else [int(part) for part in split_list(text)]
+        return None if text is None else [int(str(one)) for part in split_list(text) for one in numbers_of(part)]
     except ValueError:
         raise SettingsError(f"{flag} expects whole numbers with commas, got {text!r}") from None

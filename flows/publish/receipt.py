@@ -105,7 +105,7 @@ class Receipt(TypedDict):
     memory: NotRequired[dict[str, Any]]  # what became of what was remembered, where the map goes on from an earlier run
     pointing: NotRequired[dict[str, Any]]  # only where the mirror may look beside the plan
     lines: NotRequired[dict[str, Any]]  # sweeps with lines lost, repeated, out of order, late or invalid
-    ground: NotRequired[dict[str, Any]]  # only with a pose: grid and hectares
+    ground: NotRequired[dict[str, Any]]  # only with a pose or a placed scene: grid, hectares
     zones: NotRequired[dict[str, Any]]  # only where zones leave something out: what is kept
     plots: NotRequired[list[dict[str, Any]]]  # only where plots are given: ground, classes, confidence of each
     pixels: NotRequired[dict[str, int]]  # only where some have no value, no reading or no class: how many

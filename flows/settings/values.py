@@ -15,7 +15,7 @@ from pydantic import ByteSize, PlainValidator, TypeAdapter, ValidationError
 
 from pipeline.errors import BudgetError, SettingsError
 from pipeline.planning.plain_scans import MIOU
-from pipeline.setting_fields import number_words
+from pipeline.setting_fields import number_words, numbers_of
 from pipeline.simulator.effects.probe import Unit
 from pipeline.simulator.effects.registry import BY_NAME
 from pipeline.simulator.scenes.farm.farm_scene import refuse_removed
@@ -177,10 +177,10 @@ def parse_tolerance(value: object) -> Tolerance:
 
 
 def parse_bands(value: object) -> tuple[int, ...]:
-    """Band numbers counted from 0, none of them twice; a list or text with commas."""
-    bands = [to_whole(item) for item in _items(value)]
+    """Band numbers counted from 0, none of them twice; a list or text with commas, of which 4-7 is a run."""
+    bands = [to_whole(number) for item in _items(value) for number in numbers_of(item)]
     if not bands or any(band is None or band < 0 for band in bands):
-        raise ValueError(f"must list band numbers counted from 0, such as 0,1,2; got {value!r}")
+        raise ValueError(f"must list band numbers counted from 0, such as 0,1,2 or 0-2; got {value!r}")
     if len(set(bands)) != len(bands):
         raise ValueError(f"names a band twice: {value!r}; name each once")
     return tuple(int(band or 0) for band in bands)

@@ -61,6 +61,7 @@ def scene_of_file(file: SceneFile, camera: LineCamera) -> RasterScene:
         class_names=file.class_names,
         class_colours=file.class_colours,
         key=file.light_hash,
+        geobox=file.geobox,
     )
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,9 @@ from pipeline.errors import SceneError
 from pipeline.rectify.calibration.calibrate import calibrate
 from pipeline.source import References
 from storage.readers.scene_toml import BandWavelengths
+
+if TYPE_CHECKING:
+    from odc.geo.geobox import GeoBox
 
 DEFLATE_RATIO = 1100  # bytes that one byte of zlib's can stand for, rounded up: it is 1032
 MOST_RATIO = 10_000  # by which any packed numbers may exceed their bytes
@@ -76,6 +79,9 @@ class Raster:
     indices: NDArray[np.uint8] | None = None  # (y, x) of an image that numbers its colours
     known: BandWavelengths | None = None  # what the file says of its bands
     files: tuple[Path, ...] = ()  # that it was read from, where that is more than the one named
+    geobox: GeoBox | None = None  # where its pixels lie on the earth
+    void: NDArray[np.bool_] | None = None  # (y, x) pixels that are transparent or masked: they have no value
+    bad_bands: tuple[int, ...] = ()  # that the file itself calls bad, from 0
 
     def three_axes(self, path: Path) -> NDArray[Any]:
         """(y, x, band) values; two axes are one band (SceneError: it has others)."""
@@ -124,6 +130,9 @@ class CubeSource:
     flat: NDArray[np.float32] | None = None  # (sample, band) response left over by the white frame
     position: NDArray[np.float64] | None = None  # (line, 2) mirror, where the light falls off with its tilt
     nodata: float | None = None
+    geobox: GeoBox | None = None  # where (line, sample) lie on the earth
+    bad_bands: tuple[int, ...] = ()  # that the files themselves call bad, from 0
+    gaps: bool = False  # some pixels are transparent or masked: NaN
     headers: Mapping[str, str] = field(default_factory=dict)  # file name -> its text
     root: Path | None = None  # of a store whose files' names count, too
     by_names: tuple[tuple[int, ...], ...] = ()  # numbers in the files' names, where lines or times follow from them

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from pipeline.errors import SceneError
 from pipeline.rig.camera.camera_texts import LONGEST_LINE, FrameIndex, LineTimes, parse_frame_index, times_of_lines
 from storage.readers.cube_sources import MOST_MISSING, Bands, CubeSource, LineFacts
 from storage.readers.envi_cubes import EnviCube, find_envi_pair, open_envi_cube
+from storage.readers.raster_tags import bad_bands, place_of_envi
 
 _PART = re.compile(r"raw_(\d{1,12})(\.[A-Za-z]{1,4})?", re.IGNORECASE)
 _INDEX = re.compile(r"frameindex_(\d{1,12})\.txt", re.IGNORECASE)
@@ -50,7 +51,9 @@ def open_envi_source(path: Path) -> CubeSource:
     header, data = find_envi_pair(path)
     parts, notes = [CubePart(0, open_envi_cube(header))], list[str]()
     lines = parts[0].stop + _lost_at_end(parts, notes)
-    return _source(data.name, parts, lines, None, notes=(*parts[0].cube.notes, *notes))
+    source = _source(data.name, parts, lines, None, notes=(*parts[0].cube.notes, *notes))
+    geobox, where = place_of_envi(parts[0].cube.header.fields, data, source.shape[:2])
+    return replace(source, geobox=geobox, notes=(*source.notes, *where))
 
 
 def open_headwall_cube(folder: Path) -> CubeSource:
@@ -128,6 +131,7 @@ def _source(
         lines=_line_facts(parts, lines, times),
         bands=bands,
         nodata=first.nodata,
+        bad_bands=bad_bands(first.fields.get("bbl"), values.shape[2]),
         headers={header.name: header.read_bytes().decode("utf-8", errors="replace") for header in headers},
         notes=notes,
         by_names=by_names,

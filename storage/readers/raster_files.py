@@ -1,7 +1,7 @@
-"""Arrays out of image, TIFF, array and MATLAB files, with what the file says of its colours.
+"""Arrays out of image, TIFF, array and MATLAB files, with what the file says of its colours, its place and its gaps.
 
-TIFF goes through rasterio, some rows at a time, or whole through tifffile where that is all there is. Several images of
-one size in a file are its bands, in their order: so cameras that know no bands write cubes.
+TIFF goes through rasterio, some rows at a time. Several images of one size in a file are its bands, in their order: so
+cameras that know no bands write cubes. Transparent pixels have no value.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,10 +34,14 @@ from storage.readers.cube_sources import (
     check_numbers,
 )
 from storage.readers.envi_cubes import open_envi_cube
+from storage.readers.raster_tags import bad_bands, bad_bands_said, bands_said, place_of_envi, place_of_file, void_pixels
 from storage.readers.scene_toml import BandWavelengths
 
+if TYPE_CHECKING:
+    from odc.geo.geobox import GeoBox
+
 TIFF_ENDINGS = (".tif", ".tiff")
-_NODATA_TAG = 42113  # GDAL's
+ALPHA_NOTE = "its alpha channel says where there are pixels, and is no band"
 _ROWS = 64  # about as many as are read at a time
 
 
@@ -52,6 +56,10 @@ class TiffRows:
     assumed_nm: tuple[float, ...] | None
     nodata: float | None
     notes: tuple[str, ...]
+    alpha: int | None = None  # the channel that says where there are pixels, from 0
+    geobox: GeoBox | None = None
+    known: BandWavelengths | None = None
+    bad_bands: tuple[int, ...] = ()
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Rows ``start`` to ``stop`` (SceneError where they are damaged)."""
@@ -63,38 +71,62 @@ class TiffRows:
                 planes.append(file.read([band + 1 for band in bands], window=rows))
         return np.ascontiguousarray(np.moveaxis(np.concatenate(planes), 0, -1), self.dtype)
 
+    def void(self, start: int, stop: int) -> NDArray[np.bool_] | None:
+        """(y, x) of rows ``start`` to ``stop`` that are transparent or masked; None where the file knows neither."""
+        rasterio = importlib.import_module("rasterio")
+        with _tiff(rasterio, self.path, str(self.path)) as file:
+            return void_pixels(file, rasterio.windows.Window(0, start, self.shape[1], stop - start), self.alpha)
 
-def open_tiff_rows(path: Path) -> TiffRows | None:
-    """Open a TIFF to be read some rows at a time; None where rasterio, which can do so, is not installed.
+
+def open_tiff_rows(path: Path) -> TiffRows:
+    """Open a TIFF to be read some rows at a time.
 
     Raises SceneError: the file is missing or damaged, or claims more than its bytes can mean.
     """
-    try:
-        rasterio = importlib.import_module("rasterio")
-    except ImportError:
-        return None
+    rasterio = importlib.import_module("rasterio")
     if not path.is_file():
         raise SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
     with _tiff(rasterio, path, str(path)) as file:
         images, notes = _images(rasterio, path, file)
-        keep, assumed, more = _named_bands([kind.name for kind in file.colorinterp])
+        names = [kind.name for kind in file.colorinterp]
+        keep, assumed, more = _named_bands(names)
+        geobox, where = place_of_file(file)
+        known, told = bands_said(file, keep, path) if len(images) == 1 else (None, ())
         kind = np.result_type(*(np.dtype(file.dtypes[band]) for band in keep or [0]))
         bands = tuple((image, tuple(keep)) for image in images)
         shape = (file.height, file.width, len(keep) * len(images))
         check_claim(path, math.prod(shape) * kind.itemsize, path.stat().st_size)
         block = math.prod(max(file.block_shapes)) * file.count * kind.itemsize
         check_memory(path, block + min(_ROWS, shape[0]) * shape[1] * shape[2] * kind.itemsize)
-        assumed = assumed if len(images) == 1 else None
-        return TiffRows(path, shape, kind, bands, assumed, file.nodata, (*notes, *more))
+        return TiffRows(
+            path,
+            shape,
+            kind,
+            bands,
+            assumed_nm=assumed if len(images) == 1 else None,
+            nodata=file.nodata,
+            notes=(*notes, *more, *where, *told),
+            alpha=names.index("alpha") if "alpha" in names else None,
+            geobox=geobox,
+            known=known,
+            bad_bands=bad_bands_said(file, keep) if len(images) == 1 else (),
+        )
 
 
 def read_tiff(path: Path) -> Raster:
     """Read a whole TIFF (SceneError as for :func:`open_tiff_rows`)."""
     rows = open_tiff_rows(path)
-    if rows is None:
-        return _read_plain_tiff(path)
     check_memory(path, 2 * math.prod(rows.shape) * rows.dtype.itemsize)
-    return Raster(rows.read(0, rows.shape[0]), rows.assumed_nm, rows.nodata, rows.notes)
+    return Raster(
+        rows.read(0, rows.shape[0]),
+        rows.assumed_nm,
+        rows.nodata,
+        rows.notes,
+        known=rows.known,
+        geobox=rows.geobox,
+        void=rows.void(0, rows.shape[0]),
+        bad_bands=rows.bad_bands,
+    )
 
 
 def _images(rasterio: Any, path: Path, first: Any) -> tuple[list[str], tuple[str, ...]]:
@@ -129,7 +161,7 @@ def _named_bands(names: list[str]) -> tuple[list[int], tuple[float, ...] | None,
     Wavelengths are assumed only where the file names its bands red, green and blue, or grey.
     """
     keep = [index for index, name in enumerate(names) if name != "alpha"]
-    notes = ("alpha channel dropped",) if len(keep) < len(names) else ()
+    notes = (ALPHA_NOTE,) if len(keep) < len(names) else ()
     kinds = [names[index] for index in keep]
     assumed: tuple[float, ...] | None = None
     if kinds[:3] == ["red", "green", "blue"] and len(kinds) == 3:
@@ -139,32 +171,6 @@ def _named_bands(names: list[str]) -> tuple[list[int], tuple[float, ...] | None,
     elif kinds in (["gray"], ["palette"]):
         assumed = (GREY_NM,)
     return keep, assumed, notes
-
-
-def _read_plain_tiff(path: Path) -> Raster:
-    try:
-        tifffile = importlib.import_module("tifffile")
-    except ImportError as error:
-        raise SceneError(
-            f"{path} is a TIFF, which needs rasterio; pip install 'spectralzoom[geo]', or save it as .npy"
-        ) from error
-    with tifffile.TiffFile(path, _multifile=False) as file:  # headers may name other files
-        page = file.pages[0]
-        series = file.series[0]
-        check_claim(path, int(series.nbytes), path.stat().st_size)
-        check_memory(path, 2 * int(series.nbytes))
-        values, axes = series.asarray(), series.axes
-        rgb, extra = page.photometric.name == "RGB", [kind.name for kind in page.extrasamples or ()]
-        nodata = page.tags.valueof(_NODATA_TAG)
-    if values.ndim == 3 and axes.index("Y") == 1:
-        values = np.moveaxis(values, 0, -1)
-    count = 1 if values.ndim == 2 else values.shape[2]
-    names = ["red", "green", "blue"] if rgb else ["gray"]
-    names += ["alpha" if "ALPHA" in kind else "undefined" for kind in extra]
-    names += ["undefined"] * (count - len(names))
-    void = None if nodata is None else float(nodata)
-    keep, assumed, notes = _named_bands(names[:count])
-    return Raster(values.reshape(*values.shape[:2], count)[..., keep], assumed, void, notes)
 
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp")
@@ -228,7 +234,18 @@ def _read(path: Path, ending: str, variable: str | None, dims: int) -> Raster:
     cube, known = open_envi_cube(path), None
     if cube.header.wavelength_nm is not None:
         known = BandWavelengths(cube.header.wavelength_nm, cube.header.fwhm_nm, f"wavelengths from {path}")
-    return Raster(cube.values, None, cube.header.nodata, cube.notes, known=known, files=(path, cube.path))
+    header, (lines, samples, bands) = cube.header, cube.values.shape
+    geobox, notes = place_of_envi(header.fields, cube.path, (lines, samples))
+    return Raster(
+        cube.values,
+        None,
+        header.nodata,
+        (*cube.notes, *notes),
+        known=known,
+        files=(path, cube.path),
+        geobox=geobox,
+        bad_bands=bad_bands(header.fields.get("bbl"), bands),
+    )
 
 
 @contextmanager
@@ -278,10 +295,11 @@ def _from_pillow(image: Image.Image) -> Raster:
 
 def _colours(values: NDArray[Any], alpha: bool) -> Raster:
     notes: tuple[str, ...] = ()
+    void = values[..., -1] == 0 if alpha else None
     if alpha:
-        values, notes = values[..., :-1], ("alpha channel dropped",)
+        values, notes = values[..., :-1], (ALPHA_NOTE,)
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[..., 0]
     if values.ndim == 2:
-        return Raster(values, (GREY_NM,), notes=notes)
-    return Raster(values, RGB_NM if values.shape[2] == 3 else None, notes=notes)
+        return Raster(values, (GREY_NM,), notes=notes, void=void)
+    return Raster(values, RGB_NM if values.shape[2] == 3 else None, notes=notes, void=void)

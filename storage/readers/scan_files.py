@@ -24,13 +24,21 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.errors import SceneError
-from storage.arrays.layout import create_array, create_group, image_spec, write_bands, write_small
+from storage.arrays.georeference import ON_THE_MAP, map_attributes, write_grid_mapping
+from storage.arrays.layout import create_array, create_group, image_spec, write_bands, write_counts, write_small
 from storage.arrays.quicklooks import LineThumbnail, write_quicklook
 from storage.readers.cube_sources import BLOCK_LINES, Bands, CubeSource, LineFacts, check_cube_source
 from storage.readers.envi_cubes import DATA_ENDINGS, find_envi_pair, open_envi_cube
 from storage.readers.headwall_folders import find_reference, open_envi_source, open_headwall_cube
 from storage.readers.labels import load_frame_or_raster
-from storage.readers.raster_files import SCENE_ENDINGS, TIFF_ENDINGS, load_raster, open_tiff_rows, split_variable
+from storage.readers.raster_files import (
+    SCENE_ENDINGS,
+    TIFF_ENDINGS,
+    TiffRows,
+    load_raster,
+    open_tiff_rows,
+    split_variable,
+)
 from storage.readers.scene_toml import BandWavelengths, SceneSettings, find_scene_settings, settle_wavelengths
 from storage.readers.zarr_scenes import find_zarr_store, open_zarr_cube
 
@@ -123,21 +131,13 @@ def load_frame(address: str | Path) -> tuple[NDArray[np.float32], tuple[Path, ..
 
 def _raster_source(address: str | Path) -> CubeSource:
     path, _ = split_variable(address)
-    rows = open_tiff_rows(path) if path.suffix.lower() in TIFF_ENDINGS else None
-    if rows is not None:
-        return CubeSource(
-            name=path.name,
-            shape=rows.shape,
-            dtype=rows.dtype,
-            read=rows.read,
-            files=(path,),
-            lines=LineFacts(np.ones(rows.shape[0], np.bool_)),
-            bands=_raster_bands(path, rows.assumed_nm, None, rows.shape[2]),
-            nodata=rows.nodata,
-            notes=rows.notes,
-        )
+    if path.suffix.lower() in TIFF_ENDINGS:
+        return _tiff_source(path, open_tiff_rows(path))
     raster, _ = load_frame_or_raster(address)
     values = raster.three_axes(path)
+    gaps = raster.void is not None and bool(raster.void.any())
+    if raster.void is not None and gaps:
+        values = _with_gaps(values, raster.void)
     native = values.dtype.newbyteorder("=")
     return CubeSource(
         name=path.name,
@@ -148,8 +148,43 @@ def _raster_source(address: str | Path) -> CubeSource:
         lines=LineFacts(np.ones(values.shape[0], np.bool_)),
         bands=_raster_bands(path, raster.assumed_nm, raster.known, values.shape[2]),
         nodata=raster.nodata,
+        geobox=raster.geobox,
+        bad_bands=raster.bad_bands,
+        gaps=gaps,
         notes=raster.notes,
     )
+
+
+def _tiff_source(path: Path, rows: TiffRows) -> CubeSource:
+    """A TIFF as lines; of one with transparent or masked pixels they are float32, with NaN there."""
+    starts = range(0, rows.shape[0], BLOCK_LINES)
+    voids = (rows.void(start, min(start + BLOCK_LINES, rows.shape[0])) for start in starts)
+    gaps = any(void is not None and bool(void.any()) for void in voids)
+
+    def read(start: int, stop: int) -> NDArray[Any]:
+        void = rows.void(start, stop)
+        assert void is not None  # of a file with gaps
+        return _with_gaps(rows.read(start, stop), void)
+
+    return CubeSource(
+        name=path.name,
+        shape=rows.shape,
+        dtype=np.dtype(np.float32) if gaps else rows.dtype,
+        read=read if gaps else rows.read,
+        files=(path,),
+        lines=LineFacts(np.ones(rows.shape[0], np.bool_)),
+        bands=_raster_bands(path, rows.assumed_nm, rows.known, rows.shape[2]),
+        nodata=rows.nodata,
+        geobox=rows.geobox,
+        bad_bands=rows.bad_bands,
+        gaps=gaps,
+        notes=rows.notes,
+    )
+
+
+def _with_gaps(values: NDArray[Any], void: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """(y, x, band) values as float32, NaN in the (y, x) pixels that are void."""
+    return np.where(void[..., None], np.float32(np.nan), values.astype(np.float32))
 
 
 def _raster_bands(path: Path, assumed_nm: Sequence[float] | None, known: BandWavelengths | None, count: int) -> Bands:
@@ -198,8 +233,7 @@ def write_ingested_cube(
     looked_at = source.dtype.kind in "ui" and source.dtype not in (np.uint8, np.uint16)
     begin = 0.3 if looked_at else 0.0
     group = create_group(folder / "cube.zarr", f"{KIND} {name}", _attributes(source, files, name))
-    coordinates = _write_coordinates(group, source)
-    about = {"long_name": "numbers of the file", "units": "1", **({"coordinates": coordinates} if coordinates else {})}
+    about: dict[str, Any] = {"long_name": "numbers of the file", "units": "1", **_write_coordinates(group, source)}
     array = create_array(group, "values", image_spec(("line", "sample", "band"), source.shape, kind.str), about)
     thumbnail = LineThumbnail(
         source.shape, source.bands.wavelength_nm, dark=source.dark, white=source.white, panel=source.panel
@@ -256,13 +290,18 @@ def _attributes(source: CubeSource, files: Sequence[SourceFile], name: str) -> d
         facts["nodata"] = source.nodata
     if source.position is not None:
         facts["by_mirror"] = True
+    if source.bad_bands:
+        facts["bad_bands"] = list(source.bad_bands)
+    if source.geobox is not None:
+        facts |= {**map_attributes(source.geobox), "spatial:dimensions": ["line", "sample"]}
     if source.lines.first_stamp_us is not None:
         facts["first_stamp_us"] = source.lines.first_stamp_us
     return facts
 
 
-def _write_coordinates(group: zarr.Group, source: CubeSource) -> str:
-    """Store what is known of lines and bands, and the reference frames; give the coordinates' names."""
+def _write_coordinates(group: zarr.Group, source: CubeSource) -> dict[str, str]:
+    """Store what is known of lines, bands and place, and the reference frames; give the attributes that name it."""
+    write_counts(group, line=source.shape[0], sample=source.shape[1])
     names: list[str] = []
     if source.bands.wavelength_nm is not None:
         names.append(write_bands(group, source.bands.wavelength_nm, source.bands.fwhm_nm))
@@ -277,7 +316,11 @@ def _write_coordinates(group: zarr.Group, source: CubeSource) -> str:
             write_small(group, name, ("line",), np.asarray(values), about)
             names.append(name)
     _write_references(group, source)
-    return " ".join(names)
+    placed = {} if source.geobox is None else ON_THE_MAP
+    if source.geobox is not None:
+        write_grid_mapping(group, source.geobox)
+        names.append(ON_THE_MAP["coordinates"])
+    return {**placed, **({"coordinates": " ".join(names)} if names else {})}
 
 
 def _write_references(group: zarr.Group, source: CubeSource) -> None:

@@ -9,7 +9,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,9 @@ from storage.readers.labels import Labels, load_frame_or_raster, load_labels
 from storage.readers.raster_files import split_variable
 from storage.readers.scan_files import known_bands, open_cube_source, reader_of
 from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings, settle_wavelengths
+
+if TYPE_CHECKING:
+    from odc.geo.geobox import GeoBox
 
 _LOOKED_AT = 1 << 20  # values, evenly spread, by which the range of a scene is told
 
@@ -43,6 +46,7 @@ class SceneFile:
     content_hash: str  # of everything above
     light_hash: str  # of values and wavelengths alone: labels do not change what a camera sees
     provenance: tuple[str, ...]  # one sentence for each thing assumed or left out
+    geobox: GeoBox | None = None  # where the pixels lie on the earth
 
     def with_labels(self, labels: NDArray[np.uint8], note: str) -> SceneFile:
         """The same scene with other labels; hash and provenance say so."""
@@ -70,7 +74,7 @@ def load_scene_file(
     raster, layout = load_frame_or_raster(path) if reader_of(path) == "raster" else (load_scan(path), None)
     settings = find_scene_settings(file)
     cube = raster.three_axes(file)
-    chosen = _chosen_bands(bands, settings, cube.shape[2], file)
+    chosen, bad_note = _chosen_bands(bands, settings, cube.shape[2], file, raster.bad_bands)
     light = settle_wavelengths(
         file,
         chosen,
@@ -81,13 +85,15 @@ def load_scene_file(
         known=raster.known,
     )
     nodata = raster.nodata if settings.nodata is None else settings.nodata
-    values, notes = _as_float(cube, chosen, nodata, file)
+    gaps, gap_notes = _gaps(raster)
+    values, notes = _as_float(cube, chosen, nodata, file, gaps)
     found, label_note = _labels(file, (cube.shape[0], cube.shape[1]), labels, settings)
     if layout is not None and labels is None and settings.labels is None:
         found, label_note = layout.labels, (layout.label_note,)
     count, widths = cube.shape[2], None if light.fwhm_nm is None else light.fwhm_nm.tolist()
-    some_bands = () if chosen == list(range(count)) else (f"bands {chosen} of {count}, counted from 0",)
-    stated = () if settings.nodata is None else (f"nodata {settings.nodata!r}",)
+    some_bands = () if chosen == list(range(count)) else (f"bands {bands_text(chosen)} of {count}, counted from 0",)
+    stated: tuple[str, ...] = () if settings.nodata is None else (f"nodata {settings.nodata!r}",)
+    stated += () if gaps is None else (f"void {hashlib.sha256(np.packbits(gaps).tobytes()).hexdigest()}",)
     light_hash = _digest(_content_hash(file, raster), variable, chosen, light.centre_nm.tolist(), widths, *stated)
     content_hash = light_hash
     if found is not None:
@@ -104,7 +110,8 @@ def load_scene_file(
         class_values=() if found is None else found.values,
         content_hash=content_hash,
         light_hash=light_hash,
-        provenance=(*some_bands, *raster.notes, light.origin, *notes, *label_note),
+        provenance=(*some_bands, *bad_note, *raster.notes, light.origin, *gap_notes, *notes, *label_note),
+        geobox=raster.geobox,
     )
 
 
@@ -132,6 +139,8 @@ def load_scan(address: str | Path) -> Raster:
         notes,
         known=known_bands(source),
         files=source.files,
+        geobox=source.geobox,
+        bad_bands=source.bad_bands,
     )
 
 
@@ -145,11 +154,39 @@ def _content_hash(file: Path, raster: Raster) -> str:
     return _digest(*((name, file_hash(entry)) for name, entry in zip(inside, files, strict=True)))
 
 
-def _chosen_bands(bands: Sequence[int] | None, settings: SceneSettings, count: int, path: Path) -> list[int]:
+def _gaps(raster: Raster) -> tuple[NDArray[np.bool_] | None, tuple[str, ...]]:
+    """(y, x) pixels that are transparent or masked, and a note; None where none is, or all are, which says nothing."""
+    if raster.void is None or not raster.void.any():
+        return None, ()
+    if raster.void.all():
+        return None, ("every pixel is transparent or masked, which is not believed",)
+    return raster.void, (f"{int(raster.void.sum())} transparent or masked pixels have no value, and no class in a map",)
+
+
+def bands_text(bands: Sequence[int]) -> str:
+    """Band numbers as ``--bands`` takes them: ``0-3,7``."""
+    runs: list[list[int]] = []
+    for band in bands:
+        if runs and band == runs[-1][1] + 1:
+            runs[-1][1] = band
+        else:
+            runs.append([band, band])
+    return ",".join(str(first) if first == last else f"{first}-{last}" for first, last in runs)
+
+
+def _chosen_bands(
+    bands: Sequence[int] | None, settings: SceneSettings, count: int, path: Path, bad: Sequence[int]
+) -> tuple[list[int], tuple[str, ...]]:
+    """Bands to use, and a note: without a word of the user's, those that the file itself does not call bad."""
     where = "--bands" if bands is not None else f"bands in {settings.path}"
     chosen = bands if bands is not None else settings.bands
     if chosen is None:
-        return list(range(count))
+        good = [band for band in range(count) if band not in set(bad)]
+        if len(good) == count or not good:
+            return list(range(count)), ()
+        everything = bands_text(range(count))
+        left_out = f"bands {bands_text(sorted(bad))} are left out: the file calls them bad; --bands {everything} takes"
+        return good, (f"{left_out} them all the same",)
     wrong = [band for band in chosen if not 0 <= band < count]
     if wrong or not chosen:
         raise SceneError(
@@ -158,21 +195,25 @@ def _chosen_bands(bands: Sequence[int] | None, settings: SceneSettings, count: i
         )
     if len(set(chosen)) < len(chosen):
         raise SceneError(f"{where}: {list(chosen)} names a band twice; name each once")
-    return [int(band) for band in chosen]
+    return [int(band) for band in chosen], ()
 
 
 def _as_float(
-    cube: NDArray[Any], chosen: list[int], nodata: float | None, path: Path
+    cube: NDArray[Any], chosen: list[int], nodata: float | None, path: Path, gaps: NDArray[np.bool_] | None
 ) -> tuple[NDArray[np.float32], tuple[str, ...]]:
-    """Chosen bands as float32; the no-data value and infinities become NaN, and are counted.
+    """Chosen bands as float32; gaps (y, x), the no-data value and infinities become NaN, and are counted.
 
-    Raises SceneError where another value is no reading, or no value is finite.
+    Raises SceneError where another value is no reading, a band has no value anywhere, or no value is finite.
     """
     every = chosen == list(range(cube.shape[2]))
     picked = cube if every else cube[..., chosen]
     notes: list[str] = []
+    if gaps is not None:
+        picked = np.where(gaps[..., None], picked.dtype.type(0), picked)  # whatever lies under them is no value
     with np.errstate(over="ignore"):
         values = np.array(picked, np.float32, order="C")
+    if gaps is not None:
+        values[gaps] = np.nan
     strange = beyond_range(picked)
     if nodata is not None:
         # Compared as numbers: -9999 in the numbers of the file would wrap to 55537 where they are uint16.
@@ -196,9 +237,20 @@ def _as_float(
     missing = int(np.isnan(values).sum())
     if missing == values.size:
         raise SceneError(f"{path} holds no finite number in the bands used; choose others")
+    _check_empty(values, chosen, path)
     if missing:
         notes.append(f"{missing} of {values.size} samples are missing")
     return values, (*notes, *_dark_note(values))
+
+
+def _check_empty(values: NDArray[np.float32], chosen: list[int], path: Path) -> None:
+    """Refuse bands without a value anywhere (SceneError, with the ``--bands`` that leaves them out)."""
+    empty = [band for place, band in enumerate(chosen) if np.isnan(values[..., place]).all()]
+    if empty:
+        rest = bands_text([band for band in chosen if band not in set(empty)])
+        raise SceneError(
+            f"{path} has no value anywhere in bands {bands_text(empty)} (from 0); take the others: --bands {rest}"
+        )
 
 
 def _dark_note(values: NDArray[np.float32]) -> tuple[str, ...]:

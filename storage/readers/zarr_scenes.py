@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import base64
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from pipeline.rig.camera.camera_texts import MICROMETRES, NANOMETRES, UNSAID
+from storage.arrays.georeference import find_geobox
 from storage.arrays.layout import missing_codec
 from storage.readers.cube_sources import BLOCK_LINES, Bands, CubeSource, LineFacts, ReadLines
 from storage.readers.zarr_checks import check_array, check_blocks, check_store, open_options
@@ -62,7 +64,23 @@ def open_zarr_cube(path: Path, variable: str | None = None) -> CubeSource:
         order, notes = _axes(array, path)
         check_blocks(array, path, [BLOCK_LINES if axis == order[0] else size for axis, size in enumerate(array.shape)])
         attributes = {} if group is None else dict(group.attrs)
-        return _source(path, array, order, arrays, attributes, notes)
+        source = _source(path, array, order, arrays, attributes, notes)
+    return _placed(source, {**attributes, **dict(array.attrs)}, arrays, _dims(array) or ["y", "x", "band"], order)
+
+
+def _placed(
+    source: CubeSource,
+    attributes: Mapping[str, Any],
+    arrays: Mapping[str, Any],
+    dims: Sequence[str],
+    order: tuple[int, ...],
+) -> CubeSource:
+    """The same cube with its place on the earth, where its store says that; a note where it cannot be read."""
+    try:
+        geobox = find_geobox(attributes, arrays, source.shape[:2], (dims[order[0]], dims[order[1]]))
+    except Exception as error:  # attributes of anyone's may hold anything
+        return replace(source, notes=(*source.notes, f"its place on the earth cannot be read: {error}"))
+    return replace(source, geobox=geobox)
 
 
 @contextmanager
@@ -152,6 +170,7 @@ def _source(
         flat=_small(known, "flat", frame),
         position=position,
         nodata=void if void is not None else fill,
+        bad_bands=tuple(int(band) for band in attributes.get("bad_bands", ())) if own else (),
         root=path,
         notes=notes,
     )

@@ -122,7 +122,6 @@ def test_mutated_headers_end_well(seed: int) -> None:
 @pytest.mark.filterwarnings("ignore::Warning")  # decoders may warn of what they then refuse
 def test_mutated_files_end_well() -> None:
     """Each file gives a cube or one clear error, soon, in memory bounded by its size."""
-    pytest.importorskip("tifffile")
     found = mutated_files.try_files(18 * len(FORMATS), seed=7).values()
     assert [line for tally in found for line in tally.wrong] == []
     assert min(tally.read + tally.refused for tally in found) == 18

@@ -99,7 +99,7 @@ def test_classes_are_those_of_the_store(run: OpenedRun) -> None:
     """Numbers stay uint8 with their meanings, also where there is no class."""
     found = run.class_map
     stored = load_class_map(Path(run.archive_name) / run.receipt["products"]["class_map"])
-    assert (found.dtype, found.attrs["_FillValue"]) == (np.uint8, 255)
+    assert (found.dtype, found.attrs["nodata"]) == (np.uint8, 255)
     np.testing.assert_array_equal(found, stored.classes)
     assert found.attrs["flag_meanings"].split() == list(run.class_names) == list(stored.names)
     np.testing.assert_array_equal(run.confidence, stored.confidence)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +11,9 @@ from typing import Any
 
 import numpy as np
 import odc.geo.xr  # noqa: F401 - gives xarray its .odc
+import pystac
 import pytest
+import rasterio
 import xarray as xr
 from rich.console import Console
 
@@ -31,8 +32,6 @@ from tests.remembered_work import without_effects
 from tests.storage.export.stac_rules import extension_problems
 from tests.storage.small_archive import flip
 
-rasterio = pytest.importorskip("rasterio", reason="exports are written with rasterio, of the extra [geo]")
-pystac = pytest.importorskip("pystac", reason="exports are described with pystac, of the extra [geo]")
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 POSE = RigPose(lon_deg=9.5, lat_deg=52.1, heading_deg=25.0, tilt_deg=50.0, height_m=14.0)
 QUIET = Console(quiet=True)
@@ -313,14 +312,3 @@ def test_a_store_that_is_gone_is_named(posed: Exported, tmp_path: Path) -> None:
     with pytest.raises(IncompleteStoreError, match=r"the mosaic of run .* does not; run its survey again"):
         run_export(archive, posed.id, out, envi=False, console=QUIET)
     assert not (out / "collection.json").exists()
-
-
-@pytest.mark.parametrize("package", ["rasterio", "pystac"])
-def test_without_the_extra_one_message_says_what_to_install(
-    posed: Exported, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str
-) -> None:
-    """Nothing is begun without all of it."""
-    monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(ArchiveError, match=rf"{package}.*pip install 'spectralzoom\[geo\]'"):
-        run_export(posed.archive, None, tmp_path / "out", envi=False, console=QUIET)
-    assert not (tmp_path / "out").exists()

@@ -168,7 +168,6 @@ def test_what_was_ingested_is_a_scene(tmp_path: Path, raw: NDArray[np.uint16]) -
 
 def test_real_files_come_back_bit_by_bit(tmp_path: Path, real_data: Path) -> None:
     """A GeoTIFF read some rows at a time, and raw frames of a space-borne imager."""
-    pytest.importorskip("rasterio")
     path = real_data / "rgbn" / "rgbn.tif"
     data = opened(ingest(path, tmp_path / "archive"))
     np.testing.assert_array_equal(data["values"], load_scene_file(path).values)

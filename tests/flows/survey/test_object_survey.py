@@ -157,8 +157,6 @@ def test_cubes_go_into_a_bucket_and_exports_come_out(
     records = [json.loads(command_line(*words).out) for _ in range(2)]
     assert [record["cached"] for record in records] == [False, True]
     assert records[0]["uri"] == records[1]["uri"]
-    pytest.importorskip("rasterio", reason="rasterio is not installed (extra geo)")
-    pytest.importorskip("pystac", reason="pystac is not installed (extra geo)")
     survey_png(bucket)
     ended = command_line("export", bucket, "-o", tmp_path / "export", "--json")
     assert (ended.code, ended.errors) == (0, [])

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rasterio
 
 from pipeline.errors import RigError
 from pipeline.json_lines import with_check
@@ -70,7 +71,6 @@ def test_the_spool_is_an_envi_file(tmp_path: Path) -> None:
     assert "lines = 7\n" in text
     cube = np.memmap(tmp_path / "lines.bil", "<u2", "r", shape=(7, 4, 6))
     np.testing.assert_array_equal(cube[3].T, _line(3).data)
-    rasterio = pytest.importorskip("rasterio")
     with pytest.warns(rasterio.errors.NotGeoreferencedWarning), rasterio.open(tmp_path / "lines.bil") as file:
         np.testing.assert_array_equal(file.read()[:, 3].T, _line(3).data)
 

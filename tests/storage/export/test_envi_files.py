@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rasterio
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
@@ -190,7 +191,6 @@ def test_bytes_between_frames_are_refused_by_both(tmp_path: Path, says: str, wor
 @pytest.mark.parametrize(("dtype", "nodata"), [("<u2", None), (">u2", 0.0), ("<f4", float("nan")), ("<f4", -9999.5)])
 def test_rasterio_reads_the_same(tmp_path: Path, interleave: str, dtype: str, nodata: float | None) -> None:
     """GDAL's reader agrees on values, bands, nodata and wavelengths."""
-    rasterio = pytest.importorskip("rasterio")
     code = next(code for code, name in DATA_TYPES.items() if name == dtype[1:])
     values, box = numbers(code), GeoBox.from_bbox(BOX, crs="EPSG:32632", resolution=0.5)
     file = EnviFile(SHAPE, dtype, interleave, np.array(NM), np.array(WIDTHS), nodata=nodata, geobox=box)
@@ -204,7 +204,6 @@ def test_rasterio_reads_the_same(tmp_path: Path, interleave: str, dtype: str, no
 @pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:25832", "EPSG:3035", "EPSG:32733", "EPSG:2056"])
 def test_map_info_puts_the_image_where_it_lies(tmp_path: Path, crs: str) -> None:
     """UTM of either half of the earth and other projections: rasterio finds CRS and transform again."""
-    rasterio = pytest.importorskip("rasterio")
     box = GeoBox.from_bbox(BOX, crs=crs, resolution=0.5)
     file = EnviFile(SHAPE, "<f4", geobox=box)
     with rasterio.open(write_envi(tmp_path / "a.hdr", file, in_blocks(np.zeros(SHAPE, np.float32)))) as found:

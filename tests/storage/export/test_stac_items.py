@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import copy
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pystac
 import pytest
 from odc.geo.geobox import GeoBox
 
@@ -25,7 +25,6 @@ from storage.export.stac_items import (
     classes,
     clean_id,
     footprint,
-    need_pystac,
     projection,
     spectral_bands,
     stac_problems,
@@ -34,7 +33,6 @@ from storage.export.stac_items import (
 )
 from tests.storage.export.stac_rules import extension_problems
 
-pystac = pytest.importorskip("pystac", reason="STAC is written with pystac, of the extra [geo]")
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 BOX = GeoBox.from_bbox((500000, 5770000, 500050, 5770040), crs="EPSG:32632", resolution=0.5)
 ABOUT = Collection("field-a", "Surveys of field-a", "Surveys")
@@ -210,13 +208,6 @@ def test_a_damaged_item_of_before_is_named(tmp_path: Path, text: str) -> None:
     (tmp_path / "r1" / "r1.json").write_text(text)
     with pytest.raises(ArchiveError, match=r"r1\.json .*remove"):
         write_stac(tmp_path, ABOUT, item("r2"))
-
-
-def test_without_pystac_one_message_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The extra is named."""
-    monkeypatch.setitem(sys.modules, "pystac", None)
-    with pytest.raises(ArchiveError, match=r"pystac.*pip install 'spectralzoom\[geo\]'"):
-        need_pystac()
 
 
 @pytest.fixture

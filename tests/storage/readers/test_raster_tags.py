@@ -1,0 +1,178 @@
+"""What GeoTIFF, ENVI and Zarr files say beside their numbers, as scenes and ingested cubes keep it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import odc.geo.xr  # noqa: F401 - registers the accessor
+import pytest
+import rasterio
+import xarray as xr
+from affine import Affine
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+from rasterio.control import GroundControlPoint
+
+from pipeline.errors import SceneError
+from pipeline.setting_fields import numbers_of
+from storage.readers.raster_tags import bad_bands
+from storage.readers.scan_files import open_cube_source, write_ingested_cube
+from storage.readers.scene_files import bands_text, load_scene_file
+
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:Use `@` matmul:PendingDeprecationWarning", "ignore:Dataset has no geotransform"
+)
+PLACE = Affine(0.5, 0, 400_000, 0, -0.5, 5_700_000)
+VALUES = np.random.default_rng(3).integers(1, 200, (4, 6, 7)).astype(np.uint8)  # (band, y, x)
+NM = [450.0, 550.0, 660.5, 800.0]
+
+
+def write(path: Path, values: Any = VALUES, **profile: Any) -> rasterio.io.DatasetWriter:
+    """A GeoTIFF of (band, y, x) values, open for more to be said."""
+    count, height, width = values.shape
+    known = {"driver": "GTiff", "count": count, "height": height, "width": width, "dtype": values.dtype.name}
+    file = rasterio.open(path, "w", photometric="MINISBLACK", **known, **profile)
+    file.write(values)
+    return file
+
+
+def say_in_bands(file: Any) -> None:
+    for band, centre in enumerate(NM):
+        file.update_tags(band + 1, WAVELENGTH=f"{centre / 1000}", WAVELENGTH_UNITS="Micrometers")
+
+
+def say_in_imagery(file: Any) -> None:
+    for band, centre in enumerate(NM):
+        file.update_tags(band + 1, ns="IMAGERY", CENTRAL_WAVELENGTH_UM=str(centre / 1000), FWHM_UM="0.006")
+
+
+def say_in_a_list(file: Any) -> None:
+    file.update_tags(wavelength="{" + ", ".join(map(str, NM)) + "}", wavelength_units="nm", fwhm="6 6 6 6")
+
+
+def say_in_names(file: Any) -> None:
+    file.descriptions = [f"Band {number} ({centre} Nanometers)" for number, centre in enumerate(NM)]
+
+
+@pytest.mark.parametrize("say", [say_in_bands, say_in_imagery, say_in_a_list, say_in_names])
+def test_wavelengths_stand_in_tags_of_many_kinds(tmp_path: Path, say: Any) -> None:
+    """Of bands, of GDAL's domain IMAGERY, of the file as a list, or in the bands' names; widths where they are said."""
+    with write(tmp_path / "a.tif") as file:
+        say(file)
+    scene = load_scene_file(tmp_path / "a.tif")
+    assert scene.wavelength_nm.tolist() == pytest.approx(NM)
+    if say in (say_in_imagery, say_in_a_list):
+        assert scene.fwhm_nm is not None
+        assert scene.fwhm_nm.tolist() == pytest.approx([6.0] * 4)
+
+
+def test_a_geotiff_keeps_its_place(tmp_path: Path) -> None:
+    """CRS and transform as written; a transform alone, and ground control points, are no place, and a note says so."""
+    write(tmp_path / "a.tif", crs="EPSG:25832", transform=PLACE).close()
+    scene = load_scene_file(tmp_path / "a.tif", wavelengths=NM)
+    assert scene.geobox is not None
+    assert scene.geobox.crs is not None
+    assert (scene.geobox.affine, scene.geobox.crs.epsg, tuple(scene.geobox.shape)) == (PLACE, 25832, (6, 7))
+    write(tmp_path / "b.tif", transform=PLACE).close()
+    points = [GroundControlPoint(0, 0, 7, 52), GroundControlPoint(6, 0, 7, 51.9), GroundControlPoint(0, 7, 7.1, 52)]
+    write(tmp_path / "c.tif", gcps=points, crs="EPSG:4326").close()
+    for name, words in (("b.tif", "a transform and no CRS"), ("c.tif", "ground control points, which are not read")):
+        scene = load_scene_file(tmp_path / name, wavelengths=NM)
+        assert scene.geobox is None
+        assert any(words in note for note in scene.provenance)
+
+
+def test_bands_that_a_file_calls_bad_are_left_out(tmp_path: Path) -> None:
+    """Without a word of the user's; a note says which, and --bands takes them all the same."""
+    with write(tmp_path / "a.tif") as file:
+        say_in_a_list(file)
+        file.update_tags(bbl="{1, 0, 1, 1}")
+    scene = load_scene_file(tmp_path / "a.tif")
+    assert scene.wavelength_nm.tolist() == [450.0, 660.5, 800.0]
+    assert any("bands 1 are left out: the file calls them bad; --bands 0-3 takes" in note for note in scene.provenance)
+    assert load_scene_file(tmp_path / "a.tif", bands=[1]).wavelength_nm.tolist() == [550.0]
+
+
+def test_a_band_without_a_value_is_named_with_the_bands_that_have_some(tmp_path: Path) -> None:
+    """One message, with what to write."""
+    values = VALUES.astype(np.float32)
+    values[1:3] = np.nan
+    write(tmp_path / "a.tif", values).close()
+    with pytest.raises(SceneError, match=r"no value anywhere in bands 1-2 \(from 0\); take the others: --bands 0,3$"):
+        load_scene_file(tmp_path / "a.tif", wavelengths=NM)
+
+
+@pytest.mark.parametrize("kind", ["mask", "png"])
+def test_masked_and_transparent_pixels_have_no_value(tmp_path: Path, kind: str) -> None:
+    """An internal mask and the alpha of a PNG; another gap is another scene, whatever the pixels under it."""
+    there = np.ones((6, 7), np.bool_)
+    there[2:4, :3] = False
+    hashes = set()
+    for gap in (True, False):
+        mask = np.where(there | (not gap), 255, 0).astype(np.uint8)
+        if kind == "mask":
+            with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True), write(tmp_path / "a.tif") as file:
+                file.write_mask(mask)
+            scene = load_scene_file(tmp_path / "a.tif", wavelengths=NM)
+        else:
+            Image.fromarray(np.dstack([np.moveaxis(VALUES[:3], 0, -1), mask])).save(tmp_path / "a.png")
+            scene = load_scene_file(tmp_path / "a.png")
+        np.testing.assert_array_equal(np.isnan(scene.values).all(axis=-1), ~there & gap)
+        hashes.add(scene.light_hash)
+    assert len(hashes) == 2
+
+
+def test_a_zarr_store_says_its_place_in_any_of_three_ways(tmp_path: Path) -> None:
+    """By a grid mapping, by coordinates and a CRS, by GeoZarr's attributes; not by halves."""
+    values = ("y", "x", "band"), np.moveaxis(VALUES, 0, -1)
+    centres = {"y": 5_700_000 - 0.25 - 0.5 * np.arange(6), "x": 400_000.25 + 0.5 * np.arange(7)}
+    waves = {"wavelength": ("band", np.array(NM), {"units": "nm"})}
+    crs = xr.DataArray(0, attrs={"crs_wkt": rasterio.crs.CRS.from_epsg(25832).to_wkt()})
+    told = {"GeoTransform": "400000 0.5 0 5700000 0 -0.5", **crs.attrs}
+    geozarr = {"proj:code": "EPSG:25832", "spatial:transform": list(PLACE[:6])}
+    stores = {
+        "mapping": xr.Dataset({"v": (*values, {"grid_mapping": "crs"})}, {**waves, "crs": ((), 0, told)}),
+        "centres": xr.Dataset({"v": values}, {**waves, **centres, "spatial_ref": crs}),
+        "geozarr": xr.Dataset({"v": (*values, geozarr)}, waves),
+        "halves": xr.Dataset({"v": values}, {**waves, **centres}),
+    }
+    for name, store in stores.items():
+        store.to_zarr(tmp_path / f"{name}.zarr", zarr_format=3, consolidated=False)
+        geobox = load_scene_file(tmp_path / f"{name}.zarr:v").geobox
+        if name == "halves":
+            assert geobox is None
+        else:
+            assert geobox is not None
+            assert geobox.crs is not None
+            assert geobox.crs.epsg == 25832
+            np.testing.assert_allclose(geobox.affine[:6], PLACE[:6])
+
+
+def test_an_ingested_cube_keeps_place_gaps_and_bad_bands(tmp_path: Path) -> None:
+    """What a file says is what a scene of the archive's cube says."""
+    with (
+        rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True),
+        write(tmp_path / "a.tif", crs="EPSG:25832", transform=PLACE) as file,
+    ):
+        say_in_a_list(file)
+        file.update_tags(bbl="1 1 0 1")
+        file.write_mask(np.where(np.arange(42).reshape(6, 7) < 9, 0, 255).astype(np.uint8))
+    write_ingested_cube(tmp_path / "stored", open_cube_source(tmp_path / "a.tif"), [], name="a")
+    scene, cube = load_scene_file(tmp_path / "a.tif"), load_scene_file(tmp_path / "stored")
+    assert cube.geobox == scene.geobox is not None
+    np.testing.assert_array_equal(cube.values, scene.values)
+    assert cube.wavelength_nm.tolist() == [450.0, 550.0, 800.0]
+    assert np.isnan(cube.values).all(axis=-1).sum() == 9
+
+
+@given(st.lists(st.booleans(), min_size=1, max_size=40))
+def test_bands_in_words_are_those_that_are_meant(good: list[bool]) -> None:
+    """A list of bad bands gives the bands of its zeros, and bands in words are read as what they were."""
+    bad = bad_bands("{" + ", ".join(str(int(one)) for one in good) + "}", len(good))
+    assert list(bad) == [band for band, one in enumerate(good) if not one]
+    assert bad_bands("1, 1", len(good)) == () or len(good) == 2
+    if bad:
+        assert [int(str(one)) for part in bands_text(bad).split(",") for one in numbers_of(part)] == list(bad)
