@@ -30,6 +30,7 @@ from flows.terminal.processes import DONE
 from flows.terminal.progress import put_out
 from pipeline.errors import IncompleteStoreError, PipelineError
 from pipeline.lazy import deferred
+from pipeline.planning.fine_pass import FinePlan
 from pipeline.planning.plain_scans import scan_words
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef, plain, store_at
@@ -120,14 +121,21 @@ def forecast(settings: Settings, preview: Path | None = None) -> Forecast:
         planner = Planner(run, catalogue)
         products = survey(planner)
         judge(planner, products)
-        attention = products["attend"]
-        fine = None if attention is None or isinstance(attention, _Awaited) else load_plan(attention)
+        fine = _planned_fine(products["attend"])
         figures = field_figures(run, fine)
         if preview is not None:
             shown = plan_preview.PlanPicture(run, fine, _last_map(run, catalogue), figure_lines(figures))
             with refusals(preview.parent, "write the preview"):
                 plan_preview.draw_preview(preview, shown)
     return Forecast(planner.rows, run.refused, run.scans, figures)
+
+
+def _planned_fine(attention: StageRef | None) -> FinePlan | None:
+    """The fine pass where it is planned already and can be read; the row of what reads it says why it cannot."""
+    if attention is not None and not isinstance(attention, _Awaited):
+        with suppress(PipelineError, OSError):
+            return load_plan(attention)
+    return None
 
 
 def _last_map(run: SurveyRun, catalogue: Catalogue) -> ClassMap | None:

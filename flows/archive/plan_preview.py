@@ -113,11 +113,10 @@ def _draw_ground(axes: Axes, shown: PlanPicture, place: PosedField) -> None:
 
 def _point_to_rig(axes: Axes, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
     """An arrow at the field's border to a rig that stands far beyond it."""
-    middle = (low + high) / 2
-    away = float(np.hypot(*middle))
-    start, towards = middle, -middle / away
-    end = start + towards * float((high - low).max()) * 0.42
-    axes.annotate("", end, start + 0.6 * (end - start), arrowprops={"arrowstyle": "-|>", "color": "black"}, zorder=6)
+    (x, y), size = ((low + high) / 2).tolist(), float((high - low).max())
+    away = float(np.hypot(x, y))
+    begin, end = ((x * (1 - share * size / away), y * (1 - share * size / away)) for share in (0.25, 0.42))
+    axes.annotate("", end, begin, arrowprops={"arrowstyle": "-|>", "color": "black"}, zorder=6)
     axes.annotate(f"rig, {away:.3g} m", end, (6, 0), textcoords="offset points", size=10, zorder=6)
 
 

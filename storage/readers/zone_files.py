@@ -115,11 +115,11 @@ class _VectorLayer:
 def _read(path: Path, layer: str | None, source: str) -> _VectorLayer:
     try:
         about, _, geometry, values = pyogrio.raw.read(path, layer=layer)
-        crs = None if about["crs"] is None else pyproj.CRS.from_user_input(about["crs"])
+        # GDAL takes WGS 84 for granted in GeoJSON; whether that is meant is the survey's to say
+        known = about["crs"] is not None and (path.suffix.lower() not in GEOJSON or _names_crs(path))
+        crs = pyproj.CRS.from_user_input(about["crs"]) if known else None
     except (OSError, ValueError, RuntimeError, pyproj.exceptions.CRSError) as error:  # GDAL's are RuntimeErrors
         raise ZoneError(f"cannot read {source} as polygons: {error}; save it anew from a map program") from None
-    if path.suffix.lower() in GEOJSON and not _names_crs(path):
-        crs = None  # GDAL takes WGS 84 for granted; whether that is meant is the survey's to say
     fields = {str(name): column for name, column in zip(about["fields"], values, strict=True)}
     return _VectorLayer(crs, fields, [] if geometry is None else list(geometry))
 

@@ -304,7 +304,8 @@ def _cut_everything(
         waiting.append(band if kept.all() else (band[0][kept], band[1][kept]))
         values, seen = (np.concatenate(parts) for parts in zip(*waiting, strict=True))
         whole = len(values) if done + len(values) == count else len(values) // SEATS_AT_ONCE * SEATS_AT_ONCE
-        writer.write(done, *_on_scene(run, seats[done : done + whole], values[:whole], seen[:whole]))
+        if whole:
+            writer.write(done, *_on_scene(run, seats[done : done + whole], values[:whole], seen[:whole]))
         waiting, done = [(values[whole:], seen[whole:])], done + whole
         run.report(done / count)
 

@@ -1,0 +1,166 @@
+"""Polygons on pixels: laws of masks, areas against shapely's, CRS round trips, and what zones leave of seats."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyproj
+import pytest
+import shapely
+from affine import Affine
+from hypothesis import given
+from hypothesis import strategies as st
+from odc.geo.geobox import GeoBox
+
+from pipeline.geometry.grid import SceneGrid
+from pipeline.ground.field_places import NoPlace, PlacedPicture, PosedField
+from pipeline.ground.map_grid import ground_grid
+from pipeline.ground.view import GroundView, RigPose
+from pipeline.ground.zones import field_zones, on_field, pixels_inside
+
+SHAPE = (60, 80)
+corners = st.lists(st.tuples(st.floats(-20, 100), st.floats(-20, 80)), min_size=3, max_size=8)
+polygons = corners.map(lambda points: shapely.MultiPoint(points).convex_hull).filter(lambda one: one.area > 1)
+
+
+def posed(lon_deg: float = 7.6, lat_deg: float = 51.96, *, tilt_deg: float = 35.0) -> PosedField:
+    """A field of 60 x 80 px of 1 mrad before a rig 30 m high."""
+    pose = RigPose(lon_deg=lon_deg, lat_deg=lat_deg, heading_deg=20.0, tilt_deg=tilt_deg, height_m=30.0)
+    return PosedField(ground_grid(GroundView(pose, 1e-3), SHAPE))
+
+
+@given(polygons)
+def test_an_area_and_what_is_outside_of_it_are_all_pixels_once(area: Any) -> None:
+    """Masks of a polygon and of its complement share no pixel and miss none."""
+    outside = shapely.box(-200, -200, 300, 300).difference(area)
+    inner, outer = pixels_inside([area], SHAPE), pixels_inside([outside], SHAPE)
+    assert (inner ^ outer).all()
+
+
+@given(polygons)
+def test_pixels_are_as_many_as_the_polygon_is_large(area: Any) -> None:
+    """To a pixel of its border's length; with every pixel touched there are no fewer, and all that centres have."""
+    there = area.intersection(shapely.box(0, 0, SHAPE[1], SHAPE[0]))
+    inside, touched = (pixels_inside([area], SHAPE, touched=one) for one in (False, True))
+    assert abs(inside.sum() - there.area) <= there.length + 1
+    assert (touched | ~inside).all()
+
+
+@given(polygons, st.integers(0, 40), st.integers(0, 50))
+def test_a_window_shows_its_part_of_the_mask(area: Any, top: int, left: int) -> None:
+    """Pixels do not depend on where the window begins, but for centres on the border itself."""
+    whole = pixels_inside([area], SHAPE)
+    part = pixels_inside([area], (20, 30), origin=(top, left))
+    y, x = np.nonzero(part != whole[top : top + 20, left : left + 30])
+    centres = shapely.points(x + left + 0.5, y + top + 0.5)
+    assert (shapely.distance(centres, area.boundary) < 1e-6).all()  # on the border rounding decides
+
+
+def test_holes_and_islands_are_as_drawn() -> None:
+    """A polygon with a hole, and a second one elsewhere."""
+    ring = shapely.box(10, 10, 30, 30).difference(shapely.box(15, 15, 25, 25))
+    found = pixels_inside([shapely.union(ring, shapely.box(50, 40, 60, 45))], SHAPE)
+    assert found.sum() == 400 - 100 + 50
+    assert not found[15:25, 15:25].any()
+
+
+def test_less_than_a_pixel_is_touched_and_holds_no_centre() -> None:
+    """A tiny polygon beside a pixel's centre."""
+    tiny = shapely.box(10.1, 20.1, 10.2, 20.2)
+    assert not pixels_inside([tiny], SHAPE).any()
+    assert np.argwhere(pixels_inside([tiny], SHAPE, touched=True)).tolist() == [[20, 10]]
+
+
+@pytest.mark.parametrize("crs", [32632, 4326, 3857, 3035, 31466])
+def test_the_way_to_a_map_and_back_is_none(crs: int) -> None:
+    """A polygon in pixels, brought to the ground and to another CRS, comes back to its pixels."""
+    place, drawn = posed(), shapely.segmentize(shapely.Polygon([(5, 5), (70, 8), (60, 50), (9, 44)]), 1)
+    frame = place.grid.frame
+    middle = np.array([SHAPE[1], SHAPE[0]]) / 2
+    on_map = shapely.transform(
+        drawn, lambda at: frame.ground_to_map(place.view.scene_to_ground((at - middle)[:, ::-1]))
+    )
+    to_crs = pyproj.Transformer.from_crs(place.crs, crs, always_xy=True)
+    away = shapely.transform(on_map, lambda at: np.stack(to_crs.transform(at[:, 0], at[:, 1]), axis=-1))
+    back = on_field(away, pyproj.CRS.from_epsg(crs), place)
+    assert back.symmetric_difference(drawn).area < 0.02 * drawn.length
+
+
+@pytest.mark.parametrize("lon_deg", [179.9999, -179.9999])
+def test_a_polygon_across_the_antimeridian_is_one(lon_deg: float) -> None:
+    """Longitudes to either side of 180, whole or parted there as RFC 7946 wants it, hold the field."""
+    place = posed(lon_deg, -17.0)
+    whole = shapely.Polygon([(179.99, -17.01), (-179.99, -17.01), (-179.99, -16.99), (179.99, -16.99)])
+    parts = shapely.union(shapely.box(179.99, -17.01, 180, -16.99), shapely.box(-180, -17.01, -179.99, -16.99))
+    for shape in (whole, parts):
+        assert pixels_inside([on_field(shape, pyproj.CRS.from_epsg(4326), place)], SHAPE).all()
+    elsewhere = shapely.box(-179.9, -17.01, -179.8, -16.99)
+    assert on_field(elsewhere, pyproj.CRS.from_epsg(4326), place).is_empty
+
+
+def test_what_lies_behind_the_rig_has_no_pixels() -> None:
+    """A polygon around the rig's foot that reaches into the field holds that part alone; one behind it holds none."""
+    place = posed()
+    foot = np.array(place.grid.frame.ground_to_map(np.zeros((1, 3))))[0]
+    around = shapely.Point(foot).buffer(float(place.scale(1e-3).footprint.range_m[1]) * 0.82)  # type: ignore[union-attr]
+    found = pixels_inside([on_field(around, place.crs, place)], SHAPE)
+    assert 0.1 < found.mean() < 0.9
+    assert found[-1].all()
+    assert not found[0].any()
+    behind = shapely.Point(foot - [0, 60]).buffer(20)
+    assert on_field(behind, place.crs, place).is_empty
+
+
+@pytest.mark.parametrize("turn", [0.0, 30.0])
+def test_a_georeferenced_picture_takes_polygons_by_its_transform(turn: float) -> None:
+    """Rows and columns are those of the GeoBox, also of one that is turned; pixel areas are those of its sides."""
+    place = PlacedPicture(
+        GeoBox(SHAPE, Affine.translation(4e5, 5.7e6) @ Affine.rotation(turn) @ Affine.scale(0.5, -0.5), 32632)
+    )
+    field = shapely.Polygon([place.geobox.affine @ at for at in ((10, 20), (30, 20), (30, 50), (10, 50))])
+    found = pixels_inside([on_field(field, place.crs, place)], SHAPE)
+    assert found[20:50, 10:30].all()
+    assert found.sum() == 600
+    assert place.pixel_areas_m2(slice(0, 2), slice(0, 3)) == pytest.approx(np.full((2, 3), 0.25))
+
+
+def test_pixels_of_degrees_have_their_area_on_the_ellipsoid() -> None:
+    """A hundredth of a second at 52 N is 0.309 m north and 0.191 m east."""
+    step = 0.01 / 3600
+    place = PlacedPicture(GeoBox(SHAPE, Affine(step, 0, 7.6, 0, -step, 52.0), 4326))
+    areas = place.pixel_areas_m2(slice(10, 12), slice(5, 6))
+    assert areas is not None
+    assert areas.ravel() == pytest.approx(np.full(2, 0.30903 * 0.19068), rel=1e-3)
+
+
+@given(polygons, polygons)
+def test_no_seat_that_a_no_go_zone_touches_is_worth_anything(area: Any, no_go: Any) -> None:
+    """Nor one outside of the area; a seat wholly inside and untouched counts in full."""
+    grid = SceneGrid(*SHAPE, 8, 4)
+    barred = pixels_inside([no_go], SHAPE, touched=True)
+    found = field_zones(pixels_inside([area], SHAPE), barred)
+    if found is None:
+        return
+    shares, shown = found.seat_shares(grid), found.shown_seats(grid)
+    for seat in grid.valid_seats():
+        y, x = grid.seat_origin(seat)
+        kept, stopped = (mask[y : y + 8, x : x + 8] for mask in (found.kept, barred))
+        assert shares[seat] == pytest.approx(0 if stopped.any() else kept.mean())
+        assert shown[seat] or not kept.any()
+    assert not found.kept[barred].any()
+
+
+def test_zones_that_leave_nothing_out_are_none() -> None:
+    """Whoever keeps to all of a field surveys it as without zones."""
+    everything = np.ones(SHAPE, bool)
+    assert field_zones(everything, ~everything) is None
+    assert field_zones(None, None) is None
+    assert field_zones(None, everything) is not None
+
+
+def test_without_a_place_polygons_are_pixels() -> None:
+    """From the upper left corner, and no pixel has an area."""
+    found = on_field(shapely.box(-5, -5, 3, 2), None, NoPlace(SHAPE))
+    assert np.argwhere(pixels_inside([found], SHAPE)).tolist() == [[0, 0], [0, 1], [0, 2], [1, 0], [1, 1], [1, 2]]
+    assert NoPlace(SHAPE).pixel_areas_m2(slice(0, 1), slice(0, 1)) is None

@@ -1,0 +1,67 @@
+"""Sweeps cut to a part of a field: they still show all of it, and nothing is taken for nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import Axis
+from pipeline.planning.area_cover import sweeps_over
+from pipeline.planning.coverage import coarse_sweeps, full_sweeps, sweep_outline
+from pipeline.planning.strips import covered_seats
+
+GRID, CAMERA = SceneGrid(320, 416, 16, 4), LineCamera(samples=160)
+
+
+def shown_of(top: int, left: int, rows: int, columns: int) -> np.ndarray:
+    """Seats of a block, (seat,)."""
+    shown = np.zeros(GRID.seat_shape, bool)
+    shown[top : top + rows, left : left + columns] = True
+    return (shown & (GRID.valid_share() > 0)).ravel()
+
+
+blocks = st.builds(shown_of, st.integers(0, 19), st.integers(0, 25), st.integers(1, 8), st.integers(1, 8))
+
+
+@given(blocks, st.sampled_from(["x", "y"]))
+def test_every_seat_that_was_shown_still_is(shown: np.ndarray, along: Axis) -> None:
+    """Of a full scan, seats that lay whole in one of its sweeps do so after it is cut."""
+    sweeps = full_sweeps(GRID, CAMERA, along)
+    cut = sweeps_over(sweeps, GRID, CAMERA, shown)
+    before, after = (covered_seats(GRID, CAMERA, one) for one in (sweeps, cut))
+    assert np.isin(np.intersect1d(before, np.flatnonzero(shown)), after).all()
+    assert sum(one.lines for one in cut) < sum(one.lines for one in sweeps)
+
+
+@given(blocks)
+def test_lines_stay_where_they_lie(shown: np.ndarray) -> None:
+    """A coarse sweep that is cut holds positions that the whole one does, and no others."""
+    whole = {sweep.name: sweep for sweep in coarse_sweeps(GRID, CAMERA, "x")}
+    for sweep in sweeps_over(list(whole.values()), GRID, CAMERA, shown):
+        assert np.isin(sweep.held_px(), whole[sweep.name].held_px()).all()
+
+
+def test_of_the_whole_field_nothing_is_cut() -> None:
+    """The same sweeps, value by value."""
+    sweeps = coarse_sweeps(GRID, CAMERA, "y")
+    assert sweeps_over(sweeps, GRID, CAMERA, GRID.valid_share().ravel() > 0) == sweeps
+
+
+def test_strips_beside_the_area_are_left_out() -> None:
+    """A corner of the field needs one strip of three."""
+    sweeps = full_sweeps(GRID, CAMERA, "x")
+    assert len(sweeps) == 3
+    assert [one.name for one in sweeps_over(sweeps, GRID, CAMERA, shown_of(0, 0, 3, 3))] == ["full-0"]
+    assert sweeps_over(sweeps, GRID, CAMERA, np.zeros_like(shown_of(0, 0, 1, 1))) == []
+
+
+def test_the_outline_of_a_sweep_is_as_large_as_its_lines() -> None:
+    """Samples times held positions, for one strip at the axis."""
+    (sweep,) = full_sweeps(SceneGrid(64, 96, 16, 4), LineCamera(samples=96), "x")
+    x, y = sweep_outline(sweep, LineCamera(samples=96)).T
+    assert np.ptp(x) == pytest.approx(96, rel=1e-3)
+    assert np.ptp(y) == pytest.approx(sweep.lines, rel=1e-3)

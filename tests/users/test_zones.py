@@ -1,0 +1,280 @@
+"""Area of interest, no-go zones and plots: a survey keeps to them from its lines to its areas, and says so."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import geopandas
+import numpy as np
+import pandas
+import pytest
+import rasterio
+import shapely
+from PIL import Image
+
+from flows.publish.run_folder import Published
+from flows.settings.load import load_settings, parse_settings
+from flows.survey.run import SurveyRun, open_run
+from pipeline.errors import SettingsError, ZoneError
+from pipeline.geometry.grid import UNLABELLED
+from storage.archive.archive import Archive
+from storage.arrays.beliefs import BeliefStore
+from storage.arrays.class_maps import ClassMap, load_class_map
+from storage.arrays.mosaics import load_attention, open_patches
+from tests.conftest import Survey
+from tests.remembered_work import without_effects
+from tests.users.zone_sketches import sketch
+
+pytestmark = pytest.mark.usefixtures("no_effects")
+AREA = shapely.Polygon([(20, 8), (118, 10), (110, 62), (24, 60)])
+NO_GO = shapely.box(50, 24, 58, 33)
+PLOTS = {
+    "north": shapely.box(24, 12, 100, 36),
+    "south": shapely.box(24, 36, 100, 60),
+    "away": shapely.box(400, 0, 410, 9),
+}
+POSE = {"lon_deg": 7.6, "lat_deg": 51.96, "height_m": 30, "heading_deg": 20, "tilt_deg": 35}
+NARROW = {"camera.samples": 64, "budget": "1"}
+
+
+def drawn(out: Path, published: Published) -> ClassMap:
+    """The class map of a run."""
+    return load_class_map(out / published.receipt["products"]["class_map"])
+
+
+Opened = Callable[..., SurveyRun]
+
+
+@pytest.fixture
+def opened(scene_files: Path, weights: Path, tmp_path: Path) -> Opened:
+    """Open a survey of the small picture with such settings, without running it."""
+
+    def open_with(**given: Any) -> SurveyRun:
+        basic = {"scene": str(scene_files / "scene.png"), "weights": str(weights), "engine": "plain"}
+        settings = parse_settings(basic | {name: value for name, value in given.items() if value is not None})
+        return open_run(settings, planning=True, archive=Archive(tmp_path, writes=False))
+
+    return open_with
+
+
+@pytest.fixture(scope="module")
+def zones(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Files of an area, a no-go zone and plots, in pixels."""
+    folder = tmp_path_factory.mktemp("zones")
+    return {
+        "zones.area": sketch(folder / "area.geojson", {"field": AREA}),
+        "zones.no_go": sketch(folder / "no_go.geojson", {"pond": NO_GO}),
+        "zones.plots": sketch(folder / "plots.geojson", PLOTS),
+    }
+
+
+@pytest.fixture(scope="module")
+def kept_to(
+    survey_png: Survey, zones: dict[str, str], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, Published]:
+    """A survey that keeps to all of them."""
+    out = tmp_path_factory.mktemp("kept") / "archive"
+    with without_effects():
+        return out, survey_png(out, **NARROW, **zones)
+
+
+def inside(shape: shapely.Geometry) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    """Pixels of the picture whose centres lie in a polygon, by shapely alone."""
+    x, y = np.meshgrid(np.arange(128) + 0.5, np.arange(96) + 0.5)
+    return np.asarray(shapely.contains_xy(shape, x, y))
+
+
+def test_the_map_is_that_of_the_area_without_the_no_go_zones(kept_to: tuple[Path, Published]) -> None:
+    """Inside every pixel has a class and a confidence, elsewhere none has."""
+    found = drawn(*kept_to)
+    wanted = inside(AREA) & ~inside(NO_GO)
+    classed = found.classes != UNLABELLED
+    assert (classed != wanted).sum() <= 2 * (NO_GO.length + AREA.length) / 100  # on the border alone, if at all
+    assert np.array_equal(classed, np.isfinite(found.confidence))
+    assert not classed[inside(NO_GO)].any()
+
+
+def test_no_seat_outside_or_in_a_no_go_zone_is_asked_for(kept_to: tuple[Path, Published]) -> None:
+    """Scores there are 0, no rank is given, and no patch is cut that touches a no-go zone."""
+    out, published = kept_to
+    products = published.receipt["products"]
+    attention = load_attention(out / products["attention"])
+    rows, columns = attention.score.shape
+    seats = [shapely.box(8 * x, 8 * y, 8 * x + 8, 8 * y + 8) for y in range(rows) for x in range(columns)]
+    barred = np.array([not seat.intersects(AREA) or seat.intersection(NO_GO).area > 0 for seat in seats])
+    cut = open_patches(out / products["patches"]).seats
+    assert len(cut) > 10
+    assert not barred[cut].any()
+    assert (attention.rank.ravel()[barred] == -1).all()
+    assert (attention.score.ravel()[barred] == 0).all()
+
+
+def test_lines_that_show_nothing_of_the_area_are_not_taken(
+    kept_to: tuple[Path, Published], opened: Opened, zones: dict[str, str]
+) -> None:
+    """Coarse pass and full scan are of the area: both take fewer lines than for the field."""
+    rest = {"camera": {"samples": 64}, "budget": 1.0}
+    kept = opened(zones={name.partition(".")[2]: path for name, path in zones.items()}, **rest).plan
+    whole = opened(**rest).plan
+    assert sum(one.lines for one in kept.coarse) < sum(one.lines for one in whole.coarse)
+    assert kept.full_s < whole.full_s
+    assert kept_to[1].receipt["savings"]["capture_s"]["full"] == pytest.approx(kept.full_s)
+
+
+def test_accuracy_is_of_the_area(kept_to: tuple[Path, Published]) -> None:
+    """The pixels that were judged are those that have a class."""
+    found = drawn(*kept_to)
+    assert kept_to[1].receipt["accuracy"]["pixels"] == (found.classes != UNLABELLED).sum()
+
+
+def test_plots_are_told_in_receipt_and_csv(kept_to: tuple[Path, Published]) -> None:
+    """Shares sum to 1, pixels are those of the map, and a plot beside the field has none."""
+    _, published = kept_to
+    found, table = drawn(*kept_to), pandas.read_csv(published.folder / "plots.csv").set_index("plot")
+    rows = {row["plot"]: row for row in published.receipt["plots"]}
+    assert list(rows) == ["north", "south", "away"] == list(table.index)
+    for name in ("north", "south"):
+        mapped = inside(PLOTS[name]) & (found.classes != UNLABELLED)
+        counts = np.bincount(found.classes[mapped], minlength=3)
+        assert rows[name]["mapped_pixels"] == mapped.sum() == table.loc[name, "mapped_pixels"]
+        assert list(rows[name]["shares"].values()) == pytest.approx(counts / counts.sum())
+        assert table.loc[name, "share_class_1"] == pytest.approx(rows[name]["shares"]["class_1"])
+        assert rows[name]["confidence"] == pytest.approx(found.confidence[mapped].mean(), rel=1e-5)
+    assert (rows["away"]["pixels"], rows["away"]["confidence"]) == (0, None)
+    assert "plots.csv" in published.receipt["products"]
+    assert "north" in (published.folder / "report.html").read_text(encoding="utf-8")
+
+
+def test_nothing_is_believed_of_what_was_left_out(kept_to: tuple[Path, Published]) -> None:
+    """What the next visit remembers has no class where zones left pixels out."""
+    out, published = kept_to
+    values, age, _ = BeliefStore(out / published.receipt["products"]["belief"]).read()
+    classed = drawn(*kept_to).classes != UNLABELLED
+    assert np.array_equal(np.isfinite(values[..., 0]), classed)
+    assert np.array_equal(np.isfinite(age), classed)
+
+
+def test_a_plain_scan_cuts_the_seats_of_the_area(survey_png: Survey, zones: dict[str, str], tmp_path: Path) -> None:
+    """Each patch shows the picture where it lies; no seat outside is cut, and the map keeps to the area as well."""
+    plain = {"scan_step": 1, "budget": None, "camera.samples": 64, "accuracy": False}
+    published = survey_png(tmp_path, **plain, **zones)
+    store = open_patches(tmp_path / published.receipt["products"]["patches"])
+    values, (row, column) = store.read(0, len(store.seats)), np.divmod(store.seats, 16)
+    with Image.open(published.receipt["settings"]["scene"]) as found:
+        picture = np.asarray(found, np.float64)
+    there = [picture[8 * y : 8 * y + 8, 8 * x : 8 * x + 8] for y, x in zip(row, column, strict=True)]
+    assert 20 < len(store.seats) < 16 * 12
+    assert np.abs(np.nan_to_num(values - there)).mean() < 2
+    boxes = shapely.box(8 * column, 8 * row, 8 * column + 8, 8 * row + 8)
+    assert shapely.intersects(boxes, AREA).all()
+    assert not (shapely.area(shapely.intersection(boxes, NO_GO)) > 0).any()
+    assert ((drawn(tmp_path, published).classes != UNLABELLED) <= inside(AREA.buffer(1e-6))).all()
+
+
+def test_a_visit_with_zones_keeps_the_memory_of_the_rest(
+    survey_png: Survey, surveyed_png: Survey, zones: dict[str, str], tmp_path: Path
+) -> None:
+    """What was known outside of the area is known afterwards, and no look counts there."""
+    first = surveyed_png(tmp_path)
+    second = survey_png(tmp_path, visit="second", prior="latest", accuracy=False, **NARROW, **zones)
+    before, after = (BeliefStore(tmp_path / one.receipt["products"]["belief"]).read() for one in (first, second))
+    away = drawn(tmp_path, second).classes == UNLABELLED
+    assert away.any()
+    assert np.array_equal(before[0][away].argmax(axis=-1), after[0][away].argmax(axis=-1))
+    assert np.isfinite(after[0]).all()
+    assert (after[2][away] <= before[2][away] + 1e-6).all()
+
+
+def test_a_georeferenced_scene_takes_polygons_by_its_transform(
+    survey_png: Survey, scene_files: Path, tmp_path: Path
+) -> None:
+    """Pixels of 10 cm: an area of 8 x 6 m on the map, given in degrees, is 80 x 60 of them and 48 square metres."""
+    with Image.open(scene_files / "scene.png") as found:
+        values = np.asarray(found).transpose(2, 0, 1)
+    grid = {"crs": 32632, "transform": rasterio.Affine(0.1, 0, 404000, 0, -0.1, 5757000)}
+    about = {"driver": "GTiff", "width": 128, "height": 96, "count": 3, "dtype": "uint8"}
+    with rasterio.open(tmp_path / "field.tif", "w", **about, **grid) as file:
+        file.write(values)
+    area = geopandas.GeoSeries([shapely.box(404002, 5756993, 404010, 5756999)], crs=32632).to_crs(4326).iloc[0]
+    path = sketch(tmp_path / "area.gpkg", {"mine": area}, 4326)
+    flags = {"scene": str(tmp_path / "field.tif"), "labels": None, "wavelengths": "640,550,460", "camera.samples": 64}
+    published = survey_png(tmp_path / "archive", **flags, **{"zones.area": path, "zones.plots": path})
+    rows, columns = np.nonzero(drawn(tmp_path / "archive", published).classes != UNLABELLED)
+    assert (rows.min(), rows.max(), columns.min(), columns.max(), len(rows)) == (10, 69, 20, 99, 4800)
+    assert published.receipt["plots"][0]["area_m2"] == pytest.approx(48)
+    assert published.receipt["zones"]["kept_m2"] == pytest.approx(48)
+
+
+def test_a_zone_of_the_whole_field_changes_no_bit(survey_png: Survey, surveyed_png: Survey, tmp_path: Path) -> None:
+    """Every store has the key that it has without zones: nothing is made."""
+    surveyed_png(tmp_path / "archive")
+    area = sketch(tmp_path / "all.geojson", {"all": shapely.box(-5, -5, 200, 200)})
+    published = survey_png(tmp_path / "archive", **{"zones.area": area})
+    assert {stage["state"] for stage in published.receipt["stages"]} <= {"cached", "skipped"}
+    assert "zones" not in published.receipt
+
+
+def test_polygons_in_any_crs_are_the_same_zones(opened: Opened, tmp_path: Path) -> None:
+    """The far half of the field on the ground in metres, degrees and with axes north before east: one mask."""
+    place = opened(pose=POSE).zones.place
+    west, south, east, north = place.outline.bounds
+    half = shapely.intersection(place.outline, shapely.box(west, (south + north) / 2, east, north))
+    fine = geopandas.GeoSeries([half], crs=place.crs).segmentize((east - west) / 500)
+    masks = []
+    for name, crs in (("utm.gpkg", 32632), ("globe.geojson", 4326), ("web.shp", 3857), ("laea.gpkg", 3035)):
+        path = sketch(tmp_path / name, {"half": fine.to_crs(crs).iloc[0]}, crs)
+        found = opened(pose=POSE, zones={"area": path}).zones.kept
+        assert found is not None
+        masks.append(found.kept)
+    assert 0.2 < masks[0].mean() < 0.8
+    differ = [(mask != masks[0]).sum() for mask in masks]
+    assert max(differ) <= 16  # of 12 288: datums are half a millimetre apart there and back, a pixel has 7
+
+
+@pytest.mark.parametrize(
+    ("shape", "crs", "pose", "words"),
+    [
+        (shapely.box(300, 0, 400, 50), None, False, "expected some in x 0 to 128.*got x 300 to 400"),
+        (shapely.box(10.1, 10.1, 10.3, 10.3), None, False, "smaller than a pixel"),
+        (shapely.box(7.5, 51.9, 7.7, 52), 4326, False, r"WGS 84.*give the rig's \[pose\]"),
+        (shapely.box(8.5, 51.9, 8.7, 52), 4326, True, "longitude 7.6.*got longitude 8.5 to 8.7"),
+    ],
+    ids=["beside", "tiny", "no place", "another farm"],
+)
+def test_an_area_that_is_not_of_the_field_is_refused(
+    opened: Opened, tmp_path: Path, shape: Any, crs: Any, pose: bool, words: str
+) -> None:
+    """One message with both extents, or what is missing."""
+    path = sketch(tmp_path / ("area.gpkg" if crs else "area.geojson"), {"a": shape}, crs)
+    with pytest.raises(ZoneError, match=words):
+        opened(zones={"area": path}, pose=POSE if pose else None)
+
+
+def test_zones_that_leave_nothing_are_refused(opened: Opened, tmp_path: Path) -> None:
+    """A no-go zone over all of the area is a mistake, not an empty map."""
+    path = sketch(tmp_path / "all.geojson", {"all": shapely.box(0, 0, 200, 200)})
+    with pytest.raises(ZoneError, match="nothing is left to survey"):
+        opened(zones={"no_go": path})
+
+
+def test_a_no_go_zone_beside_the_field_is_told(opened: Opened, tmp_path: Path) -> None:
+    """It may belong to another field of the farm: a note with both extents, and the survey goes on."""
+    run = opened(zones={"no_go": sketch(tmp_path / "n.geojson", {"n": shapely.box(200, 0, 210, 9)})})
+    assert run.zones.kept is None
+    assert any("do not lie on the field" in note for note in run.notes)
+
+
+def test_a_name_without_plots_is_refused() -> None:
+    """The message says which flag is missing."""
+    with pytest.raises(SettingsError, match="give --plots FILE too"):
+        load_settings(None, {"zones.plots_name": "variety"})
+
+
+def test_paths_of_zones_start_at_the_settings_file(tmp_path: Path) -> None:
+    """As every path in it does, with the layer of a GeoPackage kept."""
+    (tmp_path / "s.toml").write_text('[zones]\narea = "area.geojson"\nplots = "plots.gpkg:trial"\n')
+    zones = load_settings(tmp_path / "s.toml").zones
+    assert (zones.area, zones.plots) == (str(tmp_path / "area.geojson"), str(tmp_path / "plots.gpkg:trial"))
+    assert zones.no_go is None
