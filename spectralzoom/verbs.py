@@ -86,8 +86,8 @@ def plan(settings: Asked = None, *, preview: str | Path | None = None, **flags: 
     """Tell what `survey` with the same arguments would make, and how long it takes; nothing is captured or written.
 
     Gives what `spectralzoom plan --json` prints: ``field``, how large and how finely seen, ``stages``, each with its
-    state, reason, seconds and bytes, their sums, and the plain ``scans`` of the weights' record. ``preview`` is a PNG to
-    draw the sweeps into. Raises Error where a survey could not be.
+    state, reason, seconds and bytes, their sums, and the plain ``scans`` of the weights' record. Sweeps are drawn into
+    ``preview``, a PNG. Raises Error where a survey could not be.
     """
     asked, picture = _settings(settings, flags), None if preview is None else Path(preview)
     with _working(None):
