@@ -48,7 +48,7 @@ docs: $(BIN)/.ok
 # The notebooks of docs/, run from top to bottom and kept with what they gave. The tests run them without a kernel.
 notebooks: $(BIN)/.ok
 	$(BIN)/python -m pip install -q --no-compile --disable-pip-version-check -c constraints.txt nbclient ipykernel
-	$(BIN)/jupyter-execute --inplace --NotebookClient.record_timing=False docs/notebooks/*.ipynb
+	$(BIN)/python -c "$$RENDER" docs/notebooks/*.ipynb
 
 # Every goal with the peers beside it (BENCH="geometry lookup" for some), then what accuracy costs in time.
 bench: $(BIN)/.ok
@@ -91,3 +91,13 @@ lines.pop("spectralzoom", None)
 target.write_text("\n".join([head, *(lines[name] for name in sorted(lines))]) + "\n")
 endef
 export LOCK
+
+define RENDER
+import sys
+import nbclient, nbformat
+for name in sys.argv[1:]:
+    notebook = nbformat.read(name, 4)
+    nbclient.NotebookClient(notebook, record_timing=False).execute()
+    nbformat.write(notebook, name)
+endef
+export RENDER

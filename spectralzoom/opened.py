@@ -113,12 +113,12 @@ class OpenedRun:
     @property
     def report(self) -> Path:
         """The page for people: one file, opens in any browser."""
-        return self.folder / "report.html"
+        return self._archive.locate(f"runs/{self.name}/report.html")
 
     @property
     def quicklook(self) -> Path:
         """Four panels in one picture."""
-        return self.folder / "quicklook.png"
+        return self._archive.locate(f"runs/{self.name}/quicklook.png")
 
     @property
     def class_names(self) -> tuple[str, ...]:

@@ -82,15 +82,16 @@ def survey(settings: Asked = None, *, progress: Told | None = None, quiet: bool 
     return opened.open(asked.out)[published.folder.name]
 
 
-def plan(settings: Asked = None, **flags: Any) -> dict[str, Any]:
+def plan(settings: Asked = None, *, preview: str | Path | None = None, **flags: Any) -> dict[str, Any]:
     """Tell what `survey` with the same arguments would make, and how long it takes; nothing is captured or written.
 
-    Gives what `spectralzoom plan --json` prints: ``stages``, each with its state, reason, seconds and bytes, their
-    sums, and the plain ``scans`` of the weights' record. Raises Error where a survey could not be.
+    Gives what `spectralzoom plan --json` prints: ``field``, how large and how finely seen, ``stages``, each with its
+    state, reason, seconds and bytes, their sums, and the plain ``scans`` of the weights' record. Sweeps are drawn into
+    ``preview``, a PNG. Raises Error where a survey could not be.
     """
-    asked = _settings(settings, flags)
+    asked, picture = _settings(settings, flags), None if preview is None else Path(preview)
     with _working(None):
-        content: dict[str, Any] = plan_command.plan_content(asked)
+        content: dict[str, Any] = plan_command.plan_content(asked, picture)
     return content
 
 

@@ -36,6 +36,7 @@ VERBS = {  # by what is typed: the module of the function, loaded once it is ask
     "train": "flows.cli.model_verbs",
     "evaluate": "flows.cli.model_verbs",
     "tradeoff": "flows.cli.model_verbs",
+    "completion": "flows.cli.completion",
 }
 GOES_ON = ("survey", "train", "evaluate", "export", "reprocess", "simulate", "serve")  # verbs that keep what is done
 stderr = on_stderr()

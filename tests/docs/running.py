@@ -90,7 +90,7 @@ class Reader:
         return root
 
     def _command(self, block: Block, command: str, word: str, rest: str) -> None:
-        words = shlex.split(command.partition(" > ")[0])
+        words = shlex.split(command.partition(" '>' ")[0])
         program = Path(words[0]).name
         check_words(words, block.place)
         if word == "parses":

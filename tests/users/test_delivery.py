@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -18,6 +19,8 @@ from pathlib import Path
 
 import pytest
 
+from flows.cli.app import VERBS, build_app
+from flows.cli.main import main
 from tests.conftest import WeightsMaker
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -42,6 +45,14 @@ def run(words: Sequence[str | Path], cwd: Path, environment: Mapping[str, str] |
     ended = subprocess.run(given, cwd=cwd, env=environment, capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stderr[-3000:]
     return ended.stdout
+
+
+def may_be_nobody(python: Path) -> bool:
+    """Whether this user may become another, who can run this interpreter."""
+    if os.geteuid() != 0 or shutil.which("setpriv") is None:
+        return False
+    words = [*AS_NOBODY, str(python), "-c", "import ctypes, decimal, lzma, ssl"]
+    return subprocess.run(words, env={}, capture_output=True, check=False).returncode == 0
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +126,7 @@ def test_the_wheel_works_for_a_user_without_a_home(
         folder.chmod(0o755 if folder == place else 0o777)
     shutil.copyfile(scene_files / "scene.png", place / "field.png")
     shutil.copyfile(make_weights(), place / "mine.safetensors")
-    nobody = AS_NOBODY if os.geteuid() == 0 and shutil.which("setpriv") else ()
+    nobody = AS_NOBODY if may_be_nobody(installed / "python") else ()
     bare = {"TMPDIR": str(temporary), "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
     version = run([*nobody, installed / "spectralzoom", "--version"], place, bare)
     told, file, report, stages = json.loads(run([*nobody, installed / "python", "-c", USED, archive], place, bare))
@@ -124,3 +135,32 @@ def test_the_wheel_works_for_a_user_without_a_home(
     assert Path(file).is_relative_to(installed.parent)
     assert Path(report).read_text(encoding="utf-8").lower().startswith("<!doctype html>")
     assert stages > 10
+
+
+def test_the_container_takes_every_package() -> None:
+    """What the image is built from is what the wheel is, and what it runs is what `make survey` runs."""
+    text = (ROOT / "Containerfile").read_text(encoding="utf-8")
+    copied = [word for line in re.findall(r"^COPY (?!--from)(.*) \S+$", text, re.MULTILINE) for word in line.split()]
+    assert set(copied) == {*PACKAGES, *BESIDE, "constraints.txt"}
+    (asked,) = re.findall(r"^CMD (\[.*\])$", text, re.MULTILINE)
+    defaults = dict(re.findall(r"^(\w+) \?= (\S+)$", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    words = ["survey", "--scene", defaults["SCENE"], "--seconds", defaults["SECONDS"], "--out", "/archive"]
+    assert json.loads(asked) == words
+    build_app(listed=False).parse_args(words, exit_on_error=False, print_error=False)
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_the_shell_reads_what_completes_words(shell: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Every verb and its flags are in a script that the shell takes; bash completes by it."""
+    with pytest.raises(SystemExit) as ended:
+        main(["completion", shell])
+    script = capsys.readouterr().out
+    assert not ended.value.code
+    assert all(re.search(rf"\b{verb.split()[-1]}\b", script) for verb in VERBS)
+    assert "budget" in script
+    (tmp_path / "script").write_text(script)
+    if shutil.which(shell):
+        run([shell, "-n", tmp_path / "script"], tmp_path)
+    if shell == "bash":
+        typed = "COMP_WORDS=(spectralzoom survey --budg); COMP_CWORD=2; _spectralzoom; echo ${COMPREPLY[@]}"
+        assert run(["bash", "-c", f"source {tmp_path / 'script'}; {typed}"], tmp_path).split() == ["--budget"]

@@ -13,6 +13,7 @@ from storage.remote.opening import open_archive
 
 pytest.importorskip("obstore", reason="obstore is not installed (extra s3)")
 
+import spectralzoom
 from flows.publish.run_folder import Published
 from flows.survey.survey import STAGES
 from pipeline.errors import SceneError
@@ -69,6 +70,10 @@ def test_a_rerun_makes_nothing_and_moves_next_to_nothing(
     assert states(elsewhere.receipt) <= CACHED
     assert elsewhere.folder != again.folder
     np.testing.assert_array_equal(map_of(open_archive(bucket), elsewhere), beside)
+    monkeypatch.setenv("SPECTRALZOOM_WORK", str(tmp_path / "a desk"))
+    run = spectralzoom.open(bucket).latest
+    np.testing.assert_array_equal(run.class_map, beside)
+    assert run.report.is_file()
 
 
 def test_verbs_read_an_archive_in_a_bucket(
