@@ -52,7 +52,6 @@ Documented = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
 IN_FUNCTIONS = {  # file -> packages that a function of it imports, and why no file's head does
     "flows/publish/survey_command.py": ("PIL", "for Prefect's pages alone"),
     "flows/survey/prefect_engine.py": ("prefect", "that it cannot be imported is told, and the survey runs plain"),
-    "storage/arrays/ground_maps.py": ("odc xarray", "the import registers the accessor, for maps on the ground alone"),
     "storage/parallel/cluster_work.py": ("dask", "half a second, for crews of processes alone"),
     "storage/remote/object_stores.py": ("obstore", "an extra: that it is missing is told"),
 }
@@ -237,7 +236,7 @@ def test_what_is_imported_is_declared() -> None:
     """Every package from outside that the source imports stands in pyproject.toml."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
-    wanted = project["dependencies"] + extras["geo"] + extras["s3"]
+    wanted = project["dependencies"] + extras["s3"]
     declared = {re.split(r"[\[<>=~! ]", item, maxsplit=1)[0].lower() for item in wanted}
     outside = {name.split(".")[0] for tree in source().values() for name in imported(tree)}
     outside -= {*ROOMS, *sys.stdlib_module_names}

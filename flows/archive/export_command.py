@@ -23,12 +23,14 @@ from flows.cli.app import ArchiveName, AsJson, OutFile, Switch, check_outside, s
 from flows.terminal.processes import DONE
 from flows.terminal.progress import print_json
 from pipeline.errors import ArchiveError, PipelineError
+from pipeline.ground.georeference import pixel_side_m
 from storage.archive.staging import take_lock
 from storage.archive.whole_files import remove_leftovers
 from storage.arrays.cubes import open_raw_cube
+from storage.arrays.georeference import load_geobox
 from storage.arrays.ground_maps import load_bands, open_image
 from storage.arrays.layout import SHARD_ROWS
-from storage.export.image_files import EnviFile, need_rasterio, write_cog, write_envi
+from storage.export.image_files import EnviFile, has_map_info, write_cog, write_envi
 from storage.export.qgis_styles import STYLE
 from storage.export.stac_items import (
     COG,
@@ -39,7 +41,6 @@ from storage.export.stac_items import (
     check_owner,
     clean_id,
     footprint,
-    need_pystac,
     projection,
     spectral_bands,
     wavelengths,
@@ -49,8 +50,8 @@ from storage.remote.opening import open_archive
 
 ENVI_NUMBERS = "application/octet-stream"
 NOT_PLACED = (
-    "The survey has no rig pose: its images lie on the camera's angular grid (transforms in radians), and where on "
-    "earth that is is not known."
+    "The survey has no rig pose, and its scene no georeference: its images lie on the camera's angular grid "
+    "(transforms in radians), and where on earth that is is not known."
 )
 RUN_FILES = {
     "receipt.json": ("Receipt", "application/json", ["metadata"]),
@@ -101,8 +102,6 @@ def run_export(
     WavelengthError: its cube lacks bands of an index; ArchiveError: ``out`` is another archive's or cannot be written;
     IncompleteStoreError: a store is missing or damaged.
     """
-    need_rasterio()
-    need_pystac()
     opened = open_exported(open_archive(archive, create=False, write=False), run)
     out = check_outside(out, opened.archive.root)
     about = describe_collection(opened)
@@ -131,7 +130,7 @@ def run_export(
     }
     placed = opened.geobox is not None
     if not placed:
-        console.print("[dim]note: no rig pose in this survey, so the images have no CRS[/]")
+        console.print("[dim]note: neither a rig pose nor the scene says where this lies, so the images have no CRS[/]")
     for path in (*(out / name for name in files.values()), item, collection):
         console.print(f"  {escape(str(path))}", soft_wrap=True)
     return {"run": opened.id, "item": str(item), "collection": str(collection), "placed": placed, "files": files}
@@ -173,8 +172,10 @@ def _export_cubes(export: Export, console: Console) -> None:
     mosaic = open_image(run.path("mosaic"), "values")
     rows, columns, bands = mosaic.shape
     wave, width = load_bands(run.path("mosaic"))
-    text = f"coarse mosaic of {run.id}, scene values; {NOT_PLACED if run.geobox is None else 'camera grid, no CRS'}"
-    file = EnviFile((rows, columns, bands), "<f4", "bil", wave, width, text, nodata=float("nan"))
+    geobox = mosaic.geobox if mosaic.geobox is not None and has_map_info(mosaic.geobox) else None
+    place = NOT_PLACED if run.geobox is None else "camera grid, no CRS" if geobox is None else "on the scene's map"
+    text = f"coarse mosaic of {run.id}, scene values; {place}"
+    file = EnviFile((rows, columns, bands), "<f4", "bil", wave, width, text, float("nan"), geobox)
     _write_cube(export, "mosaic", file, mosaic.rows(), console)
     for path in run.sweeps():
         cube = open_raw_cube(path)
@@ -244,12 +245,12 @@ def name_stores(export: Export) -> None:
     about = {"data_type": "float32", "nodata": "nan", "unit": "1"}
     bands = spectral_bands(*load_bands(run.path("mosaic")), about)
     stores: dict[str, tuple[str, dict[str, Any]]] = {
-        "mosaic": ("Coarse mosaic", {**nowhere, **bands}),
-        "class_map": ("Class map and confidence on the camera's grid", nowhere),
+        "mosaic": ("Coarse mosaic", {**_store_place(run, "mosaic", nowhere), **bands}),
+        "class_map": ("Class map and confidence on the camera's grid", _store_place(run, "class_map", nowhere)),
         "attention": ("Score and rank of the seats", nowhere),
         "patches": ("Fine patches", nowhere),
     }
-    if run.geobox is not None:
+    if run.geobox is not None and run.map_product == "ground_map":
         stores["ground_map"] = ("Class map, confidence and picture on the map", projection(run.geobox))
     for product, (title, fields) in stores.items():
         if run.store(product) is not None:
@@ -260,6 +261,12 @@ def name_stores(export: Export) -> None:
     for name, (title, kind, roles) in RUN_FILES.items():
         if (run.folder / name).is_file():
             export.add(Path(name).stem, run.folder / name, title, kind, roles)
+
+
+def _store_place(run: ExportedRun, product: str, nowhere: Asset) -> Asset:
+    """Where one of the archive's own stores lies, where it says so."""
+    geobox = load_geobox(run.path(product))
+    return nowhere if geobox is None else projection(geobox)
 
 
 def describe_collection(run: ExportedRun) -> Collection:
@@ -289,6 +296,6 @@ def describe_item(export: Export) -> Item:
     outline = None
     if run.geobox is not None:
         properties["proj:code"] = projection(run.geobox)["proj:code"]
-        properties["gsd"] = abs(float(run.geobox.resolution.x))
+        properties["gsd"] = pixel_side_m(run.geobox)
         outline = footprint(run.geobox, seen_rows(run))
     return Item(run.id, receipt["started"], receipt["finished"], properties, export.assets, outline)

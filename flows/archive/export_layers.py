@@ -16,6 +16,7 @@ from flows.publish.receipt import Receipt, check_receipt
 from flows.survey.stages.maps import coarse_colours
 from pipeline.errors import IncompleteStoreError, SettingsError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
+from pipeline.ground.georeference import zoomed_out
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.archive.records import RECEIPT, read_run
@@ -69,8 +70,13 @@ class ExportedRun:
 
     @cached_property
     def geobox(self) -> GeoBox | None:
-        """Where the run's map lies on the earth; None without a pose."""
-        return None if self.store("ground_map") is None else load_geobox(self.path("ground_map"))
+        """Where the run's map lies on the earth, by its pose or its scene's file; None where neither says it."""
+        return load_geobox(self.path(self.map_product))
+
+    @property
+    def map_product(self) -> str:
+        """The map that is exported: the one on the ground, where there is a pose."""
+        return "class_map" if self.store("ground_map") is None else "ground_map"
 
 
 def open_exported(archive: Archive, name: str | None) -> ExportedRun:
@@ -106,20 +112,15 @@ class Layer:
     fields: Mapping[str, Any] = field(default_factory=dict)  # STAC's, beside its bands and its grid
 
 
-def map_product(run: ExportedRun) -> str:
-    """Which store a run's map is exported from: on the ground where there is one, else on the scene's own grid."""
-    return "class_map" if run.store("ground_map") is None else "ground_map"
-
-
 def map_layers(run: ExportedRun) -> list[Layer]:
     """Class map, confidence, attention (on its seats) and picture: on the map where there is one, else on angles."""
-    product = "class_map" if run.geobox is None else "ground_map"
+    product = run.map_product
     about = open_image(run.path(product), "classes").about
     colours = np.array(about.get("class_colours", ()), np.uint8).reshape(-1, 3)
     legend = ClassNames(tuple(about.get("class_names", ())), colours)
     drawn = _layer(run, product, "classes", ("class",), nodata=UNLABELLED, legend=legend)
     sure = _layer(run, product, "confidence", ("confidence",), nodata=np.nan)
-    seen = _picture(run) if run.geobox is None else _layer(run, product, "picture", RGB, nodata=0)
+    seen = _picture(run) if product == "class_map" else _layer(run, product, "picture", RGB, nodata=0)
     score = _of_seats(run, "attention", "score", ("score",))
     layers = [
         Layer("class_map", "Class map", ("data",), *drawn, fields=classes(legend)),
@@ -147,8 +148,8 @@ def layer_tags(run: ExportedRun, product: str, place: Place) -> dict[str, str]:
 
 def _place(run: ExportedRun, stored: StoredImage) -> Place:
     """Where a store's images lie, as the store itself says."""
-    if run.geobox is not None and stored.on_map:
-        return Place.on_map(run.geobox)
+    if stored.geobox is not None:
+        return Place.on_map(stored.geobox)
     transform = stored.about.get("spatial:transform")
     if transform is None:
         raise IncompleteStoreError(f"the {stored.name} of run {run.id} do not say where they lie; verify the archive")
@@ -174,13 +175,15 @@ def _layer(
 def _of_seats(
     run: ExportedRun, product: str, array: str, bands: tuple[str, ...]
 ) -> tuple[CogImage, Callable[[], Rows]]:
-    """A figure of each seat, on the angular grid that their size in pixels gives."""
+    """A figure of each seat, on the grid of the scene that their size in pixels gives."""
     stored, patch = open_image(run.path(product), array), open_image(run.path("patches"), "valid").shape[1]
     scene = grid_of(open_image(run.path("class_map"), "classes").about)
     if scene is None:
         raise IncompleteStoreError(f"the class map of run {run.id} does not say its grid; run its survey again")
     shape = (stored.shape[0], stored.shape[1])
-    place = Place.on_angles(replace(scene, factor=patch), shape)
+    geobox = load_geobox(run.path("class_map"))
+    on_angles = Place.on_angles(replace(scene, factor=patch), shape)
+    place = on_angles if geobox is None else Place.on_map(zoomed_out(geobox, patch, shape))
     policy = {"policy": str(stored.about.get("policy", ""))} if product == "attention" else {}
     tags = {**layer_tags(run, product, place), **policy, "seat_px": str(patch)}
     return CogImage(shape, stored.dtype.name, place, bands, np.nan, tags=tags), stored.rows
@@ -201,6 +204,11 @@ def _picture(run: ExportedRun) -> tuple[CogImage, Callable[[], Rows]]:
 
 def seen_rows(run: ExportedRun) -> Iterator[tuple[int, NDArray[np.bool_]]]:
     """Where a run's map shows anything, some rows at a time."""
+    if run.map_product == "class_map":
+        yield from (
+            (first, found != UNLABELLED) for first, found in open_image(run.path("class_map"), "classes").rows()
+        )
+        return
     found, pictures = (open_image(run.path("ground_map"), name).rows() for name in ("classes", "picture"))
     for (first, numbers), (_, picture) in zip(found, pictures, strict=True):
         yield first, (numbers != UNLABELLED) | (picture.max(axis=2) > 0)

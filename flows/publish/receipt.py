@@ -78,6 +78,7 @@ class Accuracy(Score):
     all: Score
     gap_closed: float | None
     controls: dict[str, Control]
+    confusion: NotRequired[list[list[int]]]  # pixels by label (row) and mapped class; receipts of before have none
     controls_mode: NotRequired[dict[str, Any]]  # seats of the controls, and their share of samples, lines, seconds
 
 
@@ -104,7 +105,7 @@ class Receipt(TypedDict):
     memory: NotRequired[dict[str, Any]]  # what became of what was remembered, where the map goes on from an earlier run
     pointing: NotRequired[dict[str, Any]]  # only where the mirror may look beside the plan
     lines: NotRequired[dict[str, Any]]  # sweeps with lines lost, repeated, out of order, late or invalid
-    ground: NotRequired[dict[str, Any]]  # only with a pose: grid and hectares
+    ground: NotRequired[dict[str, Any]]  # only with a pose or a placed scene: grid, hectares
     pixels: NotRequired[dict[str, int]]  # only where some have no value, no reading or no class: how many
     products: dict[str, str]
 

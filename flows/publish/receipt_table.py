@@ -161,7 +161,7 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
     if "ground" in found:
         ground = found["ground"]
         areas = [f"{name.replace('_', ' ')} {area_words(area)}" for name, area in ground["areas_ha"].items() if area]
-        place = f"{ground['crs']}, {ground['resolution_m']:g} m a pixel"
+        place = f"{ground['crs']}, {ground['resolution_m']:.4g} m a pixel"
         words.append(f"On the ground ({place}) the classes cover {', '.join(areas)}.")
     return words
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.publish.change_picture import change_pictures
+from flows.publish.ground_findings import placed_findings, posed_findings
 from flows.publish.panels import draw_ground
 from flows.publish.quicklook import QuicklookData, draw_quicklook
 from flows.publish.receipt import AccuracyIs, Header, Receipt, build_receipt, check_receipt, with_accuracy
@@ -298,21 +299,16 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     if pointing:
         found["pointing"] = {"prior_px": run.settings.pointing_px, **pointing}
     for ground_map in products.there(["ground"]):
-        drawn = load_ground_map(ground_map.path / STORE)
-        found["ground"] = {
-            "crs": str(drawn.geobox.crs),
-            "resolution_m": abs(float(drawn.geobox.resolution.x)),
-            "shape": [int(size) for size in drawn.geobox.shape],
-            "areas_ha": {name: area["ha"] for name, area in drawn.areas.items()},
-        }
+        found["ground"] = posed_findings(load_ground_map(ground_map.path / STORE))
     class_map = products.of("draw_map")
-    classes = load_class_map(class_map.path / "class_map.zarr").classes
+    drawn = load_class_map(class_map.path / "class_map.zarr")
+    found |= placed_findings(run, drawn)
     pixels = {
         "scene_without_a_value": run.scene.filled_px,
         "coarse_px_no_reading": 0,
         "fine_px_no_reading": 0,
         **{f"{name}_no_reading": count for name, count in strange_pixels(class_map).items()},
-        "map_without_a_class": int(np.count_nonzero(classes == UNLABELLED)),
+        "map_without_a_class": int(np.count_nonzero(drawn.classes == UNLABELLED)),
     }
     if any(pixels.values()):
         found["pixels"] = pixels

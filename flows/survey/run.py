@@ -42,6 +42,7 @@ from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
+from pipeline.ground.georeference import georeference_record
 from pipeline.ground.map_grid import ground_grid
 from pipeline.ground.view import GroundView
 from pipeline.lazy import Once
@@ -52,6 +53,7 @@ from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 from pipeline.source import References
 from storage.archive.archive import Archive
+from storage.archive.keys import array_digest
 from storage.arrays.layout import AngularGrid, image_spec
 from storage.arrays.tile_work import MosaicWork, tile_budget
 from storage.readers.raster_files import load_raster
@@ -155,6 +157,13 @@ class SurveyRun(CaptureRun):
     def vgg(self) -> VggFile | None:
         """VGG19 for the policies ``vgg-static`` and ``vgg-trained``."""
         return _vgg_file(self.settings)
+
+    @property
+    def place_key(self) -> dict[str, Any]:
+        """What images on the scene's pixels depend on beside what was seen: where they lie, and what is no scene."""
+        missing = self.scene.missing
+        gaps = {} if missing is None else {"missing": array_digest(missing)}
+        return {**georeference_record(self.scene.geobox), **gaps}
 
     def angular_grid(self, factor: int = 1) -> AngularGrid:
         """Where pixels of ``factor`` fine px lie."""

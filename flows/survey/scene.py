@@ -36,6 +36,7 @@ else:
 
 # Peak of a survey of the farm without controls: 1.58 GB for 1280 x 1024 px, 4.12 GB for 2560 x 2560 px
 FARM_BYTES, FARM_BYTES_PER_PX = 1_000_000_000, 490
+POSE_WINS = "the scene's own place on the earth is set aside: [pose] says where it lies; leave [pose] out to keep it"
 SAME_HOUR = 0.5  # by which true solar time is at most off mean solar time, and whoever rounds it [h]
 
 
@@ -53,13 +54,15 @@ def open_scene(settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
     file = load_scene_file(
         settings.scene, labels=settings.labels, bands=settings.bands, wavelengths=settings.wavelengths
     )
-    scene = scene_of_file(file, settings.camera)
+    scene, notes = scene_of_file(file, settings.camera), file.provenance
+    if scene.geobox is not None and settings.pose is not None:  # one place a run
+        scene, notes = replace(scene, geobox=None), (*notes, POSE_WINS)
     if not scene.filled_px:
-        return scene, file.provenance
+        return scene, notes
     void = 0 if scene.missing is None else int(np.count_nonzero(scene.missing))
     unclassed = f"; {void} without most of their bands have no class in the map" if void else ""
     gaps = f"{scene.filled_px} pixels without a value were given their band's median{unclassed}"
-    return scene, (*file.provenance, gaps)
+    return scene, (*notes, gaps)
 
 
 def _field_before_rig(settings: Settings) -> RasterScene:

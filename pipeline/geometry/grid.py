@@ -65,6 +65,14 @@ class SceneGrid:
         return np.stack([rows, columns], axis=-1).astype(np.intp) * self.patch
 
 
+def seat_pixels(grid: SceneGrid, image: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Cut a (y, x) image of the scene into seats, (seat, y, x) by their numbers; False beyond the scene."""
+    (rows, columns), p = grid.seat_shape, grid.patch
+    padded = np.zeros(grid.padded_shape, np.bool_)
+    padded[: grid.height, : grid.width] = image
+    return padded.reshape(rows, p, columns, p).transpose(0, 2, 1, 3).reshape(rows * columns, p, p)
+
+
 def pad_by_reflection(image: NDArray[np.generic], shape: tuple[int, int]) -> NDArray[np.generic]:
     """Grow the first two axes to ``shape`` by reflection (by the edge pixel where reflection has nothing to show)."""
     grown = image

@@ -59,6 +59,7 @@ from storage.archive.staging import (
     retire,
     take_lock,
 )
+from storage.arrays.layout import consolidate_stores
 
 __all__ = ["Archive", "Cost", "RunDraft", "StageRef", "StagedStore", "stage_key"]
 
@@ -162,6 +163,7 @@ class Archive:
                 yield StagedStore(part, ref, done)
                 if not done:
                     facts |= {"cost": cost_since(start, work), "created": date_of_store(self.root, ref.uri)}
+                    consolidate_stores(part)
                     write_manifest(part, facts)
                     self._put_in_place(part, final)
             finally:

@@ -31,6 +31,8 @@ from storage.arrays.layout import (
 STEP, FAINTEST, NOTHING = 0.05, -12.7, 255  # nats; 254 is certainty, 255 that nothing is known
 DAY_STEP, NEVER = 0.125, 65535
 OCTAVE_STEP, DARKEST, DARK = 0.0625, -10.0, 255  # log2 of reference exposures; 255 where there was no light
+# what the images of a pixel hold of which nothing is known
+UNKNOWN = {"log_probability": NOTHING, "age": NEVER, "log2_light": DARK}
 Floats = NDArray[np.float32]
 
 

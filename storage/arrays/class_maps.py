@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -111,29 +110,11 @@ def check_named(classes: NDArray[np.integer], count: int) -> None:
         raise ShapeError(f"class {worst} is in the map, but only {count} classes have names")
 
 
-def clear_classes(path: Path, where: NDArray[np.bool_]) -> None:
-    """Take the class from some pixels of a stored map: 255, and a confidence of NaN.
-
-    ``where`` is (y, x), True for those pixels. Raises IncompleteStoreError where there is no map.
-    """
-    group = open_group(path)
-    array = group["classes"]
-    assert isinstance(array, zarr.Array)
-    steps = array.shards or array.shape
-    rows, columns = (range(0, size, step) for size, step in zip(array.shape, steps, strict=True))
-    for top, left in product(rows, columns):
-        place = np.s_[top : top + steps[0], left : left + steps[1]]
-        if where[place].any():
-            classes = np.where(where[place], UNLABELLED, read_array(group, "classes", place))
-            confidence = np.where(where[place], np.nan, read_array(group, "confidence", place))
-            write_class_tile(path, (top, left), classes, confidence)
-
-
 def class_flags(names: Sequence[str], colours: NDArray[np.uint8]) -> dict[str, Any]:
     """CF's flag attributes of an image of class indices."""
     return {
         "long_name": "class",
-        "_FillValue": UNLABELLED,
+        "nodata": UNLABELLED,  # no _FillValue: xarray would make fractions of the numbers
         "flag_values": list(range(len(names))),
         "flag_meanings": " ".join("_".join(name.split()) for name in names),
         "flag_colors": " ".join("#{:02x}{:02x}{:02x}".format(*colour) for colour in colours.tolist()),

@@ -27,6 +27,7 @@ from storage.arrays.layout import (
     read_array,
     read_bands,
     write_bands,
+    write_counts,
     write_small,
 )
 from storage.arrays.quicklooks import LineThumbnail, Quicklook, quicklook_of, write_quicklook
@@ -87,6 +88,7 @@ class RawCubeWriter:
         self._group = create_group(path, f"raw sweep {header.sweep.name}", facts)
         bands = write_bands(self._group, header.wavelength_nm, header.fwhm_nm)
         about = {"long_name": "raw numbers of the camera", "units": "1", "coordinates": f"{bands} {_LINE_COORDINATES}"}
+        write_counts(self._group, line=header.shape[0], sample=header.shape[1])
         spec = image_spec(("line", "sample", "band"), header.shape, "<u2")
         self._dn = create_array(self._group, "dn", spec, about)
         known = header.references

@@ -161,10 +161,14 @@ def load_geobox(path: Path) -> GeoBox | None:
 
     Raises IncompleteStoreError: the store is missing, or what says its grid is damaged.
     """
-    group = open_group(path)
+    return geobox_of_group(open_group(path))
+
+
+def geobox_of_group(group: zarr.Group) -> GeoBox | None:
+    """Read the grid of an opened store; None where it lies on an angular grid (IncompleteStoreError: damaged)."""
     if GRID_MAPPING not in group:
         return None
-    with damage_named(f"the grid of {path}"):
+    with damage_named(f"the grid of {group.store_path}"):
         sizes = {name: array.shape[0] for name, array in group.arrays() if name in ("x", "y")}
         said = {**dict(group.attrs), "grid_mapping": GRID_MAPPING}
         geobox = find_geobox(said, dict(group.arrays()), (sizes["y"], sizes["x"]), ("y", "x"))

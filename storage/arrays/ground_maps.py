@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import IncompleteStoreError, ShapeError
 from storage.arrays.class_maps import CONFIDENCE, ClassNames, check_named, class_flags, legend_of
-from storage.arrays.georeference import GRID_MAPPING, ON_THE_MAP, load_geobox, map_attributes, write_map_coordinates
+from storage.arrays.georeference import ON_THE_MAP, geobox_of_group, load_geobox, map_attributes, write_map_coordinates
 from storage.arrays.layout import (
     SHARD_COLUMNS,
     SHARD_ROWS,
@@ -52,9 +52,9 @@ class StoredImage:
         return dict(self.group.attrs)
 
     @property
-    def on_map(self) -> bool:
-        """Whether the store says where on the earth it lies."""
-        return GRID_MAPPING in self.group
+    def geobox(self) -> GeoBox | None:
+        """Where on the earth it lies; None where its store does not say."""
+        return geobox_of_group(self.group)
 
     def rows(self) -> Iterator[tuple[int, NDArray[Any]]]:
         """Rows with the number of the first, as many at a time as a shard has.

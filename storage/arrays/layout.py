@@ -6,6 +6,7 @@ and a flipped bit is an error instead of a wrong number. Codecs to choose from a
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -115,10 +116,10 @@ def whole_shards(what: str, place: Sequence[slice], shape: Sequence[int], shards
 
 
 def create_array(group: zarr.Group, name: str, spec: ArraySpec, attributes: Mapping[str, Any]) -> zarr.Array[Any]:
-    """Add an empty array: NaN where floating, 0 or ``_FillValue`` where not; a chunk's checksum comes last."""
+    """Add an empty array: NaN where floating; ``_FillValue``, ``nodata`` or 0 where not; checksums come last."""
     kind = np.dtype(spec.dtype)
     blosc = BloscCodec(cname="zstd", clevel=3, shuffle=BloscShuffle.bitshuffle, typesize=kind.itemsize)
-    fill: Any = np.nan if kind.kind == "f" else attributes.get("_FillValue", 0)
+    fill: Any = np.nan if kind.kind == "f" else attributes.get("_FillValue", attributes.get("nodata", 0))
     return group.create_array(
         name,
         shape=spec.shape,
@@ -140,6 +141,13 @@ def write_small(
     array = create_array(group, name, spec, attributes)
     if values.size:
         array[...] = values
+
+
+def write_counts(group: zarr.Group, **sizes: int) -> None:
+    """Store coordinates that count along axes from 0, by the axes' names."""
+    for name, size in sizes.items():
+        about = {"long_name": f"number of the {name.replace('_', ' ')}, from 0", "units": "1"}
+        write_small(group, name, (name,), np.arange(size), about)
 
 
 def write_image(
@@ -165,6 +173,18 @@ def write_bands(group: zarr.Group, wavelength_nm: NDArray[np.float64], fwhm_nm: 
         raise ShapeError(f"fwhm has shape {widths.shape}, wavelengths {centre.shape}; give one a band")
     write_small(group, "fwhm", ("band",), widths, {"long_name": "full width at half maximum", "units": "nm"})
     return "wavelength fwhm"
+
+
+def consolidate_stores(folder: Path) -> None:
+    """Put the metadata of all arrays of each store in a folder together, so that it opens at once and without a word.
+
+    After this nothing may be written to the stores' attributes.
+    """
+    for path in sorted(folder.glob("*.zarr")):
+        if (path / "zarr.json").is_file():
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", "Consolidated metadata is currently not part")  # zarr's, of its v3
+                zarr.consolidate_metadata(path)
 
 
 def open_group(path: Path) -> zarr.Group:

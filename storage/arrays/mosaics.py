@@ -28,6 +28,7 @@ from storage.arrays.layout import (
     round_bits,
     whole_shards,
     write_bands,
+    write_counts,
     write_image,
     write_small,
 )
@@ -194,8 +195,7 @@ class PatchWriter:
             ("seat_x", origin_px[:, 1], "column of the patch's first pixel"),
         ):
             write_small(group, name, ("patch",), np.asarray(values, np.int64), {"long_name": meaning, "units": "1"})
-        for name, meaning in (("y", "row within the patch"), ("x", "column within the patch")):
-            write_small(group, name, (name,), np.arange(patch_px), {"long_name": meaning, "units": "1"})
+        write_counts(group, patch=count, y=patch_px, x=patch_px)
         coordinates = " ".join(["seat seat_y seat_x", *write_corners(group, grid, origin_px)])
         self._count = count
         shape = (count, patch_px, patch_px)
@@ -272,6 +272,7 @@ def write_attention(path: Path, attention: Attention) -> None:
     if attention.score.shape != attention.rank.shape or attention.score.ndim != 2:
         raise ShapeError(f"score {attention.score.shape} and rank {attention.rank.shape} must both be (seat_y, seat_x)")
     group = create_group(path, "attention", {"policy": attention.policy})
+    write_counts(group, seat_y=attention.score.shape[0], seat_x=attention.score.shape[1])
     dims = ("seat_y", "seat_x")
     about = {"long_name": f"worth of a fine look, policy {attention.policy}", "units": "1"}
     write_image(group, "score", dims, np.asarray(attention.score, np.float64), about)

@@ -164,6 +164,10 @@ class Thumbnail:
         y, x = (-(-one.start // step) for one, step in zip((rows, columns), self.cut.steps, strict=True))
         self.image[y : y + part.shape[0], x : x + part.shape[1]] = part
 
+    def blank(self, where: NDArray[np.bool_]) -> None:
+        """Leave (y, x) pixels of the mosaic out of the picture."""
+        self.image[where[:: self.cut.steps[0], :: self.cut.steps[1]]] = np.nan
+
 
 @dataclass(frozen=True)
 class TileBudget:

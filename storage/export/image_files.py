@@ -74,24 +74,14 @@ class CogImage:
     fwhm_nm: Sequence[float] | None = None
 
 
-def need_rasterio() -> Any:
-    """The module rasterio; ArchiveError saying how to get it where it is not installed."""
-    try:
-        return importlib.import_module("rasterio")
-    except ImportError as error:
-        raise ArchiveError(
-            "export writes GeoTIFF, which needs rasterio, and it is not installed; pip install 'spectralzoom[geo]'"
-        ) from error
-
-
 def write_cog(path: Path, image: CogImage, blocks: Blocks) -> None:
     """Write one file, replacing what was there as a whole. Blocks come in order; memory: one block, not the image.
 
     Classes get a colour table, their names as tags of the band, and as GDAL's category names in ``NAME.aux.xml``.
-    Raises ShapeError: the blocks do not fill the image. ArchiveError: rasterio is not installed, the disk refuses, or
+    Raises ShapeError: the blocks do not fill the image. ArchiveError: the disk refuses, or
     what was written does not read back the same.
     """
-    rasterio = need_rasterio()
+    rasterio = importlib.import_module("rasterio")
     copy = importlib.import_module("rasterio.shutil").copy
     sidecar = f"{path.name}.aux.xml"
     with written_aside(path.parent, [path.name] if image.legend is None else [path.name, sidecar]) as aside:
@@ -191,7 +181,7 @@ def value_span(path: Path, bands: Sequence[int], share: float = 0.02) -> tuple[f
 
     Of at most 512 x 512 pixels of the file.
     """
-    with need_rasterio().open(path) as file:
+    with importlib.import_module("rasterio").open(path) as file:
         y, x = (min(size, TILE) for size in file.shape)
         values = file.read(list(bands), out_shape=(len(bands), y, x), masked=True).astype(np.float64).filled(np.nan)
     known = values[np.isfinite(values)]
@@ -207,7 +197,7 @@ def cog_problems(path: Path) -> list[str]:
     Checked: GDAL's own note of the layout, tiles (or a single one), overviews down to one tile, halving from level to
     level, all directories before all pixels with the full image's first, and overviews' pixels before the image's.
     """
-    rasterio = need_rasterio()
+    rasterio = importlib.import_module("rasterio")
     with rasterio.open(path) as file:
         problems = [] if file.tags(ns="IMAGE_STRUCTURE").get("LAYOUT") == "COG" else ["GDAL does not call it a COG"]
         levels = file.overviews(1)
@@ -322,10 +312,17 @@ def _listed(words: list[str]) -> str:
     return "{" + ", ".join(words) + "}"
 
 
+def has_map_info(geobox: GeoBox) -> bool:
+    """Whether ENVI's header can say where an image lies: north is up, and the CRS counts metres."""
+    a, b, _, d, e, _ = (float(number) for number in geobox.affine[:6])
+    metres = geobox.crs is not None and geobox.crs.projected and "metre" in geobox.crs.units
+    return metres and not b and not d and a > 0 > e
+
+
 def _map_fields(geobox: GeoBox) -> Iterator[tuple[str, str]]:
     """Where the upper left pixel's corner lies, the pixels' sides, and the CRS as the WKT that ENVI reads."""
-    a, b, c, d, e, f = (float(number) for number in geobox.affine[:6])
-    if b or d or a <= 0 or e >= 0 or geobox.crs is None:
+    a, _, c, _, e, f = (float(number) for number in geobox.affine[:6])
+    if not has_map_info(geobox) or geobox.crs is None:
         raise PoseError(f"ENVI's map info takes a grid with north up and a CRS, got {geobox!r}")
     crs = pyproj.CRS.from_wkt(geobox.crs.to_wkt())
     zone = crs.utm_zone  # such as 32N; None where the projection is another

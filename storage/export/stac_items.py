@@ -63,9 +63,10 @@ def footprint(geobox: GeoBox, seen: Iterable[tuple[int, NDArray[np.bool_]]]) -> 
     points = np.concatenate(corners) if corners else np.empty((0, 2), np.intp)
     if not len(points):
         return None
-    a, _, c, _, e, f = (float(number) for number in geobox.affine[:6])
-    places = np.stack([c + a * points[:, 0], f + e * points[:, 1]], axis=-1)
-    hull = multipoint(places.tolist(), geobox.crs).convex_hull.simplify(abs(a))
+    a, b, c, d, e, f = (float(number) for number in geobox.affine[:6])
+    x, y = points.T
+    places = np.stack([a * x + b * y + c, d * x + e * y + f], axis=-1)
+    hull = multipoint(places.tolist(), geobox.crs).convex_hull.simplify(float(np.hypot(a, d)))
     to_degrees = pyproj.Transformer.from_crs(map_attributes(geobox)["proj:wkt2"], "EPSG:4326", always_xy=True)
     ring = np.round(np.stack(to_degrees.transform(*np.array(hull.json["coordinates"][0]).T[:2]), axis=-1), _DIGITS)
     x, y = (ring - ring[0]).T
@@ -149,23 +150,13 @@ class Collection:
     summaries: Mapping[str, Any] = field(default_factory=dict)
 
 
-def need_pystac() -> Any:
-    """The module pystac; ArchiveError saying how to get it where it is not installed."""
-    try:
-        return importlib.import_module("pystac")
-    except ImportError as error:
-        raise ArchiveError(
-            "export describes its files with pystac, and it is not installed; pip install 'spectralzoom[geo]'"
-        ) from error
-
-
 def write_stac(folder: Path, collection: Collection, item: Item) -> tuple[Path, Path]:
     """Write ``ID/ID.json`` and the collection of all items that lie in ``folder``; gives both paths.
 
-    Raises ArchiveError: pystac is not installed, the folder is another collection's, one of its items cannot be read,
+    Raises ArchiveError: the folder is another collection's, one of its items cannot be read,
     or what would be written does not fit STAC's own schemas.
     """
-    pystac = need_pystac()
+    pystac = importlib.import_module("pystac")
     check_owner(folder, collection.id)
     root = pystac.Collection(
         collection.id,

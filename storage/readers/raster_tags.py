@@ -22,10 +22,12 @@ from storage.readers.scene_toml import BandWavelengths
 if TYPE_CHECKING:  # half a second to import, for files with a place alone
     import odc.geo.crs as odc_crs
     import odc.geo.geobox as odc_geobox
+    import pyproj
     from odc.geo.geobox import GeoBox
 else:
     odc_crs = deferred("odc.geo.crs")
     odc_geobox = deferred("odc.geo.geobox")
+    pyproj = deferred("pyproj")
 
 Notes = tuple[str, ...]
 _CENTRES = ("wavelength", "wavelength_nm", "center_wavelength", "centre_wavelength", "central_wavelength")
@@ -43,7 +45,11 @@ def place_of_file(file: Any) -> tuple[GeoBox | None, Notes]:
         return None, (told,) if other else ()
     if file.crs is None:
         return None, ("it has a transform and no CRS, so that its place on the earth is not known (gdal_edit -a_srs)",)
-    return odc_geobox.GeoBox(file.shape, file.transform, odc_crs.CRS(file.crs.to_wkt())), ()
+    crs = pyproj.CRS.from_wkt(file.crs.to_wkt())
+    if not (crs.is_projected or crs.is_geographic):
+        return None, (f"its CRS, {crs.name!r}, is none of the earth; its place is not known",)
+    code = crs.to_epsg()  # the same CRS by whichever words a file has it
+    return odc_geobox.GeoBox(file.shape, file.transform, odc_crs.CRS(crs.to_wkt() if code is None else code)), ()
 
 
 def place_of_envi(header: Mapping[str, str], data: Path, shape: tuple[int, int]) -> tuple[GeoBox | None, Notes]:

@@ -92,7 +92,7 @@ def load_scene_file(
         found, label_note = layout.labels, (layout.label_note,)
     count, widths = cube.shape[2], None if light.fwhm_nm is None else light.fwhm_nm.tolist()
     some_bands = () if chosen == list(range(count)) else (f"bands {bands_text(chosen)} of {count}, counted from 0",)
-    stated = () if settings.nodata is None else (f"nodata {settings.nodata!r}",)
+    stated: tuple[str, ...] = () if settings.nodata is None else (f"nodata {settings.nodata!r}",)
     stated += () if gaps is None else (f"void {hashlib.sha256(np.packbits(gaps).tobytes()).hexdigest()}",)
     light_hash = _digest(_content_hash(file, raster), variable, chosen, light.centre_nm.tolist(), widths, *stated)
     content_hash = light_hash

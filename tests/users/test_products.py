@@ -19,14 +19,18 @@ from isoxml.converter.np_grid import to_numpy_array
 from isoxml.util.isoxml_io import isoxml_from_path
 from rich.console import Console
 
+from flows.archive import export_zones
 from flows.archive.export_command import run_export
+from flows.archive.export_layers import open_exported
 from flows.archive.product_choice import ProductFlags, choose_products
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from pipeline.errors import SettingsError, WavelengthError
 from pipeline.ground.map_grid import ground_grid, image_at
 from pipeline.ground.view import GroundView, RigPose
+from pipeline.planning.orientation import CropRows
 from pipeline.products.indices import find_index
+from storage.archive.archive import Archive
 from storage.export.image_files import cog_problems
 from storage.export.stac_items import stac_problems
 from storage.readers.scene_files import load_scene_file
@@ -40,12 +44,12 @@ FLAGS = {
     "reflectance": True,
     "indices": "NDVI,SAVI",
     "polygons": True,
-    "prescription": "weed=2.5,maize=1",
+    "prescription": "track=2.5,grass=1",
     "cell": 3.0,
-    "heading": "rows",
+    "heading": "20",
     "least_share": 0.1,
     "least_area": 0.6,
-    "buffer": "weed=0.8",
+    "buffer": "track=0.8",
 }
 
 
@@ -162,16 +166,34 @@ def test_prescribed_cells_hold_the_dose_of_their_classes(posed: Products) -> Non
     assert set(cells.dose) == {0.0, 1.0, 2.5}
     np.testing.assert_allclose(cells.area, 9.0)
     x, y, classes, names = _classes_of_polygons(posed)
-    maize = (classes == names.index("maize")).ravel()
+    grass = (classes == names.index("grass")).ravel()
     tree = shapely.STRtree(shapely.points(x.ravel(), y.ravel()))
     sure = 0
     for cell, dose in zip(cells.geometry, cells.dose, strict=True):
         inside = tree.query(cell, predicate="contains")
-        share = maize[inside].mean() if len(inside) else 0.0
+        share = grass[inside].mean() if len(inside) else 0.0
         if share > 0.5:  # far above the least share, whatever the small regions and borders did
             assert dose >= 1.0
             sure += 1
     assert sure > 10
+
+
+def test_cells_lie_along_the_heading(posed: Products) -> None:
+    """The first side of each cell is turned by it, clockwise from the map's north."""
+    corners = shapely.get_coordinates(geopandas.read_file(posed.file("prescription")).geometry).reshape(-1, 5, 2)
+    turned = np.rad2deg(np.arctan2(*np.diff(corners, axis=1).transpose(2, 0, 1))) % 90
+    np.testing.assert_allclose(turned, 20, atol=1e-3)
+
+
+def test_the_heading_of_rows_follows_the_picture(posed: Products, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rows across the picture run square to where the rig looks, rows down it along: to the meridians' convergence."""
+    run = open_exported(Archive.open(posed.archive), None)
+    for angle, heading in ((0.0, POSE.heading_deg + 90), (90.0, POSE.heading_deg)):
+        monkeypatch.setattr(export_zones, "find_rows", lambda image, angle=angle: CropRows(angle, 1.0))
+        assert export_zones.row_heading(run) == pytest.approx(heading, abs=1.0)
+    monkeypatch.setattr(export_zones, "find_rows", lambda image: CropRows(None, 0.0))
+    with pytest.raises(SettingsError, match="no crop rows are seen in this run; give --heading in degrees"):
+        export_zones.row_heading(run)
 
 
 def test_task_data_hold_what_the_map_says(posed: Products) -> None:
@@ -189,10 +211,10 @@ def test_task_data_hold_what_the_map_says(posed: Products) -> None:
     assert row[known].min() >= 0
     assert row[known].max() < grid.maximum_row
     assert column[known].max() < grid.maximum_column
-    maize, total = np.zeros(doses.shape), np.zeros(doses.shape)
+    grass, total = np.zeros(doses.shape), np.zeros(doses.shape)
     np.add.at(total, (row[known], column[known]), 1)
-    np.add.at(maize, (row[known], column[known]), classes[known] == names.index("maize"))
-    mostly = (total > 4) & (maize > 0.5 * total)
+    np.add.at(grass, (row[known], column[known]), classes[known] == names.index("grass"))
+    mostly = (total > 4) & (grass > 0.5 * total)
     assert mostly.sum() > 10
     assert (doses[mostly] >= 1.0).all()
     assert (doses[total == 0] == 0).all()
@@ -209,8 +231,10 @@ def test_a_table_of_areas_adds_up(posed: Products) -> None:
     np.testing.assert_allclose([float(row["hectares"]) for row in table], [hectares[name] for name in names], rtol=1e-5)
     for column in ("share", "estimated_share"):
         assert sum(float(row[column]) for row in table) == pytest.approx(1, abs=1e-4)
-    assert {row["estimated_from"] for row in table} == {"probabilities"}
+    assert {row["estimated_from"] for row in table} == {"labels"}
     assert all(float(row["standard_error_share"]) >= 0 for row in table)
+    by_labels = np.array(posed.receipt["accuracy"]["confusion"])
+    assert by_labels.sum() == posed.receipt["accuracy"]["pixels"]
 
 
 def test_the_catalogue_names_every_product(posed: Products) -> None:
@@ -262,6 +286,7 @@ def test_a_survey_without_a_place_has_what_needs_none(one_picture: Products) -> 
     with one_picture.file("areas").open() as text:
         table = list(csv.DictReader(text))
     assert {row["hectares"] for row in table} == {""}
+    assert {row["estimated_from"] for row in table} == {"labels"}
     assert sum(int(row["pixels"]) for row in table) == pixels
     for flags in ({"prescription": "class_1=1"}, {"polygons": True, "least_area": 1.0}):
         with pytest.raises(SettingsError, match=r"metres, and the run does not say where .* \[pose\]"):

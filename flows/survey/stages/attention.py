@@ -14,6 +14,7 @@ from flows.survey.run import SurveyRun
 from flows.survey.stage import Product, Wanted, stage
 from models.policies.policies import IMAGE_POLICIES, SEEDED_POLICIES, SEEING_POLICIES, score_seats
 from models.reading.inference import Glance
+from pipeline.geometry.grid import seat_pixels
 from pipeline.geometry.scan import Sweep, exposing
 from pipeline.planning.fine_pass import FinePlan, plan_fine
 from pipeline.planning.orientation import compare_orientations, find_rows
@@ -89,6 +90,20 @@ def _whole_field(run: SurveyRun) -> tuple[NDArray[np.float64], FinePlan]:
 
 def _scores(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> NDArray[np.float64]:
     """(seat,) worth of a fine look at each seat of the padded grid."""
+    scores = _scores_of_seats(run, work, mosaic)
+    if run.scene.missing is not None:  # a seat without any pixel of the scene is worth no look
+        scores = np.where(_on_no_scene(run), 0.0, scores)
+    return scores
+
+
+def _on_no_scene(run: SurveyRun) -> NDArray[np.bool_]:
+    """(seat,) of whose pixels the scene has none."""
+    grid, missing = run.grid, run.scene.missing
+    assert missing is not None
+    return np.asarray(seat_pixels(grid, missing).mean(axis=(1, 2)) >= grid.valid_share().ravel())
+
+
+def _scores_of_seats(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> NDArray[np.float64]:
     policy = run.settings.policy
     if policy in SEEING_POLICIES + IMAGE_POLICIES:
         return work.score(policy, mosaic.path / "mosaic.zarr", lambda done: run.report(0.5 * done)).ravel()

@@ -20,16 +20,17 @@ from pipeline.ground.map_grid import GroundGrid, classes_at, ground_grid, image_
 from pipeline.ground.view import GroundView
 from pipeline.rectify.registration.field_shift import FieldShift
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS
-from storage.archive.keys import StageRef, array_digest
+from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table, write_table
-from storage.arrays.beliefs import create_belief, write_changes
-from storage.arrays.class_maps import ClassNames, clear_classes, create_class_map, load_class_map
+from storage.arrays.beliefs import UNKNOWN, create_belief, write_changes
+from storage.arrays.blank_pixels import NO_CLASS, blank_pixels
+from storage.arrays.class_maps import ClassNames, create_class_map, load_class_map
 from storage.arrays.ground_maps import BLOCK, GroundMapWriter
 from storage.arrays.layout import SHARD_ROWS, open_group, read_array, read_bands
 from storage.arrays.mosaics import open_patches
 from storage.arrays.quicklooks import choose_bands, develop, stretch
 
-CLASS_MAP = Product("segment", version=6, files=("class_map.zarr", "belief.zarr"), by_weights=True)
+CLASS_MAP = Product("segment", version=7, files=("class_map.zarr", "belief.zarr"), by_weights=True)
 STRANGE = "strange.json"  # beside a map, where values were no readings
 MOST_TURN_PX = 12.0  # that a field's corners may lie off by, as it is turned, so that its memory is of use
 MEMORY = "memory.json"  # beside a map that goes on from an earlier one: what became of the memory
@@ -54,15 +55,11 @@ def draw_map(run: SurveyRun, mosaic: StageRef, patches: StageRef) -> Wanted:
         if any(drawn.strange):
             write_table(path / STRANGE, dict(zip(("coarse_px", "fine_px"), drawn.strange, strict=True)))
         if run.scene.missing is not None:
-            clear_classes(out, run.scene.missing)
+            blank_pixels(out, run.scene.missing, NO_CLASS)
+            blank_pixels(path / "belief.zarr", run.scene.missing, UNKNOWN)
 
     prior = run.prior
-    params = {
-        "weights": run.weights_key,
-        "grid": asdict(run.grid),
-        **region_params(run.grid),
-        **({} if run.scene.missing is None else {"missing": array_digest(run.scene.missing)}),
-    }
+    params = {"weights": run.weights_key, "grid": asdict(run.grid), **region_params(run.grid), **run.place_key}
     if prior is not None:
         reader = None if run.reader is None else run.reader.key
         params |= {"days": prior.days, "classes": list(prior.classes), "reader": reader, "light": _light(run)}
@@ -151,7 +148,7 @@ def patch_columns(run: SurveyRun, patches: StageRef, seen: CoarseLook) -> tuple[
 
 
 STORE = "ground_map.zarr"
-GROUND = Product("ground", version=2, files=(STORE,))
+GROUND = Product("ground", version=3, files=(STORE,))
 
 
 @stage("ground", "map on the ground", GROUND, of=("draw_map", "rectify"), after=("compare_turned",), unit="pixels")

@@ -15,6 +15,7 @@ from flows.survey.stage import Product, Wanted, stage
 from flows.survey.stages.attention import load_plan
 from flows.survey.stages.capture import captured
 from pipeline.errors import ShapeError
+from pipeline.geometry.grid import seat_pixels
 from pipeline.rectify.line_cache import LineCache
 from pipeline.rectify.placed import PixelGrid, Placed
 from pipeline.rectify.region import read_every_seat, read_seats
@@ -26,6 +27,7 @@ from pipeline.rectify.tie_points import TieTable
 from pipeline.rectify.tracks import Track
 from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table, write_table
+from storage.arrays.blank_pixels import NO_VALUE, blank_coarse, blank_pixels
 from storage.arrays.layout import read_array
 from storage.arrays.lookups import path_digest, write_lookup
 from storage.arrays.mosaics import MosaicWriter, PatchWriter, load_mosaic, open_patches
@@ -156,8 +158,8 @@ def load_registration(registration: StageRef) -> dict[str, Any]:
 
 
 LOOKUP = Product("locate", version=2, files=("lookup.zarr",))
-MOSAIC = Product("rectify", version=3, files=("mosaic.zarr",))
-PATCHES = Product("patches", version=3, files=("patches.zarr",))
+MOSAIC = Product("rectify", version=4, files=("mosaic.zarr",))
+PATCHES = Product("patches", version=4, files=("patches.zarr",))
 QUICKLOOK_PX = 512
 SEATS_AT_ONCE = 64
 CACHE_SHARE = 8  # raw lines kept for the next patches may take this part of the memory
@@ -220,10 +222,14 @@ def rectify(run: SurveyRun, raw: StageRef, lookup: StageRef, *registration: Stag
         colours, _ = choose_bands(run.scene.wavelength_nm)
         settings, picture = run.settings, Thumbnail(grid.shape, colours, QUICKLOOK_PX)
         write_mosaic(recipe, writer, memory=settings.memory, crew=settings.crew, seen=picture, report=run.report)
+        if run.scene.missing is not None:
+            gaps = blank_coarse(run.scene.missing, run.grid.factor)
+            blank_pixels(path / "mosaic.zarr", gaps, NO_VALUE)
+            picture.blank(gaps)
         writer.write_quicklook(stretched(picture.image).image)
         write_table(path / "lines.json", {one.cube.sweep.name: one.facts() for one in recipe.sweeps()})
 
-    params = {"grid": asdict(run.grid), "kernel": run.settings.kernel}
+    params = {"grid": asdict(run.grid), "kernel": run.settings.kernel, **run.place_key}
     return Wanted(build, params, [raw, lookup, *registration])
 
 
@@ -237,7 +243,7 @@ def rectify(run: SurveyRun, raw: StageRef, lookup: StageRef, *registration: Stag
 def cut_patches(
     run: SurveyRun, attention: StageRef, coarse: StageRef, fine: StageRef, *registrations: StageRef
 ) -> Wanted:
-    """Bring every chosen seat onto the scene grid, one patch a seat; NaN where a mirror off the plan did not look.
+    """Bring every chosen seat onto the scene grid, one patch a seat; NaN where nothing was seen, or is no scene.
 
     Patches are of the fine sweeps, or of a plain scan.
     """
@@ -260,39 +266,53 @@ def cut_patches(
         )
         cache = LineCache(run.settings.memory // CACHE_SHARE)
         if run.plan.plain:
-            _cut_everything(run, sighted(run, raw, _only(registration)), writer, len(ordered), cache)
+            _cut_everything(run, sighted(run, raw, _only(registration)), writer, ordered, cache)
             return
         sweeps = [one.placed(run.camera) for one in sighted(run, raw, _only(registration))]
         for first in range(0, len(ordered), SEATS_AT_ONCE):
             seats = ordered[first : first + SEATS_AT_ONCE]
-            writer.write(first, *read_seats(sweeps, run.camera, run.grid, seats, run.settings.kernel, cache=cache))
+            seen = read_seats(sweeps, run.camera, run.grid, seats, run.settings.kernel, cache=cache)
+            writer.write(first, *_on_scene(run, seats, *seen))
             run.report((first + len(seats)) / len(ordered))
 
-    params = {"grid": asdict(run.grid), "kernel": run.settings.kernel}
+    params = {"grid": asdict(run.grid), "kernel": run.settings.kernel, **run.place_key}
     return Wanted(build, params, [attention, raw, *registration])
 
 
+def _on_scene(
+    run: SurveyRun, seats: NDArray[np.integer], values: NDArray[np.float32], valid: NDArray[np.bool_]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """The same patches (patch, y, x, band) with NaN, and no validity, where the scene has no value."""
+    if run.scene.missing is None:
+        return values, valid
+    gaps = seat_pixels(run.grid, run.scene.missing)[seats]
+    return np.where(gaps[..., None], np.float32(np.nan), values), valid & ~gaps
+
+
 def _cut_everything(
-    run: SurveyRun, sweeps: Sequence[Sighted], writer: PatchWriter, count: int, cache: LineCache
+    run: SurveyRun, sweeps: Sequence[Sighted], writer: PatchWriter, seats: NDArray[np.integer], cache: LineCache
 ) -> None:
     """Cut every seat of a plain scan, by tables of its pixels: many times as fast as looking each of them up."""
     placed = [one.placed(run.camera, PixelGrid.of_scene(run.grid, 1)) for one in sweeps]
     waiting: list[tuple[NDArray[np.float32], NDArray[np.bool_]]] = []
-    done = 0
+    done, count = 0, len(seats)
     for band in read_every_seat(placed, run.camera, run.grid, run.settings.kernel, cache=cache):
         waiting.append(band)
         values, seen = (np.concatenate(parts) for parts in zip(*waiting, strict=True))
         whole = len(values) if done + len(values) == count else len(values) // SEATS_AT_ONCE * SEATS_AT_ONCE
-        writer.write(done, values[:whole], seen[:whole])
+        writer.write(done, *_on_scene(run, seats[done : done + whole], values[:whole], seen[:whole]))
         waiting, done = [(values[whole:], seen[whole:])], done + whole
         run.report(done / count)
 
 
 def seen_shares(run: SurveyRun, patches: StageRef) -> NDArray[np.float64]:
-    """How much of each patch was seen, (patch,) 0..1 of its pixels on the scene."""
+    """How much of each patch was seen, (patch,) 0..1 of its pixels on the scene; 1 where it has none there."""
     store = open_patches(patches.path / "patches.zarr")
     seen: NDArray[np.float64] = read_array(store.group, "valid").mean(axis=(1, 2))
-    return seen / run.grid.valid_share().ravel()[store.seats]
+    there = run.grid.valid_share().ravel()[store.seats]
+    if run.scene.missing is not None:
+        there = there - seat_pixels(run.grid, run.scene.missing)[store.seats].mean(axis=(1, 2))
+    return np.divide(seen, there, out=np.ones_like(seen), where=there > 0)
 
 
 def _only(registration: Sequence[StageRef]) -> StageRef | None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -313,14 +312,3 @@ def test_a_store_that_is_gone_is_named(posed: Exported, tmp_path: Path) -> None:
     with pytest.raises(IncompleteStoreError, match=r"the mosaic of run .* does not; run its survey again"):
         run_export(archive, posed.id, out, envi=False, console=QUIET)
     assert not (out / "collection.json").exists()
-
-
-@pytest.mark.parametrize("package", ["rasterio", "pystac"])
-def test_without_the_extra_one_message_says_what_to_install(
-    posed: Exported, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str
-) -> None:
-    """Nothing is begun without all of it."""
-    monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(ArchiveError, match=rf"{package}.*pip install 'spectralzoom\[geo\]'"):
-        run_export(posed.archive, None, tmp_path / "out", envi=False, console=QUIET)
-    assert not (tmp_path / "out").exists()

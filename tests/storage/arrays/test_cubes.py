@@ -139,7 +139,8 @@ def test_reflectance_is_the_calibrated_cube(tmp_path: Path) -> None:
     np.testing.assert_array_equal(opened.values, values)
     assert 0 < np.isnan(values).sum() < values.size
     assert opened.dims == ("line", "sample", "band")
-    assert {"wavelength", "fwhm", "time", "mirror_x", "mirror_y", "exposure_ms", "valid_line"} == set(opened.coords)
+    facts = {"time", "mirror_x", "mirror_y", "exposure_ms", "valid_line"}
+    assert set(opened.coords) == {"line", "sample", "band", "wavelength", "fwhm", *facts}
     assert opened["time"].values[10] == np.datetime64("2026-05-01T10:00:01")
     np.testing.assert_array_equal(opened["mirror_x"], [x for x, _ in position])
 

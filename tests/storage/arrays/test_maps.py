@@ -13,10 +13,10 @@ from pyproj import CRS
 
 from pipeline.errors import ChunkError, IncompleteStoreError, PoseError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
+from storage.arrays.blank_pixels import NO_CLASS, blank_pixels
 from storage.arrays.class_maps import (
     ClassMap,
     ClassNames,
-    clear_classes,
     create_class_map,
     load_class_map,
     write_class_map,
@@ -70,7 +70,7 @@ def test_areas_are_kept_in_hectares(tmp_path: Path, areas_m2: tuple[float, ...],
 
 
 def test_plain_xarray_opens_it_with_flags_and_areas(tmp_path: Path) -> None:
-    """Class flags, hectares, pose and grid mapping are there without this project's code; unseen pixels are NaN."""
+    """Flags, hectares, pose and grid mapping are there without this project's code; unseen pixels have no class."""
     writer = begin(tmp_path / "a.zarr")
     writer.write_block(slice(0, 64), slice(0, 90), *block((64, 90)))
     writer.finish(np.ones(2))
@@ -80,7 +80,7 @@ def test_plain_xarray_opens_it_with_flags_and_areas(tmp_path: Path) -> None:
         assert content.classes.odc.crs.epsg in (None, 32632)
         assert content.attrs["rig_pose"] == {"tilt_deg": 40}
         assert set(content.attrs["areas"]) == set(LEGEND.names)
-        assert np.isnan(content.classes[64:].values).all()
+        assert (content.classes[64:].values == content.classes.attrs["nodata"]).all()
         assert np.isnan(content.confidence[64:].values).all()
 
 
@@ -195,6 +195,7 @@ def test_damage_is_named(tmp_path: Path) -> None:
     path = write(tmp_path / "a.zarr", box())
     group = zarr.open_group(path, mode="r+")
     group["spatial_ref"].attrs.put({})
+    group.attrs.put({})
     with pytest.raises(IncompleteStoreError, match=r"the grid of .*a\.zarr cannot be read"):
         load_geobox(path)
 
@@ -271,17 +272,17 @@ def test_classes_are_taken_from_pixels_and_from_no_other(tmp_path: Path) -> None
     classes, confidence = _drawn()
     write_class_map(tmp_path / "m.zarr", ClassMap(classes, confidence, LEGEND.names, LEGEND.colours))
     before, where = _contents(tmp_path / "m.zarr"), np.zeros(SHAPE, np.bool_)
-    clear_classes(tmp_path / "m.zarr", where)
+    blank_pixels(tmp_path / "m.zarr", where, NO_CLASS)
     assert _contents(tmp_path / "m.zarr") == before
     where[60:70, 630:650], where[149, 699] = True, True
-    clear_classes(tmp_path / "m.zarr", where)
+    blank_pixels(tmp_path / "m.zarr", where, NO_CLASS)
     found = load_class_map(tmp_path / "m.zarr")
     np.testing.assert_array_equal(found.classes, np.where(where, 255, classes))
     np.testing.assert_array_equal(found.confidence, np.where(where, np.nan, confidence))
 
 
 def test_class_map_round_trip(tmp_path: Path) -> None:
-    """Classes, names and colours come back; xarray reads the CF flags and masks what has no class."""
+    """Classes, names and colours come back; xarray reads the CF flags and keeps whole numbers, 255 for no class."""
     classes = np.random.default_rng(0).integers(0, 3, (50, 70), dtype=np.uint8)
     classes[0, :9] = 255
     confidence = np.where(classes == 255, np.nan, 0.75).astype(np.float32)
@@ -297,6 +298,7 @@ def test_class_map_round_trip(tmp_path: Path) -> None:
     with xr.open_zarr(tmp_path / "c.zarr", consolidated=False) as data:
         assert data["classes"].attrs["flag_meanings"] == "bare_soil crop weed"
         assert data["classes"].attrs["flag_values"] == [0, 1, 2]
-        assert int(data["classes"].isnull().sum()) == 9
+        assert data["classes"].dtype == np.uint8
+        assert int((data["classes"] == data["classes"].attrs["nodata"]).sum()) == 9
     with pytest.raises(ShapeError, match="class 2 is in the map, but only 2 classes"):
         write_class_map(tmp_path / "d.zarr", ClassMap(classes, confidence, ("a", "b"), colours[:2]))

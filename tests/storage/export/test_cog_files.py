@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +19,7 @@ from pipeline.errors import ArchiveError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.class_maps import ClassNames
 from storage.arrays.layout import AngularGrid
-from storage.export.image_files import ANGULAR, CogImage, Place, cog_problems, need_rasterio, write_cog
+from storage.export.image_files import ANGULAR, CogImage, Place, cog_problems, write_cog
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 LEGEND = ClassNames(
@@ -194,10 +193,3 @@ def test_a_plain_tiff_is_told_from_a_cloud_optimised_one(tmp_path: Path) -> None
     problems = " ".join(cog_problems(tmp_path / "a.tif"))
     for words in ("does not call it a COG", "not tiled", "do not reach down to one tile"):
         assert words in problems
-
-
-def test_without_rasterio_one_message_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The extra is named."""
-    monkeypatch.setitem(sys.modules, "rasterio", None)
-    with pytest.raises(ArchiveError, match=r"needs rasterio.*pip install 'spectralzoom\[geo\]'"):
-        need_rasterio()

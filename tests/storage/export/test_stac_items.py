@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,6 @@ from storage.export.stac_items import (
     classes,
     clean_id,
     footprint,
-    need_pystac,
     projection,
     spectral_bands,
     stac_problems,
@@ -210,13 +208,6 @@ def test_a_damaged_item_of_before_is_named(tmp_path: Path, text: str) -> None:
     (tmp_path / "r1" / "r1.json").write_text(text)
     with pytest.raises(ArchiveError, match=r"r1\.json .*remove"):
         write_stac(tmp_path, ABOUT, item("r2"))
-
-
-def test_without_pystac_one_message_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The extra is named."""
-    monkeypatch.setitem(sys.modules, "pystac", None)
-    with pytest.raises(ArchiveError, match=r"pystac.*pip install 'spectralzoom\[geo\]'"):
-        need_pystac()
 
 
 @pytest.fixture

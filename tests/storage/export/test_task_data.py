@@ -78,8 +78,8 @@ def test_the_grid_lies_where_it_was_said(tmp_path: Path) -> None:
     codes = (task.default_treatment_zone_code, task.position_lost_treatment_zone_code)
     assert {*codes, task.out_of_field_treatment_zone_code} == {0}
     assert task.treatment_zones[0].process_data_variables[0].process_data_value == 0
-    assert task_data.partfields[0].partfield_area == 12_346
-    assert task.task_designator == WORDS.task[:32]
+    assert task_data.partfields[0].area == 12_346
+    assert task.designator == WORDS.task[:32]
 
 
 def test_a_dose_beyond_the_format_is_refused(tmp_path: Path) -> None:

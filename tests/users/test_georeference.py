@@ -1,0 +1,251 @@
+"""A scene that lies on the earth, surveyed: where every product of it lies, by readers that are not this project's."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import odc.geo.xr  # noqa: F401 - registers the accessor
+import pytest
+import rasterio
+import rioxarray  # noqa: F401 - registers the accessor
+import xarray as xr
+from affine import Affine
+from numpy.typing import NDArray
+from odc.geo.geobox import GeoBox
+from odc.geo.xr import xr_coords
+from rasterio.enums import ColorInterp
+from rich.console import Console
+
+from flows.archive.export_command import run_export
+from flows.publish.run_folder import Published
+from flows.publish.survey_command import run_survey
+from flows.settings.load import load_settings
+from pipeline.ground.georeference import class_areas_m2
+from storage.remote.opening import open_archive, verify_archive
+from tests.conftest import RGB_NM, patchy_scene
+from tests.remembered_work import without_effects
+
+SHAPE = (52, 70)
+NORTH_UP = Affine(0.05, 0, 534_257.65, 0, -0.05, 5_772_301.4)
+TURNED = Affine(0.0433, 0.025, 534_257.65, 0.025, -0.0433, 5_772_301.4)  # by 30 degrees
+ENVI_TURNED = (1, 1, 534_257.65, 5_772_301.4, 0.05, 0.05)
+GAP = np.s_[:20, :24]
+QUIET = Console(quiet=True)
+pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")
+
+
+def pixels(bands: int = 3) -> NDArray[np.uint8]:
+    """(y, x, band) of a field of three classes."""
+    return patchy_scene(SHAPE, bands, seed=4)[0].astype(np.uint8)
+
+
+def write_geotiff(path: Path, transform: Affine, *, gap: bool = False, crs: str = "EPSG:32632", **tags: str) -> Path:
+    """A GeoTIFF of the field, with its wavelengths in tags; with a gap, one that is transparent there."""
+    values = np.moveaxis(pixels(), -1, 0)
+    count = len(values) + gap
+    profile = {"driver": "GTiff", "height": SHAPE[0], "width": SHAPE[1], "count": count, "dtype": "uint8"}
+    with rasterio.open(path, "w", **profile, crs=crs, transform=transform, photometric="MINISBLACK") as file:
+        file.write(values, list(range(1, len(values) + 1)))
+        for band, centre in enumerate(RGB_NM):
+            file.update_tags(band + 1, wavelength=str(centre), wavelength_units="Nanometers")
+        file.update_tags(**tags)
+        if gap:
+            alpha = np.full(SHAPE, 255, np.uint8)
+            alpha[GAP] = 0
+            file.write(alpha, count)
+            file.colorinterp = [ColorInterp.gray, ColorInterp.undefined, ColorInterp.undefined, ColorInterp.alpha]
+    return path
+
+
+def north_up(folder: Path) -> tuple[Path, Affine]:
+    return write_geotiff(folder / "a.tif", NORTH_UP), NORTH_UP
+
+
+def turned(folder: Path) -> tuple[Path, Affine]:
+    return write_geotiff(folder / "a.tif", TURNED), TURNED
+
+
+def envi(folder: Path) -> tuple[Path, Affine]:
+    place = ", ".join(map(str, ENVI_TURNED))
+    (folder / "a.hdr").write_text(
+        f"ENVI\nsamples = {SHAPE[1]}\nlines = {SHAPE[0]}\nbands = 3\ndata type = 1\ninterleave = bip\n"
+        f"map info = {{UTM, {place}, 32, North, WGS-84, units=Meters, rotation=25}}\n"
+        f"wavelength units = nm\nwavelength = {{640, 550, 460}}\n"
+    )
+    (folder / "a.img").write_bytes(pixels().tobytes())
+    with rasterio.open(folder / "a.img") as file:
+        return folder / "a.hdr", file.transform
+
+
+def zarr(folder: Path) -> tuple[Path, Affine]:
+    geobox = GeoBox(SHAPE, NORTH_UP, "EPSG:32632")
+    coords = {**xr_coords(geobox, dims=("y", "x")), "wavelength": ("band", np.array(RGB_NM), {"units": "nm"})}
+    values = xr.DataArray(pixels(), coords, ("y", "x", "band"), "values", {"grid_mapping": "spatial_ref"})
+    values.to_dataset().to_zarr(folder / "a.zarr", zarr_format=3, consolidated=False)
+    return folder / "a.zarr", NORTH_UP
+
+
+KINDS: dict[str, Callable[[Path], tuple[Path, Affine]]] = {
+    "GeoTIFF": north_up,
+    "turned GeoTIFF": turned,
+    "turned ENVI": envi,
+    "Zarr": zarr,
+}
+
+
+def survey(scene: Path, weights: Path, out: Path, **flags: Any) -> Published:
+    """Survey the scene without effects, accuracy or controls."""
+    given = {"scene": str(scene), "weights": str(weights), "engine": "plain", "out": str(out), "budget": 0.8}
+    with without_effects():
+        return run_survey(load_settings(None, {**given, "accuracy": False, "controls": False, **flags}), QUIET)
+
+
+def opened(run: Published, product: str) -> xr.Dataset:
+    """A store of the run by plain xarray, which has nothing to warn of."""
+    archive = run.folder.parent.parent
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        return xr.open_zarr(archive / run.receipt["products"][product])
+
+
+def corners_px(found: Any, wanted: Affine, shape: tuple[int, int]) -> float:
+    """How far the corners of an image lie from where they should, in its pixels."""
+    rows, columns = shape
+    inverse = ~wanted
+    apart = []
+    for x, y in ((0, 0), (columns, 0), (0, rows), (columns, rows)):
+        there = (found.a * x + found.b * y + found.c, found.d * x + found.e * y + found.f)
+        column = inverse.a * there[0] + inverse.b * there[1] + inverse.c
+        row = inverse.d * there[0] + inverse.e * there[1] + inverse.f
+        apart.append(np.hypot(column - x, row - y))
+    return float(max(apart))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_products_lie_where_the_scene_does(tmp_path: Path, weights: Path, kind: str) -> None:
+    """Stores by odc-geo and rioxarray, exports by GDAL: all corners within 0.1 px of the source's; it verifies."""
+    scene, transform = KINDS[kind](tmp_path)
+    run = survey(scene, weights, tmp_path / "archive")
+    factor = 4
+    coarse = Affine(*(number * (factor if place % 3 < 2 else 1) for place, number in enumerate(transform[:6])))
+    for product, name, wanted in (("class_map", "classes", transform), ("mosaic", "values", coarse)):
+        found = opened(run, product)[name]
+        shape = (found.sizes["y"], found.sizes["x"])
+        assert (found.odc.crs.epsg, found.rio.crs.to_epsg()) == (32632, 32632)
+        assert corners_px(found.odc.geobox.affine, wanted, shape) < 0.1
+        assert corners_px(found.rio.transform(), wanted, shape) < 0.1
+    files = run_export(tmp_path / "archive", None, tmp_path / "out", envi=False, console=QUIET)
+    assert files["placed"]
+    for name, size in (("class_map", 1), ("confidence", 1), ("attention", 8), ("rgb", factor)):
+        with rasterio.open(tmp_path / "out" / files["files"][name]) as file:
+            assert file.crs.to_epsg() == 32632
+            grown = [number * (size if place % 3 < 2 else 1) for place, number in enumerate(transform[:6])]
+            assert corners_px(file.transform, Affine(*grown), file.shape) < 0.1
+    item = json.loads(Path(files["item"]).read_text())
+    assert item["properties"]["proj:code"] == "EPSG:32632"
+    assert item["assets"]["class_map"]["proj:transform"] == pytest.approx(list(transform[:6]))
+    assert not [one for one in verify_archive(open_archive(tmp_path / "archive")) if one.problem]
+
+
+def test_transparent_pixels_are_no_data_to_the_end(tmp_path: Path, weights: Path) -> None:
+    """They are 255 in the map, NaN in mosaic and patches, outside of areas and scores, and no place to look at."""
+    run = survey(write_geotiff(tmp_path / "a.tif", NORTH_UP, gap=True), weights, tmp_path / "archive", budget=1)
+    with opened(run, "class_map") as drawn, opened(run, "mosaic") as mosaic, opened(run, "patches") as patches:
+        classes = drawn["classes"].values
+        assert classes.dtype == np.uint8
+        assert (classes[GAP] == 255).all()
+        gap = np.zeros(SHAPE, np.bool_)
+        gap[GAP] = True
+        assert (classes[~gap] != 255).all()
+        assert np.isnan(drawn["confidence"].values[GAP]).all()
+        coarse = mosaic["values"].values
+        assert np.isnan(coarse[:5, :6]).all()  # 20 x 24 px
+        assert np.isfinite(coarse[5:]).all()
+        assert (mosaic["coverage"].values[:5, :6] == 0).all()
+        for seat in range(patches.sizes["patch"]):
+            y, x = int(patches["seat_y"][seat]), int(patches["seat_x"][seat])
+            there = gap[y : y + 8, x : x + 8]
+            one = patches["valid"].values[seat][: there.shape[0], : there.shape[1]]
+            assert not one[there].any()
+            assert np.isnan(patches["values"].values[seat][: there.shape[0], : there.shape[1]][there]).all()
+    assert run.receipt["pixels"]["map_without_a_class"] == gap.sum()
+    geobox = GeoBox(SHAPE, NORTH_UP, "EPSG:32632")
+    ground = run.receipt["ground"]
+    assert sum(ground["areas_ha"].values()) == pytest.approx((~gap).sum() * 0.05**2 / 1e4, rel=2e-3)  # UTM's scale
+    whole = class_areas_m2(geobox, np.zeros(SHAPE, np.uint8), 1)[0]
+    assert sum(ground["areas_ha"].values()) * 1e4 == pytest.approx(whole * (~gap).mean(), rel=1e-6)
+    with opened(run, "attention") as attention:
+        assert (attention["score"].values[:2, :3] == 0).all()  # seats of 8 px without a pixel of the scene
+
+
+def test_a_place_is_in_the_keys_of_what_carries_it(tmp_path: Path, weights: Path) -> None:
+    """The same pixels elsewhere are captured once, and drawn on each map; without a place keys are as they were."""
+    bare = tmp_path / "bare.npy"
+    np.save(bare, pixels())
+    run = survey(bare, weights, tmp_path / "archive", wavelengths="640,550,460")
+    archive = open_archive(tmp_path / "archive")
+    for product in ("mosaic", "class_map"):
+        ref = next(ref for ref in archive.refs() if run.receipt["products"][product].startswith(ref.uri))
+        assert not {"georeference", "missing"} & set(archive.manifest(ref)["params"])
+        assert "spatial_ref" not in opened(run, product)
+    scene = write_geotiff(tmp_path / "a.tif", NORTH_UP)
+    (tmp_path / "a.tfw").unlink(missing_ok=True)
+    here = survey(scene, weights, tmp_path / "archive")
+    ref = next(ref for ref in archive.refs("rectify") if here.receipt["products"]["mosaic"].startswith(ref.uri))
+    assert archive.manifest(ref)["params"]["georeference"]["crs"] == "EPSG:32632"
+
+
+def test_a_pose_is_the_one_place_of_a_run(tmp_path: Path, weights: Path) -> None:
+    """With a pose the scene's own place is set aside, and a note says so."""
+    scene = write_geotiff(tmp_path / "a.tif", NORTH_UP)
+    words = tmp_path / "posed.toml"
+    words.write_text("[pose]\nlon_deg = 7.6\nlat_deg = 51.96\nheight_m = 30\nheading_deg = 20\ntilt_deg = 35\n")
+    flags = {"scene": str(scene), "weights": str(weights), "engine": "plain", "out": str(tmp_path / "archive")}
+    with without_effects():
+        run = run_survey(load_settings(words, {**flags, "budget": 0.8, "accuracy": False, "controls": False}), QUIET)
+    assert any("set aside: [pose] says where it lies" in note for note in run.receipt["settings"]["notes"])
+    assert "spatial_ref" not in opened(run, "class_map")
+    assert "spatial_ref" in opened(run, "ground_map")
+
+
+def test_every_store_opens_without_a_word(tmp_path: Path, weights: Path) -> None:
+    """Axes have coordinates with units, a band is found by its wavelength, and classes are whole numbers."""
+    run = survey(write_geotiff(tmp_path / "a.tif", NORTH_UP), weights, tmp_path / "archive")
+    for product in ("class_map", "belief", "mosaic", "patches", "attention", "raw_coarse"):
+        address = run.receipt["products"][product]
+        stores = sorted((tmp_path / "archive" / address).glob("*.zarr")) or [tmp_path / "archive" / address]
+        for store in stores:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")
+                content = xr.open_zarr(store)
+            for name, array in content.data_vars.items():
+                axes = [axis for axis in array.dims if not str(axis).startswith(("quicklook", "rgb", "class"))]
+                assert set(axes) <= set(content.coords), (product, name)
+                assert all("units" in content[axis].attrs for axis in axes), (product, name)
+    values = opened(run, "mosaic")["values"]
+    assert float(values.sel(band=560, method="nearest")["wavelength"]) == 550
+    swapped = values.swap_dims(band="wavelength").sel(wavelength=[455, 700], method="nearest")
+    assert swapped["wavelength"].values.tolist() == [460, 640]
+
+
+def test_a_real_scene_goes_from_file_to_export(tmp_path: Path, real_data: Path, make_weights: Any) -> None:
+    """The georeferenced rgbn.tif: map, areas and exports lie where its tiles do."""
+    scene = real_data / "rgbn" / "rgbn_suba.tif"
+    if not scene.is_file():
+        pytest.skip(f"there is no {scene}")
+    run = survey(scene, make_weights((640.0, 550.0, 460.0, 800.0)), tmp_path / "archive")
+    with rasterio.open(scene) as source:
+        known, transform, shape, empty = source.crs, source.transform, source.shape, (source.read() == 0).all(axis=0)
+    files = run_export(tmp_path / "archive", None, tmp_path / "out", envi=False, console=QUIET)["files"]
+    with rasterio.open(tmp_path / "out" / files["class_map"]) as file:
+        assert (file.crs.to_epsg(), file.shape) == (known.to_epsg(), shape)
+        assert corners_px(file.transform, transform, shape) < 0.1
+        classes = file.read(1)
+    assert (classes[empty] == 255).all()
+    ground = run.receipt["ground"]
+    assert sum(ground["areas_ha"].values()) == pytest.approx((classes != 255).sum() * 25 / 1e4, rel=5e-3)
