@@ -15,6 +15,7 @@ import pytest
 import rasterio
 import shapely
 import xarray as xr
+from affine import Affine
 from isoxml.converter.np_grid import to_numpy_array
 from isoxml.util.isoxml_io import isoxml_from_path
 from rich.console import Console
@@ -36,6 +37,7 @@ from storage.export.stac_items import stac_problems
 from storage.readers.scene_files import load_scene_file
 from tests.remembered_work import without_effects
 from tests.storage.export.stac_rules import extension_problems
+from tests.users.test_georeference import SHAPE, TURNED, corners_px, survey, write_geotiff
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 POSE = RigPose(lon_deg=9.5, lat_deg=52.1, heading_deg=25.0, tilt_deg=50.0, height_m=1400.0)
@@ -305,6 +307,43 @@ def test_a_survey_without_a_place_has_what_needs_none(one_picture: Products) -> 
             choose_products(ProductFlags(indices="ExG")),
         )
     assert not (one_picture.out / "no").exists()
+
+
+@pytest.mark.parametrize(
+    ("crs", "transform"),
+    [("EPSG:32632", TURNED), ("EPSG:4326", Affine(7e-7, 0, 9.5, 0, -4.5e-7, 52.1))],
+    ids=["turned", "in degrees"],
+)
+def test_products_of_a_georeferenced_scene_lie_where_it_does(
+    tmp_path: Path, weights: Path, crs: str, transform: Affine
+) -> None:
+    """Corners of indices and polygons to 0.1 px, in its CRS; cells are square in metres; a gap gets no dose."""
+    run = survey(write_geotiff(tmp_path / "a.tif", transform, gap=True, crs=crs), weights, tmp_path / "archive")
+    flags = {"polygons": True, "indices": "VARI", "prescription": "class_1=2", "cell": 0.5, "heading": "30"}
+    out = tmp_path / "out"
+    answer = run_export(tmp_path / "archive", None, out, False, QUIET, choose_products(ProductFlags(**flags)))
+    done = Products(tmp_path / "archive", run.receipt, answer, out)
+    with rasterio.open(done.file("VARI")) as file:
+        assert str(file.crs) == crs
+        coarse = Affine(*(number * (4 if place % 3 < 2 else 1) for place, number in enumerate(transform[:6])))
+        assert corners_px(file.transform, coarse, file.shape) < 0.1
+        assert np.isnan(file.read(1)[:5, :6]).all()
+    found = geopandas.read_file(done.file("polygons"))
+    assert str(found.crs) == crs
+    places = shapely.get_coordinates(found.geometry)
+    column, row = ~transform * places.T
+    rows, columns = SHAPE
+    assert (column.min(), column.max(), row.min(), row.max()) == pytest.approx((0, columns, 0, rows), abs=0.1)
+    seen = ((column >= 24 - 0.1) | (row >= 20 - 0.1)).all()
+    assert seen  # nothing in the gap
+    cells = geopandas.read_file(done.file("prescription"))
+    assert cells.crs.to_epsg() == 32632
+    np.testing.assert_allclose(cells.area, 0.25, rtol=1e-6)
+    assert (cells.dose == 2).any()
+    assert {0.0, 2.0} >= set(cells.dose)
+    with done.file("areas").open() as text:
+        hectares = [float(row["hectares"]) for row in csv.DictReader(text)]
+    assert sum(hectares) == pytest.approx(found.area_m2.sum() / 1e4, rel=1e-3)
 
 
 @pytest.fixture(scope="module")
