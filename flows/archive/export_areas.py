@@ -10,15 +10,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.archive.export_layers import ExportedRun, map_product
-from pipeline.ground.field_scale import M2_PER_HECTARE
+from flows.archive.export_layers import ExportedRun
 from pipeline.products.areas import ShareEstimate, probable_shares, stratified_shares
 from storage.archive.whole_files import write_whole
 from storage.arrays.beliefs import BeliefStore
-from storage.arrays.georeference import load_geobox
 from storage.arrays.ground_maps import open_image
 from storage.arrays.layout import SHARD_ROWS
-from storage.export.map_scale import MapScale
 
 CSV = "text/csv"
 COLUMNS = (
@@ -38,10 +35,10 @@ DIGITS = 6
 
 def write_areas(run: ExportedRun, path: Path) -> None:
     """Write the table, a row a class; empty where something is not known, as hectares where there is no CRS."""
-    path_of_map = run.path(map_product(run))
+    path_of_map = run.path(run.map_product)
     names = tuple(open_image(path_of_map, "classes").about["class_names"])
     pixels, confidence = _counted(path_of_map, len(names))
-    hectares = _hectares(run, names, pixels)
+    hectares = _hectares(run, names)
     share = pixels / max(pixels.sum(), 1) if hectares is None else hectares / (hectares.sum() or 1.0)
     estimate, source = _estimate(run, share)
     total = np.nan if hectares is None else hectares.sum()
@@ -71,13 +68,12 @@ def _counted(path: Path, count: int) -> tuple[NDArray[np.int64], NDArray[np.floa
     return pixels[:count], np.where(pixels > 0, sums / np.maximum(pixels, 1), np.nan)[:count]
 
 
-def _hectares(run: ExportedRun, names: tuple[str, ...], pixels: NDArray[np.int64]) -> NDArray[np.float64] | None:
-    """Hectares of each class: with a pose those of the receipt, from footprints of the scene's pixels."""
-    if "ground" in run.receipt:
-        areas = run.receipt["ground"]["areas_ha"]
-        return np.array([areas.get(name, 0.0) for name in names], np.float64)
-    geobox = load_geobox(run.path("class_map"))
-    return None if geobox is None else pixels.astype(np.float64) * (MapScale.of(geobox).pixel_m2 / M2_PER_HECTARE)
+def _hectares(run: ExportedRun, names: tuple[str, ...]) -> NDArray[np.float64] | None:
+    """Hectares of each class as the receipt has them; None where nothing says where the field lies."""
+    if "ground" not in run.receipt:
+        return None
+    areas = run.receipt["ground"]["areas_ha"]
+    return np.array([areas.get(name, 0.0) for name in names], np.float64)
 
 
 def _estimate(run: ExportedRun, share: NDArray[np.float64]) -> tuple[ShareEstimate, str]:

@@ -112,11 +112,6 @@ class Layer:
     fields: Mapping[str, Any] = field(default_factory=dict)  # STAC's, beside its bands and its grid
 
 
-def map_product(run: ExportedRun) -> str:
-    """Which store a run's map is exported from: on the ground where there is one, else on the scene's own grid."""
-    return "class_map" if run.store("ground_map") is None else "ground_map"
-
-
 def map_layers(run: ExportedRun) -> list[Layer]:
     """Class map, confidence, attention (on its seats) and picture: on the map where there is one, else on angles."""
     product = run.map_product

@@ -13,11 +13,12 @@ from affine import Affine
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
-from flows.archive.export_layers import ExportedRun, map_product
+from flows.archive.export_layers import ExportedRun
 from flows.archive.export_spectra import MosaicView
 from flows.archive.product_choice import ProductChoice, class_numbers
 from pipeline.errors import SettingsError
 from pipeline.geometry.grid import UNLABELLED
+from pipeline.ground.georeference import pixel_side_m
 from pipeline.planning.orientation import find_rows
 from pipeline.products.outlines import class_polygons
 from pipeline.products.prescriptions import (
@@ -31,10 +32,9 @@ from pipeline.products.prescriptions import (
 )
 from pipeline.products.regions import grow_class, merge_small
 from storage.arrays.class_maps import ClassNames
-from storage.arrays.georeference import load_geobox
 from storage.arrays.ground_maps import open_image
 from storage.arrays.mosaics import mosaic_brightness
-from storage.export.map_scale import MapScale, crs_wkt, to_degrees, to_plane
+from storage.export.map_scale import crs_wkt, degree_m, to_degrees, to_plane
 from storage.export.qgis_styles import NONE, REDS, STYLE, Entry, ramp_colour, write_polygon_style
 from storage.export.task_data import DEGREE_DIGITS, TaskGrid, TaskWords, write_task_data
 from storage.export.vector_files import GEOJSON, GEOPACKAGE, SHAPEFILE, write_geojson, write_geopackage, write_shapefile
@@ -67,31 +67,29 @@ class ClassRaster:
     @classmethod
     def of(cls, run: ExportedRun) -> ClassRaster:
         """Read them from the map's store."""
-        path = run.path(map_product(run))
-        stored, geobox = open_image(path, "classes"), load_geobox(path)
+        path = run.path(run.map_product)
+        stored = open_image(path, "classes")
         names, colours = stored.about["class_names"], np.array(stored.about["class_colours"], np.uint8)
         transform = Affine(*stored.about["spatial:transform"])
         classes = np.concatenate([rows for _, rows in stored.rows()])
-        return cls(classes, ClassNames(tuple(names), colours.reshape(-1, 3)), transform, geobox)
+        return cls(classes, ClassNames(tuple(names), colours.reshape(-1, 3)), transform, run.geobox)
 
     @cached_property
-    def scale(self) -> MapScale | None:
-        """Metres of its pixels; None without a CRS."""
-        return None if self.geobox is None else MapScale.of(self.geobox)
+    def pixel_m(self) -> float | None:
+        """Side of a square as large as the middle pixel; None without a CRS."""
+        return None if self.geobox is None else pixel_side_m(self.geobox)
 
     def shaped(self, choice: ProductChoice) -> ClassRaster:
-        """Small regions given to a neighbour, then classes grown in the order in which they were named.
-
-        Raises SettingsError: there is no such class, or what is meant in metres has no place on the ground.
-        """
+        """Small regions given to a neighbour, classes grown in their order, and what that cut off given away again."""
         buffers = class_numbers(self.legend.names, choice.buffers_m, "--buffer")
-        if self.scale is None:
-            if buffers or choice.least_area_m2 or choice.simplify_m is not None:
-                raise SettingsError(f"--buffer, --least-area and --simplify are in metres, and {NEEDS_PLACE}")
+        if self.pixel_m is None:
             return self
-        classes = merge_small(self.classes, choice.least_area_m2 / self.scale.pixel_m2)
+        least_px = choice.least_area_m2 / self.pixel_m**2
+        classes = merge_small(self.classes, least_px)
         for number, metres in buffers.items():
-            classes = grow_class(classes, number, metres / self.scale.pixel_m)
+            classes = grow_class(classes, number, metres / self.pixel_m)
+        if buffers:
+            classes = merge_small(classes, least_px)
         return ClassRaster(classes, self.legend, self.transform, self.geobox)
 
 
@@ -100,11 +98,13 @@ def check_zones(run: ExportedRun, choice: ProductChoice) -> ProductChoice:
 
     Raises SettingsError: the run's classes, its place or its rows do not give what is asked for.
     """
-    names = open_image(run.path(map_product(run)), "classes").about["class_names"]
+    names = open_image(run.path(run.map_product), "classes").about["class_names"]
     class_numbers(names, choice.buffers_m, "--buffer")
+    if run.geobox is None and (choice.buffers_m or choice.least_area_m2 or choice.simplify_m is not None):
+        raise SettingsError(f"--buffer, --least-area and --simplify are in metres, and {NEEDS_PLACE}")
     if choice.prescription is not None:
         class_numbers(names, choice.prescription.doses, "--prescription")
-        if load_geobox(run.path(map_product(run))) is None:
+        if run.geobox is None:
             raise SettingsError(f"a prescription is in metres, and {NEEDS_PLACE}")
         if choice.prescription.heading is None:
             return replace(choice, prescription=replace(choice.prescription, heading=row_heading(run)))
@@ -123,11 +123,11 @@ def write_zones(run: ExportedRun, folder: Path, choice: ProductChoice) -> Iterat
 
 
 def _write_polygons(run: ExportedRun, raster: ClassRaster, folder: Path, choice: ProductChoice) -> Iterator[Made]:
-    scale, crs = raster.scale, None if raster.geobox is None else crs_wkt(raster.geobox)
-    tolerance = 1.0 if scale is None or choice.simplify_m is None else choice.simplify_m / scale.pixel_m
+    side, crs = raster.pixel_m, None if raster.geobox is None else crs_wkt(raster.geobox)
+    tolerance = 1.0 if side is None or choice.simplify_m is None else choice.simplify_m / side
     found = class_polygons(raster.classes, tolerance).moved(raster.transform)
-    unit = "area_rad2" if scale is None else "area_m2"
-    area = found.polygon_areas() * (1.0 if scale is None else scale.pixel_m2 / abs(raster.transform.determinant))
+    unit = "area_rad2" if side is None else "area_m2"
+    area = found.polygon_areas() * (1.0 if side is None else side**2 / abs(raster.transform.determinant))
     names = [raster.legend.names[number] for number in found.classes]
     columns = {"class": found.classes.astype(np.int32), "name": names, unit: area}
     path = folder / "classes.gpkg"
@@ -154,7 +154,7 @@ def _write_prescription(run: ExportedRun, raster: ClassRaster, folder: Path, cho
     asked = choice.prescription
     assert asked is not None
     assert raster.geobox is not None
-    assert raster.scale is not None
+    assert raster.pixel_m is not None
     doses = class_numbers(raster.legend.names, asked.doses, "--prescription")
     assert asked.heading is not None
     heading = Heading(asked.heading)
@@ -172,13 +172,11 @@ def _write_prescription(run: ExportedRun, raster: ClassRaster, folder: Path, cho
     levels = sorted({0.0, *found[seen].tolist()})
     shown = [(d, f"{d:g} {asked.unit.name}", ramp_colour(d / most, REDS) if d else NONE) for d in levels]
     yield _styled(path, "dose", shown)
-    step = tuple(round(asked.cell_m / metres, DEGREE_DIGITS) for metres in raster.scale.degree_m)
+    step = tuple(round(asked.cell_m / metres, DEGREE_DIGITS) for metres in degree_m(raster.geobox))
     degrees = to_degrees(raster.geobox)
     grid, found = _dosed(raster, doses, asked.least_share, (step[0], step[1]), degrees)
     known = int((raster.classes != UNLABELLED).sum())
-    told = TaskWords(
-        run.receipt["survey"], run.receipt["survey"], words, layer_version(run), known * raster.scale.pixel_m2
-    )
+    told = TaskWords(run.receipt["survey"], run.receipt["survey"], words, layer_version(run), known * raster.pixel_m**2)
     task = TaskGrid(*grid.corner, *grid.step, found, asked.unit)
     for key, path, kind in zip(
         ("task_data", "task_grid"),

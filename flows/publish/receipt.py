@@ -78,6 +78,7 @@ class Accuracy(Score):
     all: Score
     gap_closed: float | None
     controls: dict[str, Control]
+    confusion: NotRequired[list[list[int]]]  # pixels by label (row) and mapped class; receipts of before have none
     controls_mode: NotRequired[dict[str, Any]]  # seats of the controls, and their share of samples, lines, seconds
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -33,7 +34,8 @@ def write_geopackage(path: Path, layer: str, polygons: Any, columns: Columns, cr
     ``polygons`` are shapely's, ``columns`` values of each, ``crs`` WKT, None where there is none. Raises ArchiveError:
     GDAL or the disk refuses.
     """
-    with _writing(path, [path.name], when) as aside:
+    with _writing(path, [path.name], when) as aside, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "'crs' was not provided", UserWarning)  # that is told where it is missing
         _frame(polygons, columns, crs).to_file(aside / path.name, layer=layer, driver="GPKG", engine="pyogrio")
 
 

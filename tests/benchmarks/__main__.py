@@ -19,7 +19,7 @@ from pathlib import Path
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 HERE = Path(__file__).resolve().parent
-sys.path[:0] = [str(HERE), str(HERE / "given"), str(HERE.parents[1])]  # given: peers and data of some
+sys.path[:0] = [str(HERE), str(HERE.parents[1])]
 
 from measure import Row, aligned, markdown_lines  # noqa: E402
 

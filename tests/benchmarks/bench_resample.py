@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from beside.resample_peers import BANDS, ENGINES, Peer, Turned, cv2_parts, peers, spline, turned_waves
 from measure import Clock, Row, ratio, time_in_turn
 from numpy.typing import NDArray
-from resample_peers import BANDS, ENGINES, Peer, Turned, cv2_parts, peers, spline, turned_waves
 
 from pipeline.rectify.kernels import Kernel, windows
 from pipeline.rectify.resample import resample

@@ -14,10 +14,7 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.patches import Rectangle
-from measure import Row, not_run
-from numpy.typing import NDArray
-from seam_data import (
+from beside.seam_data import (
     CUT_LEFT,
     CUT_RIGHT,
     LINES,
@@ -35,6 +32,9 @@ from seam_data import (
     seam_offsets,
     wave_views,
 )
+from matplotlib.patches import Rectangle
+from measure import Row, not_run
+from numpy.typing import NDArray
 
 from pipeline.rectify.placed import PixelGrid, place
 from pipeline.rectify.region import mosaic_tile

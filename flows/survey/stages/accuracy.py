@@ -49,7 +49,7 @@ from storage.archive.whole_files import to_json
 from storage.arrays.class_maps import load_class_map
 
 RECORD = "accuracy.json"
-ACCURACY = Product("evaluate", version=8, files=(RECORD,), by_weights=True)
+ACCURACY = Product("evaluate", version=9, files=(RECORD,), by_weights=True)
 
 
 @stage(
@@ -80,7 +80,7 @@ def evaluate(
         judged = np.where(classes == UNLABELLED, np.uint8(UNLABELLED), labels)  # what has no class is not
         seen = glance_at(run, mosaic)
         counts = confusion(judged, classes, len(drawn.names))  # with the class unknown, which no label has
-        result: dict[str, Any] = _figures(run, counts)
+        result: dict[str, Any] = _figures(run, counts) | {"confusion": counts.tolist()}
         empty = np.empty((0, run.grid.patch, run.grid.patch, run.weights.basis.columns), np.float32)
         none = segment(run.weights, seen, empty, np.empty(0, np.int64))
         result["none"] = _figures(run, confusion(judged, none.classes, run.weights.config.classes))

@@ -1,0 +1,355 @@
+"""What a sprayer, a QGIS project or a spreadsheet takes of a survey, read again by programs that did not write it."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import geopandas
+import numpy as np
+import pyproj
+import pytest
+import rasterio
+import shapely
+import xarray as xr
+from affine import Affine
+from isoxml.converter.np_grid import to_numpy_array
+from isoxml.util.isoxml_io import isoxml_from_path
+from rich.console import Console
+
+from flows.archive import export_zones
+from flows.archive.export_command import run_export
+from flows.archive.export_layers import open_exported
+from flows.archive.product_choice import ProductFlags, choose_products
+from flows.publish.survey_command import run_survey
+from flows.settings.load import load_settings
+from pipeline.errors import SettingsError, WavelengthError
+from pipeline.ground.map_grid import ground_grid, image_at
+from pipeline.ground.view import GroundView, RigPose
+from pipeline.planning.orientation import CropRows
+from pipeline.products.indices import find_index
+from storage.archive.archive import Archive
+from storage.export.image_files import cog_problems
+from storage.export.stac_items import stac_problems
+from storage.readers.scene_files import load_scene_file
+from tests.remembered_work import without_effects
+from tests.storage.export.stac_rules import extension_problems
+from tests.users.test_georeference import SHAPE, TURNED, corners_px, survey, write_geotiff
+
+pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
+POSE = RigPose(lon_deg=9.5, lat_deg=52.1, heading_deg=25.0, tilt_deg=50.0, height_m=1400.0)
+QUIET = Console(quiet=True)
+FLAGS = {
+    "reflectance": True,
+    "indices": "NDVI,SAVI",
+    "polygons": True,
+    "prescription": "track=2.5,grass=1",
+    "cell": 3.0,
+    "heading": "20",
+    "least_share": 0.1,
+    "least_area": 0.6,
+    "buffer": "track=0.8",
+}
+
+
+@dataclass(frozen=True)
+class Products:
+    """A survey's archive and run, and the folder with its products."""
+
+    archive: Path
+    receipt: dict[str, Any]
+    answer: dict[str, Any]
+    out: Path
+
+    def file(self, key: str) -> Path:
+        """One exported file."""
+        return self.out / str(self.answer["files"][key])
+
+    def store(self, product: str) -> xr.Dataset:
+        """A store of the archive."""
+        path = self.archive / self.receipt["products"][product]
+        return xr.open_zarr(path, consolidated=False, mask_and_scale=False)
+
+
+@pytest.fixture(scope="module")
+def posed(tmp_path_factory: pytest.TempPathFactory) -> Products:
+    """A small farm with a pose, so high that a pixel sees about a metre, and all of its products."""
+    archive, out = tmp_path_factory.mktemp("products") / "field", tmp_path_factory.mktemp("maps").resolve()
+    given = {"size": "192x128", "bands": "20,60,100,115,150,200", "budget": "0.9", "engine": "plain", "seed": "1"}
+    settings = load_settings(None, {**given, "out": str(archive), "controls": False})
+    with without_effects():
+        published = run_survey(replace(settings, pose=POSE), QUIET)
+    choice = choose_products(ProductFlags(**FLAGS))
+    return Products(archive, published.receipt, run_export(archive, None, out, False, QUIET, choice), out)
+
+
+def test_reflectance_lies_on_the_map_with_its_wavelengths(posed: Products) -> None:
+    """A COG in the map's CRS: the mosaic, resampled as the ground map is; bands named as GDAL does; NaN is nodata."""
+    ground, mosaic = posed.store("ground_map"), posed.store("mosaic")
+    assert cog_problems(posed.file("reflectance")) == []
+    scene, about = posed.store("class_map"), posed.store("class_map").attrs["angular_grid"]
+    grid = ground_grid(GroundView(POSE, about["ifov_rad"]), scene["classes"].shape)
+    rows, columns = (slice(0, size) for size in grid.shape)
+    wanted = image_at(
+        mosaic["values"].values, grid.scene_pixels(rows, columns), factor=mosaic.attrs["angular_grid"]["factor"]
+    )
+    with rasterio.open(posed.file("reflectance")) as file:
+        np.testing.assert_allclose(np.moveaxis(file.read(), 0, -1), wanted, atol=1e-6)
+        assert file.crs.to_epsg() == 32632
+        assert list(file.transform[:6]) == ground.attrs["spatial:transform"]
+        assert np.isnan(file.nodata)
+        imagery = [file.tags(band, ns="IMAGERY") for band in file.indexes]
+        assert file.descriptions[0] == f"{mosaic['wavelength'].values[0]:.1f} nm"
+    centres = [1000 * float(tags["CENTRAL_WAVELENGTH_UM"]) for tags in imagery]
+    np.testing.assert_allclose(centres, mosaic["wavelength"].values, rtol=1e-6)
+    np.testing.assert_allclose([1000 * float(tags["FWHM_UM"]) for tags in imagery], mosaic["fwhm"].values, rtol=1e-6)
+
+
+def test_exported_reflectance_is_a_scene_again(posed: Products) -> None:
+    """This project reads its wavelengths and widths from the file's tags, and its place."""
+    scene = load_scene_file(str(posed.file("reflectance")))
+    np.testing.assert_allclose(scene.wavelength_nm, posed.store("mosaic")["wavelength"].values, rtol=1e-6)
+
+
+def test_indices_are_their_formula_of_the_reflectance(posed: Products) -> None:
+    """NDVI of the file's own bands, pixel by pixel; NaN where a band has no value or both are dark."""
+    with rasterio.open(posed.file("reflectance")) as file:
+        cube, wave = np.moveaxis(file.read(), 0, -1), [float(file.tags(band)["wavelength"]) for band in file.indexes]
+    near, red = (int(np.argmin(np.abs(np.array(wave) - nm))) for nm in (832.8, 664.6))
+    wanted = (cube[..., near] - cube[..., red]) / (cube[..., near] + cube[..., red])
+    wanted[~(cube[..., [near, red]].mean(axis=-1) >= 0.01)] = np.nan
+    with rasterio.open(posed.file("NDVI")) as file:
+        np.testing.assert_allclose(file.read(1), wanted, atol=1e-5)
+        assert file.tags()["reference"] == find_index("NDVI").reference
+    assert np.isfinite(wanted).mean() > 0.2
+
+
+def test_polygons_are_the_map_without_gap_or_overlap(posed: Products) -> None:
+    """GeoPackage in the map's CRS, GeoJSON in longitude and latitude as RFC 7946 has it; areas to 1 %."""
+    found = geopandas.read_file(posed.file("polygons"))
+    assert found.crs.to_epsg() == 32632
+    assert shapely.coverage_is_valid(found.geometry.to_numpy())
+    assert shapely.union_all(found.geometry).area == pytest.approx(found.area.sum())
+    ground = posed.store("ground_map")
+    known = int((ground["classes"].values != 255).sum()) * ground.attrs["spatial:transform"][0] ** 2
+    assert found.area.sum() == pytest.approx(known, rel=0.01)
+    assert found.area_m2.sum() == pytest.approx(known, rel=0.002)  # on the earth, not on the map
+    assert found.area.min() >= 0.5  # --least-area 0.6, simplified
+    content = json.loads(posed.file("polygons_geojson").read_text())
+    assert "crs" not in content
+    rings = [shapely.LinearRing(one["geometry"]["coordinates"][0]) for one in content["features"]]
+    assert all(shapely.is_ccw(rings))
+    degrees = geopandas.read_file(posed.file("polygons_geojson"))
+    assert list(degrees.name) == list(found.name)
+    np.testing.assert_allclose(degrees.to_crs(32632).area, found.area, rtol=1e-3)
+
+
+def _classes_of_polygons(posed: Products) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
+    """Centres of the map's pixels and their classes, by the polygons that hold them."""
+    ground = posed.store("ground_map")
+    a, _, c, _, e, f = ground.attrs["spatial:transform"]
+    rows, columns = ground["classes"].shape
+    x, y = np.meshgrid(c + a * (np.arange(columns) + 0.5), f + e * (np.arange(rows) + 0.5))
+    return x, y, ground["classes"].values, ground.attrs["class_names"]
+
+
+def test_prescribed_cells_hold_the_dose_of_their_classes(posed: Products) -> None:
+    """By another count: every cell of the shapefile against the pixels of the map whose centres lie in it."""
+    cells = geopandas.read_file(posed.file("prescription"))
+    assert cells.crs.to_epsg() == 32632
+    assert {path.suffix for path in posed.file("prescription").parent.glob("prescription.*")} >= {
+        ".prj",
+        ".cpg",
+        ".dbf",
+    }
+    assert set(cells.dose) == {0.0, 1.0, 2.5}
+    np.testing.assert_allclose(cells.area, 9.0)
+    x, y, classes, names = _classes_of_polygons(posed)
+    grass = (classes == names.index("grass")).ravel()
+    tree = shapely.STRtree(shapely.points(x.ravel(), y.ravel()))
+    sure = 0
+    for cell, dose in zip(cells.geometry, cells.dose, strict=True):
+        inside = tree.query(cell, predicate="contains")
+        share = grass[inside].mean() if len(inside) else 0.0
+        if share > 0.5:  # far above the least share, whatever the small regions and borders did
+            assert dose >= 1.0
+            sure += 1
+    assert sure > 10
+
+
+def test_cells_lie_along_the_heading(posed: Products) -> None:
+    """The first side of each cell is turned by it, clockwise from the map's north."""
+    corners = shapely.get_coordinates(geopandas.read_file(posed.file("prescription")).geometry).reshape(-1, 5, 2)
+    turned = np.rad2deg(np.arctan2(*np.diff(corners, axis=1).transpose(2, 0, 1))) % 90
+    np.testing.assert_allclose(turned, 20, atol=1e-3)
+
+
+def test_the_heading_of_rows_follows_the_picture(posed: Products, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rows across the picture run square to where the rig looks, rows down it along: to the meridians' convergence."""
+    run = open_exported(Archive.open(posed.archive), None)
+    for angle, heading in ((0.0, POSE.heading_deg + 90), (90.0, POSE.heading_deg)):
+        monkeypatch.setattr(export_zones, "find_rows", lambda image, angle=angle: CropRows(angle, 1.0))
+        assert export_zones.row_heading(run) == pytest.approx(heading, abs=1.0)
+    monkeypatch.setattr(export_zones, "find_rows", lambda image: CropRows(None, 0.0))
+    with pytest.raises(SettingsError, match="no crop rows are seen in this run; give --heading in degrees"):
+        export_zones.row_heading(run)
+
+
+def test_task_data_hold_what_the_map_says(posed: Products) -> None:
+    """Read by another library: each cell's dose against the pixels whose longitude and latitude lie in it."""
+    task_data, numbers = isoxml_from_path(posed.file("task_data"))
+    (grid,) = task_data.tasks[0].grids
+    doses = to_numpy_array(numbers[grid.filename], grid) / 10_000
+    assert set(np.unique(doses)) == {0.0, 1.0, 2.5}
+    x, y, classes, names = _classes_of_polygons(posed)
+    to_degrees = pyproj.Transformer.from_crs(32632, 4326, always_xy=True)
+    lon, lat = to_degrees.transform(x, y)
+    row = np.floor((lat - float(grid.minimum_north_position)) / grid.cell_north_size).astype(int)
+    column = np.floor((lon - float(grid.minimum_east_position)) / grid.cell_east_size).astype(int)
+    known = classes != 255
+    assert row[known].min() >= 0
+    assert row[known].max() < grid.maximum_row
+    assert column[known].max() < grid.maximum_column
+    grass, total = np.zeros(doses.shape), np.zeros(doses.shape)
+    np.add.at(total, (row[known], column[known]), 1)
+    np.add.at(grass, (row[known], column[known]), classes[known] == names.index("grass"))
+    mostly = (total > 4) & (grass > 0.5 * total)
+    assert mostly.sum() > 10
+    assert (doses[mostly] >= 1.0).all()
+    assert (doses[total == 0] == 0).all()
+
+
+def test_a_table_of_areas_adds_up(posed: Products) -> None:
+    """Pixels of the map, hectares of the receipt, shares of 1, errors said to be by the labels or by probability."""
+    with posed.file("areas").open() as text:
+        table = list(csv.DictReader(text))
+    names = [row["class"] for row in table]
+    counts = np.bincount(posed.store("ground_map")["classes"].values.ravel(), minlength=256)
+    assert [int(row["pixels"]) for row in table] == counts[: len(names)].tolist()
+    hectares = posed.receipt["ground"]["areas_ha"]
+    np.testing.assert_allclose([float(row["hectares"]) for row in table], [hectares[name] for name in names], rtol=1e-5)
+    for column in ("share", "estimated_share"):
+        assert sum(float(row[column]) for row in table) == pytest.approx(1, abs=1e-4)
+    assert {row["estimated_from"] for row in table} == {"labels"}
+    assert all(float(row["standard_error_share"]) >= 0 for row in table)
+    by_labels = np.array(posed.receipt["accuracy"]["confusion"])
+    assert by_labels.sum() == posed.receipt["accuracy"]["pixels"]
+
+
+def test_the_catalogue_names_every_product(posed: Products) -> None:
+    """A valid item whose assets are there: products, their styles, and the sheet of areas."""
+    item = json.loads(Path(posed.answer["item"]).read_text())
+    assert stac_problems(item) == []
+    assert extension_problems(item) == []
+    wanted = {"reflectance", "NDVI", "SAVI", "polygons", "polygons_geojson", "prescription", "task_data", "areas"}
+    assert wanted | {f"{name}_style" for name in ("class_map", "NDVI", "reflectance")} <= set(item["assets"])
+    assert all(posed.file(key).is_file() for key in posed.answer["files"])
+    centres = [band["eo:center_wavelength"] for band in item["assets"]["reflectance"]["bands"]]
+    np.testing.assert_allclose(centres, posed.store("mosaic")["wavelength"].values / 1000)
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        ({"indices": "NDVY"}, "there is no index 'NDVY'; like it: .*NDVI"),
+        ({"prescription": "weed"}, "expects classes with numbers, weed=2.5, got 'weed'"),
+        ({"prescription": "weed=-1"}, "got 'weed=-1'"),
+        ({"prescription": "weed=1", "dose_unit": "gal/ac"}, "--dose-unit expects l/ha or kg/ha, got 'gal/ac'"),
+        ({"prescription": "weed=1", "cell": 0.0}, "--cell expects metres above 0, got 0"),
+        ({"prescription": "weed=1", "least_share": 1.0}, "--least-share expects a share"),
+        ({"prescription": "weed=1", "heading": "north"}, "--heading expects degrees from north, or rows"),
+        ({"prescription": "thistle=1"}, "no class 'thistle'; its classes are soil, maize"),
+        ({"polygons": True, "buffer": "thistle=1"}, "--buffer: the run has no class 'thistle'"),
+        ({"buffer": "weed=1"}, "shape polygons and prescriptions; ask for one of them as well"),
+        ({"polygons": True, "least_area": -1.0}, "--least-area expects 0 or more, got -1"),
+        ({"indices": "NDVI,NDMI"}, "NDMI wants Short-wave Infrared"),
+    ],
+)
+def test_what_cannot_be_made_is_refused_before_anything_is(
+    posed: Products, tmp_path: Path, flags: dict[str, Any], words: str
+) -> None:
+    """One message that says what was expected; the folder stays empty."""
+    with pytest.raises((SettingsError, WavelengthError), match=words):
+        run_export(posed.archive, None, tmp_path / "out", False, QUIET, choose_products(ProductFlags(**flags)))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_survey_without_a_place_has_what_needs_none(one_picture: Products) -> None:
+    """Polygons on the camera's angles, no GeoJSON, no hectares; doses and metres are refused with what is missing."""
+    found = geopandas.read_file(one_picture.file("polygons"))
+    assert found.crs is None
+    assert "polygons_geojson" not in one_picture.answer["files"]
+    transform = one_picture.store("class_map").attrs["spatial:transform"]
+    pixels = one_picture.store("class_map")["classes"].size
+    assert found.area.sum() == pytest.approx(pixels * transform[0] ** 2, rel=0.01)
+    with one_picture.file("areas").open() as text:
+        table = list(csv.DictReader(text))
+    assert {row["hectares"] for row in table} == {""}
+    assert {row["estimated_from"] for row in table} == {"labels"}
+    assert sum(int(row["pixels"]) for row in table) == pixels
+    for flags in ({"prescription": "class_1=1"}, {"polygons": True, "least_area": 1.0}):
+        with pytest.raises(SettingsError, match=r"metres, and the run does not say where .* \[pose\]"):
+            run_export(
+                one_picture.archive, None, one_picture.out / "no", False, QUIET, choose_products(ProductFlags(**flags))
+            )
+    with pytest.raises(
+        SettingsError, match=r"ExG wants reflectance \(0 to 1\), and the values .* choose an index of ratios"
+    ):
+        run_export(
+            one_picture.archive,
+            None,
+            one_picture.out / "no",
+            False,
+            QUIET,
+            choose_products(ProductFlags(indices="ExG")),
+        )
+    assert not (one_picture.out / "no").exists()
+
+
+@pytest.mark.parametrize(
+    ("crs", "transform"),
+    [("EPSG:32632", TURNED), ("EPSG:4326", Affine(7e-7, 0, 9.5, 0, -4.5e-7, 52.1))],
+    ids=["turned", "in degrees"],
+)
+def test_products_of_a_georeferenced_scene_lie_where_it_does(
+    tmp_path: Path, weights: Path, crs: str, transform: Affine
+) -> None:
+    """Corners of indices and polygons to 0.1 px, in its CRS; cells are square in metres; a gap gets no dose."""
+    run = survey(write_geotiff(tmp_path / "a.tif", transform, gap=True, crs=crs), weights, tmp_path / "archive")
+    flags = {"polygons": True, "indices": "VARI", "prescription": "class_1=2", "cell": 0.5, "heading": "30"}
+    out = tmp_path / "out"
+    answer = run_export(tmp_path / "archive", None, out, False, QUIET, choose_products(ProductFlags(**flags)))
+    done = Products(tmp_path / "archive", run.receipt, answer, out)
+    with rasterio.open(done.file("VARI")) as file:
+        assert str(file.crs) == crs
+        coarse = Affine(*(number * (4 if place % 3 < 2 else 1) for place, number in enumerate(transform[:6])))
+        assert corners_px(file.transform, coarse, file.shape) < 0.1
+        assert np.isnan(file.read(1)[:5, :6]).all()
+    found = geopandas.read_file(done.file("polygons"))
+    assert str(found.crs) == crs
+    places = shapely.get_coordinates(found.geometry)
+    column, row = ~transform * places.T
+    rows, columns = SHAPE
+    assert (column.min(), column.max(), row.min(), row.max()) == pytest.approx((0, columns, 0, rows), abs=0.1)
+    seen = ((column >= 24 - 0.1) | (row >= 20 - 0.1)).all()
+    assert seen  # nothing in the gap
+    cells = geopandas.read_file(done.file("prescription"))
+    assert cells.crs.to_epsg() == 32632
+    np.testing.assert_allclose(cells.area, 0.25, rtol=1e-6)
+    assert (cells.dose == 2).any()
+    assert {0.0, 2.0} >= set(cells.dose)
+    with done.file("areas").open() as text:
+        hectares = [float(row["hectares"]) for row in csv.DictReader(text)]
+    assert sum(hectares) == pytest.approx(found.area_m2.sum() / 1e4, rel=1e-3)
+
+
+@pytest.fixture(scope="module")
+def one_picture(tmp_path_factory: pytest.TempPathFactory, surveyed_png: Any) -> Products:
+    """A survey of a picture, which lies nowhere, with its polygons and an index of ratios."""
+    archive, out = tmp_path_factory.mktemp("picture") / "archive", tmp_path_factory.mktemp("maps").resolve()
+    receipt = surveyed_png(archive).receipt
+    choice = choose_products(ProductFlags(polygons=True, indices="VARI", reflectance=True))
+    return Products(archive, receipt, run_export(archive, None, out, False, QUIET, choice), out)
