@@ -160,7 +160,7 @@ class Settings:
     unknown: Unknown = stated(
         "auto",
         "Pixels unlike all that the weights were trained on get the class unknown: auto (where the weights know "
-        "what is familiar to them, at 0.5%), off, or the share of known pixels that may be called unknown: 0.5%",
+        "what is familiar to them, at 0.1%), off, or the share of known pixels that may be called unknown: 0.5%",
     )
     threshold: float | None = stated(
         None,

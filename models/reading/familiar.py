@@ -18,8 +18,8 @@ from pipeline.errors import ShapeError
 
 Floats = NDArray[np.float32]
 Exact = NDArray[np.float64]
-PIXELS_AT_ONCE = 1 << 15  # so many lie in the processor's cache with their columns
-RATE = 0.005  # of known pixels that may be called unknown, unless the settings ask for another
+PIXELS_AT_ONCE = 1 << 14  # so many lie in the processor's cache with their columns
+RATE = 0.001  # of known pixels that may be called unknown, unless the settings ask for another
 
 
 @dataclass(frozen=True)
@@ -114,10 +114,15 @@ class LitFamiliar:
         return found.reshape(columns.shape[:-1])
 
     def _distance(self, pixels: Floats) -> Floats:
-        told = np.asarray(np.isfinite(pixels).all(axis=1), np.bool_)
-        known = (pixels if told.all() else np.where(told[:, None], pixels, np.float32(0))) @ self.base
+        with np.errstate(invalid="ignore", over="ignore"):
+            known = pixels @ self.base
+            found = self._squares(known)
+        found[~np.isfinite(found)] = np.nan
+        return found
+
+    def _squares(self, known: Floats) -> Floats:
         near = (known @ self.centres.T - 0.5 * (self.centres**2).sum(axis=1)).argmax(axis=1)
-        order = np.argsort(near, kind="stable")
+        order = np.argsort(near.astype(np.uint16), kind="stable")  # sorted by digits, in a tenth of the time
         ends, in_order = np.searchsorted(near[order], np.arange(len(self.centres) + 1)), known[order]
         squares = np.empty(len(known), np.float32)
         for number, (start, stop) in enumerate(pairwise(ends)):
@@ -125,5 +130,4 @@ class LitFamiliar:
             squares[start:stop] = np.einsum("ij,ij->i", apart, apart)
         found = np.empty(len(known), np.float32)
         found[order] = squares
-        found[~told] = np.nan
         return found

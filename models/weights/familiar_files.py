@@ -49,11 +49,10 @@ class FamiliarWeights:
 
 @dataclass(frozen=True)
 class FamiliarFile:
-    """The same by its file: where it lies, what it holds, and which rates its limits are known for."""
+    """The same by its file: where it lies and what it holds."""
 
     path: Path
     key: str
-    rates: tuple[float, float]
     trained_on: TrainedOn
 
 
@@ -73,7 +72,6 @@ def save_familiar(made: FamiliarWeights, path: Path) -> None:
         "bands": familiar.bands,
         "columns": familiar.centres.shape[1],
         "steps": list(limits.steps),
-        "rates": [float(limits.rates[0]), float(limits.rates[-1])],
         "trained_on": made.trained_on.as_dict(),
         "record": dict(made.record),
     }
@@ -94,8 +92,7 @@ def describe_familiar(weights: Path, described: Description, weights_key: str) -
         return None
     with _opened(path, "np") as file:
         about = _checked(path, _described(path, file), described, weights_key)
-    low, high = map(float, about["rates"])
-    return FamiliarFile(path, familiar_key(path), (low, high), TrainedOn.read(about["trained_on"]))
+    return FamiliarFile(path, familiar_key(path), TrainedOn.read(about["trained_on"]))
 
 
 def familiar_key(path: Path) -> str:

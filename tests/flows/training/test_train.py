@@ -20,11 +20,14 @@ from flows.settings.load import load_settings
 from flows.survey.run import open_run
 from flows.training import train as flow
 from flows.training.data import pack_mask, unpack_mask
+from flows.training.measure_familiar import FamiliarRequest, measure_familiar
 from flows.training.train import TrainRequest, joined_split, run_train, suggested_patch, train_weights, usual_crop
 from models.network.sizes import PRESETS, Preset
 from models.training.start_weights import StartFile
 from models.training.train import TrainingSettings
+from models.weights.familiar_files import familiar_path, load_familiar
 from models.weights.files import describe_weights, load_any_weights, load_weights
+from models.weights.trained_on import TrainedOn
 from pipeline.errors import SceneError, SettingsError, WeightsError
 from tests.flows.small_fields import write_field
 
@@ -62,6 +65,31 @@ def test_the_record_tells_what_was_trained_on(folder: Path, out: Path, tmp_path:
     assert split["held_out"] == ["003"]
     assert record["training"]["steps"] == 1
     assert load_weights(tmp_path / "w.safetensors").record["split"] == split
+
+
+def test_new_weights_say_what_they_saw_and_know_what_is_familiar(tmp_path: Path):
+    """By scenes kept for validation; measured again by the command, the same; without such scenes nothing of it."""
+    names = tuple(f"{number:03}" for number in range(1, 5))
+    field, out = write_field(tmp_path / "field", (32, 32), names), tmp_path / "w.safetensors"
+    record = train_weights(_request(field, out, validation=1))
+    told = TrainedOn.read(load_weights(out).record["trained_on"])
+    assert (told.scenes, told.exposure_ms, told.day) == (3, (100.0, 100.0), None)
+    assert 0 <= record["calibration"]["expected_error"] <= 1
+    known = load_familiar(out, describe_weights(out))
+    assert known.trained_on == told
+    again = tmp_path / "again.safetensors"
+    measure_familiar(FamiliarRequest(str(field), out, again))
+    again.replace(familiar_path(out))
+    measured = load_familiar(out, describe_weights(out)).familiar
+    np.testing.assert_allclose(measured.centres, known.familiar.centres, atol=1e-5)
+    np.testing.assert_allclose(measured.limits.fine, known.familiar.limits.fine, rtol=1e-4)
+    other = write_field(tmp_path / "other", (32, 32), ("007", "008", "009"))
+    with pytest.raises(SettingsError, match="give the data set of their training"):
+        measure_familiar(FamiliarRequest(str(other), out, again))
+    assert "no scene was kept" in train_weights(_request(field, out, validation=0))["familiar"]
+    assert not familiar_path(out).exists()
+    with pytest.raises(SettingsError, match="no scene was kept for validation"):
+        measure_familiar(FamiliarRequest(str(field), out, again))
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,124 @@
+"""How far spectra lie from what training saw: laws of the distance, and known rates of Gaussian data."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from models.reading.familiar import Familiar, Limits
+from pipeline.errors import ShapeError
+
+COLUMNS = 5
+
+
+def some_limits(distance: float = 2.0) -> Limits:
+    """The same distance for both rates, all light and both steps."""
+    return Limits(
+        np.array([0.001, 0.01]), np.array([0.03, 1.0]), (1, 2), np.full((2, 2, 2), distance), np.full((2, 2), distance)
+    )
+
+
+def some_familiar(seed: int = 0, components: int = 3, **changed: Any) -> Familiar:
+    """Components far from each other, with covariances of their own, and noise."""
+    rng = np.random.default_rng(seed)
+    mixing = rng.normal(0, 1, (components, COLUMNS, COLUMNS))
+    covariance = mixing @ mixing.swapaxes(1, 2) + 0.1 * np.eye(COLUMNS)
+    parts: dict[str, Any] = {
+        "centres": rng.normal(0, 100, (components, COLUMNS)),
+        "covariance": covariance,
+        "shot": np.stack([0.1 * np.eye(COLUMNS)] * components),
+        "read": 0.01 * np.eye(COLUMNS),
+        "limits": some_limits(),
+        "bands": 10,
+    }
+    return Familiar(**{**parts, **changed})
+
+
+def spectra_of(familiar: Familiar, count: int, seed: int = 1, light: float = 1.0) -> np.ndarray:
+    """Spectra drawn from the components, in their order, with the noise of the light."""
+    rng = np.random.default_rng(seed)
+    noise = familiar.shot / light + familiar.read / light**2
+    drawn = [
+        rng.multivariate_normal(m, c + n, count)
+        for m, c, n in zip(familiar.centres, familiar.covariance, noise, strict=True)
+    ]
+    return np.concatenate(drawn)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 1000), st.floats(0.03, 1.0), st.integers(1, 4))
+def test_the_distance_is_that_of_mahalanobis(seed: int, light: float, readings: int) -> None:
+    """In float64, by a solution with the whole covariance, of spectra whose component is known."""
+    familiar = some_familiar(seed)
+    pixels = spectra_of(familiar, 20, seed)
+    noise = (familiar.shot / light + familiar.read / light**2) / readings
+    wanted = []
+    for number, pixel in enumerate(pixels):
+        apart = pixel - familiar.centres[number // 20]
+        spread = familiar.covariance[number // 20] + noise[number // 20]
+        wanted.append(apart @ scipy.linalg.solve(spread, apart, assume_a="pos") / COLUMNS)
+    np.testing.assert_allclose(familiar.lit(light, readings).distance(pixels), wanted, rtol=2e-3, atol=1e-4)
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 1000))
+def test_the_order_of_pixels_makes_no_difference(seed: int) -> None:
+    """Nor does the shape that they come in, nor how many come at once."""
+    lit = some_familiar().lit(0.5)
+    rng = np.random.default_rng(seed)
+    pixels = rng.normal(0, 60, (40, COLUMNS)).astype(np.float32)
+    order = rng.permutation(40)
+    plain = lit.distance(pixels)
+    np.testing.assert_allclose(lit.distance(pixels[order]), plain[order], rtol=1e-4)
+    np.testing.assert_allclose(lit.distance(pixels.reshape(5, 8, COLUMNS)).ravel(), plain, rtol=1e-4)
+    np.testing.assert_allclose(np.concatenate([lit.distance(pixels[:7]), lit.distance(pixels[7:])]), plain, rtol=1e-4)
+
+
+@pytest.mark.parametrize("light", [1.0, 0.1])
+def test_gaussian_spectra_lie_beyond_a_limit_as_often_as_chi_squared_says(light: float) -> None:
+    """In the light that they are seen in: 1 % of them beyond what one in a hundred goes beyond."""
+    beyond = float(scipy.stats.chi2.ppf(0.99, COLUMNS)) / COLUMNS
+    familiar = some_familiar(limits=some_limits(beyond))
+    pixels = spectra_of(familiar, 4000, light=light)
+    share = familiar.unknown(pixels, rate=0.005, light=light, step=1, bands=10).mean()
+    assert 0.007 < share < 0.013
+
+
+def test_fewer_bands_are_read_as_noisier_ones() -> None:
+    """A spectrum beyond the noise of all bands may be within that of some; more than in training help nothing."""
+    familiar = some_familiar(covariance=np.stack([0.01 * np.eye(COLUMNS)] * 3))
+    pixel = familiar.centres[:1] + 0.7
+    told = [familiar.unknown(pixel, rate=0.005, light=1.0, step=1, bands=bands)[0] for bands in (1, 10, 20)]
+    assert told == [False, True, True]
+
+
+def test_a_pixel_without_columns_is_not_unknown() -> None:
+    """It was not captured, which is another thing; what was, however far away, is."""
+    familiar = some_familiar()
+    pixels = np.array([[np.nan] * COLUMNS, [np.inf] * COLUMNS, [1e6] * COLUMNS])
+    assert familiar.unknown(pixels, rate=0.005, light=1.0, step=None, bands=10).tolist() == [False, False, True]
+    assert familiar.unknown(pixels[:0], rate=0.005, light=1.0, step=1, bands=10).shape == (0,)
+
+
+def test_limits_lie_between_those_that_were_measured() -> None:
+    """By the logarithms of rate and light; beyond them the nearest; a step between two counts as the wider."""
+    fine = np.array([[[4.0, 2.0], [3.0, 1.0]], [[8.0, 6.0], [7.0, 5.0]]])
+    limits = Limits(np.array([0.001, 0.1]), np.array([0.01, 1.0]), (1, 4), fine, 10 * fine[0])
+    assert limits.at(0.001, 0.01, 1) == 4
+    assert limits.at(0.01, 0.1, 1) == pytest.approx(2.5)
+    assert limits.at(0.5, 0.001, 2) == 6
+    assert limits.at(0.1, 5.0, 8) == 5
+    assert limits.at(0.001, 1.0, None) == 30
+
+
+def test_other_columns_are_refused() -> None:
+    """Of pixels, and of the components themselves."""
+    with pytest.raises(ShapeError, match="expected 5 columns"):
+        some_familiar().lit(1.0).distance(np.zeros((3, 4)))
+    with pytest.raises(ShapeError, match="covariances"):
+        some_familiar(read=np.eye(4))
