@@ -113,7 +113,7 @@ def test_the_pointer_tells_class_probability_and_place(opened: Tab) -> None:
     assert "looked at 3.0 days ago" in said
     assert f"fine sweep 2 of 2{shown}" in said
     lat, lon = 52 - 12.5 / HEIGHT, 9 + 2 * 10.5 / WIDTH
-    assert f"{lat:.6f}° N, {lon:.6f}° E ({1000 * lon:.1f}, {1000 * lat:.1f})" in said
+    assert f"{lat:.7f}° N, {lon:.7f}° E ({1000 * lon:.2f}, {1000 * lat:.2f})" in said
     opened.mouse("Moved", *place(opened, 1, 1))
     opened.wait("readout.textContent.startsWith('x 1, y 1')")
     assert "no class" in text(opened, "readout")
