@@ -52,7 +52,7 @@ def known_map() -> FieldMap:
         seats=seats,
         sweeps=[SweepShown((8, 16, 0, WIDTH), "fine", f"fine sweep 2 of 2{BAD}")],
         spectra=page_spectra([MOSAIC], MOSAIC.shape, NM, FACTOR),
-        places=PagePlaces("EPSG:32632", 1000 * lattice, lattice),
+        places=PagePlaces("EPSG:32632", 1024 * lattice, lattice),
     )
 
 
@@ -113,7 +113,7 @@ def test_the_pointer_tells_class_probability_and_place(opened: Tab) -> None:
     assert "looked at 3.0 days ago" in said
     assert f"fine sweep 2 of 2{shown}" in said
     lat, lon = 52 - 12.5 / HEIGHT, 9 + 2 * 10.5 / WIDTH
-    assert f"{lat:.6f}° N, {lon:.6f}° E ({1000 * lon:.1f}, {1000 * lat:.1f})" in said
+    assert f"{lat:.7f}° N, {lon:.7f}° E ({1024 * lon:.2f}, {1024 * lat:.2f})" in said
     opened.mouse("Moved", *place(opened, 1, 1))
     opened.wait("readout.textContent.startsWith('x 1, y 1')")
     assert "no class" in text(opened, "readout")

@@ -165,8 +165,8 @@ class FieldMap {
     };
     const [lon, lat, east, north] = [between(places.lonlat, 0), between(places.lonlat, 1), between(places.map, 0), between(places.map, 1)];
     if (lon === null || lat === null) return "no ground";
-    const degrees = `${Math.abs(lat).toFixed(6)}° ${lat < 0 ? "S" : "N"}, ${Math.abs(lon).toFixed(6)}° ${lon < 0 ? "W" : "E"}`;
-    return east === null || Math.abs(east) <= 360 ? degrees : `${degrees} (${east.toFixed(1)}, ${north.toFixed(1)})`;
+    const degrees = `${Math.abs(lat).toFixed(7)}° ${lat < 0 ? "S" : "N"}, ${Math.abs(lon).toFixed(7)}° ${lon < 0 ? "W" : "E"}`;
+    return east === null || Math.abs(east) <= 360 ? degrees : `${degrees} (${east.toFixed(2)}, ${north.toFixed(2)})`;
   }
 
   words(y, x) {
