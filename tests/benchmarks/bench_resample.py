@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from measure import Clock, Row, ratio, time_in_turn
 from numpy.typing import NDArray
-from resample_peers import BANDS, ENGINES, Peer, Turned, cv2_parts, peers, spline, turned_waves
+from prepared.resample_peers import BANDS, ENGINES, Peer, Turned, cv2_parts, peers, spline, turned_waves
 
 from pipeline.rectify.kernels import Kernel, windows
 from pipeline.rectify.resample import resample

@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.patches import Rectangle
 from measure import Row, not_run
 from numpy.typing import NDArray
-from seam_data import (
+from prepared.seam_data import (
     CUT_LEFT,
     CUT_RIGHT,
     LINES,
