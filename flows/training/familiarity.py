@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from flows.training.data import TrainingData, read_farm_name
 from models.network.spectral import patches_of
 from models.reading.inference import glance_of_columns, segment
-from models.training.calibration import JudgedMap, calibrate
+from models.training.calibration import JudgedMap, judge_confidence
 from models.training.examples import Example
 from models.training.familiar import fit_familiar
 from models.weights.familiar_files import FamiliarWeights, familiar_path, save_familiar
@@ -68,7 +68,7 @@ def measured_calibration(weights: Weights, frames: Sequence[Example], seed: int)
         drawn = segment(weights, glance_of_columns(weights, frame.coarse, grid), cells[valid], valid, every_class=True)
         assert drawn.log_probability is not None
         maps.append(JudgedMap.of(drawn.log_probability, frame.labels[: grid.height, : grid.width]))
-    return calibrate(maps, seed) if maps else None
+    return judge_confidence(maps, seed) if maps else None
 
 
 def save_beside(

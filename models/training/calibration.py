@@ -31,7 +31,7 @@ class JudgedMap:
         return JudgedMap(log_probability[told], labels[told])
 
 
-def calibrate(maps: list[JudgedMap], seed: int) -> dict[str, Any]:
+def judge_confidence(maps: list[JudgedMap], seed: int) -> dict[str, Any]:
     """Expected calibration error of maps, 0..1, for a record; with a ``temperature`` where it is bad.
 
     The temperature divides logits, which leaves the likeliest class what it is. It is the one under which the labels of

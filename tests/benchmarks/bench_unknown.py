@@ -2,13 +2,11 @@
 
 Farms of other seeds and days than any that weights or limits were made with, looked at in four ways; each map is drawn
 with the class and without it, of the same lines. Other fields have spectra that no farm has: invented ones, a farm's in
-shuffled bands, grey boards, and Indian Pines (AVIRIS; `SPECTRALZOOM_PINES` names its folder) brought to the farm's
-brightness.
+shuffled bands, grey boards, and Indian Pines (AVIRIS, of the data folder) brought to the farm's brightness.
 """
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import scipy
-from measure import Row
+from measure import Row, data_folder, not_run
 from numpy.typing import NDArray
 from rich.console import Console
 
@@ -34,6 +32,7 @@ LOOKS: dict[str, dict[str, Any]] = {
 }
 WEIGHTS = Path(__file__).resolve().parents[2] / "models" / "shipped" / "farm.safetensors"
 BANDS_NM = np.linspace(405.0, 995.0, 60)
+PINES = data_folder("indian_pines")
 BRIGHTNESS = 0.22  # mean reflectance of farms
 Values = NDArray[np.float32]
 Judged = dict[str, float]
@@ -59,7 +58,7 @@ def rows() -> list[Row]:
                 share = 100 * _survey({"scene": str(path), "weights": str(WEIGHTS), **LOOKS[look]}, "auto")["share"]
                 found.append(Row(f"{name}, {look}: unknown", f"{share:.1f} %", ">= 90 %", share >= 90))
                 print(f"{found[-1].what}: {found[-1].figure}", flush=True)
-    return found
+    return found if PINES.is_dir() else [*found, not_run("Indian Pines at the farm's brightness", PINES)]
 
 
 def _figure(values: list[float], unit: str) -> str:
@@ -101,9 +100,8 @@ def other_fields(folder: Path) -> Iterator[tuple[str, Path]]:
         shuffled = np.random.default_rng(number).permutation(reflectance.shape[-1])
         place = folder / f"shuffled{number}"
         yield f"farm, bands shuffled ({number})", _written(place, reflectance[..., shuffled], farm.wavelength_nm[::5])
-    pines = os.environ.get("SPECTRALZOOM_PINES")
-    if pines is not None:
-        yield "Indian Pines at the farm's brightness", _pines(Path(pines), folder / "pines")
+    if PINES.is_dir():
+        yield "Indian Pines at the farm's brightness", _pines(PINES, folder / "pines")
 
 
 def _invented(rng: np.random.Generator) -> NDArray[np.float64]:

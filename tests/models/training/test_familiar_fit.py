@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from models.network.spectral import Normalisation
-from models.training.calibration import JudgedMap, calibrate, fitted_temperature
+from models.training.calibration import JudgedMap, fitted_temperature, judge_confidence
 from models.training.examples import Example
 from models.training.familiar import components, fit_familiar
 from models.training.looks import ColumnNoise
@@ -77,7 +77,7 @@ def judged(sharpness: float, seed: int = 0) -> JudgedMap:
 
 def test_a_map_too_sure_of_itself_gets_the_temperature_that_it_lacks() -> None:
     """About the factor that it was too sure by, and its error falls; which class is likeliest stays."""
-    told = calibrate([judged(2.5)], seed=0)
+    told = judge_confidence([judged(2.5)], seed=0)
     assert told["temperature"] == pytest.approx(2.5, rel=0.1)
     assert told["expected_error"] < 0.02 < told["expected_error_before"]
     assert fitted_temperature([judged(0.5, 1)], 0) == pytest.approx(0.5, rel=0.1)
@@ -85,4 +85,4 @@ def test_a_map_too_sure_of_itself_gets_the_temperature_that_it_lacks() -> None:
 
 def test_a_map_that_is_right_about_itself_is_left_alone() -> None:
     """No temperature, and the error as it is."""
-    assert set(calibrate([judged(1.0)], seed=0)) == {"scenes", "expected_error"}
+    assert set(judge_confidence([judged(1.0)], seed=0)) == {"scenes", "expected_error"}
