@@ -53,7 +53,7 @@ class MosaicView:
 
     @cached_property
     def ground(self) -> GroundGrid | None:
-        """The map's grid with its rays, from what the map's store says of its pose; None without one."""
+        """The map's grid in coarse pixels, with its rays, from what the map's store says of its pose; None without."""
         if self.run.store("ground_map") is None:
             return None
         path, scene = self.run.path("ground_map"), grid_of(open_image(self.run.path("class_map"), "classes").about)
@@ -61,7 +61,15 @@ class MosaicView:
         assert scene is not None
         assert geobox is not None
         pose = RigPose(**open_image(path, "classes").about["rig_pose"])
-        return grid_of_map(GroundView(pose, scene.ifov_rad), scene.scene_shape, geobox)
+        coarse = geobox.zoom_out(self.factor)  # finer the mosaic knows nothing
+        return grid_of_map(GroundView(pose, scene.ifov_rad), scene.scene_shape, coarse)
+
+    @cached_property
+    def factor(self) -> int:
+        """Fine pixels to a side of the mosaic's."""
+        grid = grid_of(open_image(self.run.path("mosaic"), "values").about)
+        assert grid is not None
+        return grid.factor
 
     def rows(self, bands: Sequence[int]) -> Rows:
         """Values (row, x, band) of some bands with the number of the first row, from the top down."""
@@ -70,7 +78,7 @@ class MosaicView:
             for first, values in open_image(self.run.path("mosaic"), "values").rows():
                 yield first, values[..., list(bands)]
             return
-        factor = grid_of(dict(group.attrs)).factor  # type: ignore[union-attr]
+        factor = self.factor
         at_once = int(np.clip(BYTES_AT_ONCE // (4 * len(bands) * self.shape[1]), 1, 256))
         for first in range(0, self.shape[0], at_once):
             last = min(first + at_once, self.shape[0])

@@ -50,7 +50,7 @@ def check_scene_there(settings: Settings) -> None:
     except OSError as error:  # such as a name longer than any
         raise SceneError(f"--scene {settings.scene} cannot be the name of a file: {error.strerror}") from error
     if not there:
-        raise SceneError(f"--scene {settings.scene}: there is {what} {path}; check the name (seen from {Path.cwd()})")
+        raise SceneError(f"there is {what} {path}; check the name of --scene (seen from {Path.cwd()})")
 
 
 def open_scene(settings: Settings, known: Sequence[str] | None = None) -> tuple[RasterScene, tuple[str, ...]]:

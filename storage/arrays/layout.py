@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -175,6 +176,9 @@ def write_bands(group: zarr.Group, wavelength_nm: NDArray[np.float64], fwhm_nm: 
     return "wavelength fwhm"
 
 
+_FILTERING = Lock()
+
+
 def consolidate_stores(folder: Path) -> None:
     """Put the metadata of all arrays of each store in a folder together, so that it opens at once and without a word.
 
@@ -182,7 +186,7 @@ def consolidate_stores(folder: Path) -> None:
     """
     for path in sorted(folder.glob("*.zarr")):
         if (path / "zarr.json").is_file():
-            with warnings.catch_warnings():
+            with _FILTERING, warnings.catch_warnings():  # filters are of the process, not of a thread
                 warnings.filterwarnings("ignore", "Consolidated metadata is currently not part")  # zarr's, of its v3
                 zarr.consolidate_metadata(path)
 

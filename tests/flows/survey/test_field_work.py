@@ -19,6 +19,7 @@ from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
 from storage.arrays.beliefs import create_belief
 from storage.arrays.class_maps import ClassNames, create_class_map, load_class_map
+from storage.arrays.layout import consolidate_stores
 from storage.arrays.mosaics import load_attention
 from storage.parallel.crew import Crew
 
@@ -55,6 +56,7 @@ def _draw(work: FieldWork, run: SurveyRun, stages: Path, out: Path) -> dict[str,
     mosaic, patches = _store(stages, "rectify/*/mosaic.zarr"), _store(stages, "patches/*/patches.zarr")
     drawing = Drawing(work.weights, mosaic, patches, out, out.with_suffix(".belief"), 1.0, 1)
     draw_field(work, drawing, lambda done: None)
+    consolidate_stores(out.parent)  # as a store is published
     return _contents(out)
 
 

@@ -115,7 +115,7 @@ def test_evaluate_says_so_and_sealing_needs_files(
 ) -> None:
     """After the figures; without a file one message, exit code 2."""
     told = io.StringIO()
-    monkeypatch.setattr(evaluate_command, "evaluate_weights", lambda request, show: {"files": []})
+    monkeypatch.setattr(evaluate_command, "evaluate_weights", lambda request, show: {"files": [], "data_notes": []})
     request = EvaluateRequest("data", (earlier,))
     run_evaluate(request, Console(file=told, width=500), as_json=True)
     assert f"note: w.safetensors {SAID}{earlier}" in told.getvalue()

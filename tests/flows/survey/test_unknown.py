@@ -25,6 +25,7 @@ from models.weights.familiar_files import FamiliarWeights, familiar_path, save_f
 from models.weights.files import content_key, describe_weights
 from models.weights.trained_on import TrainedOn
 from pipeline.errors import SettingsError, WeightsError
+from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.class_maps import ClassNames, with_unknown
 from tests.conftest import CLASSES, RGB_NM, Survey
 
@@ -149,7 +150,7 @@ def test_pixels_without_a_value_have_no_class_rather_than_an_unknown_one(
     flags = {"scene": str(tmp_path / "holes.npy"), "labels": None, "wavelengths": ",".join(map(str, RGB_NM))}
     survey_png(tmp_path / "out", weights=str(judging(1e-6)), effects="none", **flags)
     classes = _stored(tmp_path / "out", "class_map")["classes"].values
-    assert np.isnan(classes[:8, :8]).all()
+    assert (classes[:8, :8] == UNLABELLED).all()
     assert (classes[8:, 8:] == 3).all()
 
 
