@@ -58,14 +58,16 @@ def _cell(value: float) -> str:
 
 
 def _counted(path: Path, count: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """(class,) pixels and mean confidence of the exported map; NaN for a class without a pixel."""
-    pixels, sums = np.zeros(256, np.int64), np.zeros(256)
+    """(class,) pixels and mean confidence of the exported map; NaN for a class of which no pixel has one."""
+    pixels, sums, sure_pixels = np.zeros(256, np.int64), np.zeros(256), np.zeros(256, np.int64)
     for (_, classes), (_, sure) in zip(
         open_image(path, "classes").rows(), open_image(path, "confidence").rows(), strict=True
     ):
         pixels += np.bincount(classes.ravel(), minlength=256)
-        sums += np.bincount(classes.ravel(), np.nan_to_num(sure).ravel(), 256)
-    return pixels[:count], np.where(pixels > 0, sums / np.maximum(pixels, 1), np.nan)[:count]
+        known = np.isfinite(sure)
+        sums += np.bincount(classes[known], sure[known], 256)
+        sure_pixels += np.bincount(classes[known], minlength=256)
+    return pixels[:count], np.where(sure_pixels > 0, sums / np.maximum(sure_pixels, 1), np.nan)[:count]
 
 
 def _hectares(run: ExportedRun, names: tuple[str, ...]) -> NDArray[np.float64] | None:

@@ -141,3 +141,23 @@ class StageProgress:
         """Put words beside the stage that runs, as far as it is; nothing where none runs."""
         if self._now is not None:
             self.show(*self._now, words)
+
+
+@contextmanager
+def one_after_the_other(console: Console) -> Iterator[Callable[[str, float, str], None]]:
+    """Bars of parts that follow each other: a part has ended where the next begins, and the last with the block.
+
+    Gives what a part is told by: its title, how far it is (0..1), and a figure in words.
+    """
+    last = ""
+    with StageProgress(console) as progress:
+
+        def report(what: str, done: float, figure: str) -> None:
+            nonlocal last
+            if last not in ("", what):
+                progress.show(last, 1.0, ended=True)
+            last = what
+            progress.show(what, done, figure)
+
+        yield report
+        progress.show(last, 1.0, ended=True)

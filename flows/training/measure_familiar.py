@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from flows.terminal.progress import StageProgress
+from flows.terminal.progress import one_after_the_other
 from flows.training.data import TrainingData, open_training_data
 from flows.training.familiarity import SeenScenes, measured_calibration, save_beside, trained_on
 from flows.training.train import TrainRequest, observe_all
@@ -117,18 +117,8 @@ def _looked_at(weights: Weights, data: TrainingData, request: FamiliarRequest, r
 
 def run_measure_familiar(request: FamiliarRequest, console: Console) -> dict[str, Any]:
     """Measure with a progress bar on ``console``; give the record kept in the file."""
-    last = ""
-    with StageProgress(console) as progress:
-
-        def report(what: str, done: float, figure: str) -> None:
-            nonlocal last
-            if last not in ("", what):
-                progress.show(last, 1.0, ended=True)
-            last = what
-            progress.show(what, done, figure)
-
+    with one_after_the_other(console) as report:
         record = measure_familiar(request, report)
-        progress.show(last, 1.0, ended=True)
     words = f"what is familiar: {request.out}, of {record['scenes']} scenes"
     beside = familiar_path(request.weights)
     if request.out.resolve() != beside.resolve():

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from flows.terminal.progress import StageProgress
+from flows.terminal.progress import one_after_the_other
 from flows.training.look import observe_finely
 from models.evaluation.metrics import confusion, mean_iou
 from models.network.spectral import patches_of
@@ -201,18 +201,8 @@ def _means(rows: Iterable[dict[str, float]]) -> dict[str, float]:
 
 def run_remember(request: MemoryRequest, console: Console) -> dict[str, Any]:
     """Train with a progress bar on ``console``; give the record kept in the file."""
-    last = ""
-    with StageProgress(console) as progress:
-
-        def report(what: str, done: float, figure: str) -> None:
-            nonlocal last
-            if last not in ("", what):
-                progress.show(last, 1.0, ended=True)
-            last = what
-            progress.show(what, done, figure)
-
+    with one_after_the_other(console) as report:
         record = train_memory(request, report)
-        progress.show(last, 1.0, ended=True)
     console.print(f"reader of memories: {request.out}, {record['steps']} steps", markup=False, soft_wrap=True)
     if record["validation"]:
         _print_validation(record["validation"], request.judged, console)

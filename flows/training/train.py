@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from flows.terminal.progress import StageProgress
+from flows.terminal.progress import one_after_the_other
 from flows.training.data import (
     TrainingData,
     alike_notes,
@@ -354,20 +354,10 @@ def run_train(request: TrainRequest, console: Console) -> dict[str, Any]:
     """Train with a progress bar on ``console``; give the record kept in the weights."""
     _check_counts(request)
     request = replace(request, command=request.command or asked_command())
-    last = ""
-    with StageProgress(console) as progress:
-
-        def report(what: str, done: float, figure: str) -> None:
-            nonlocal last
-            if last not in ("", what):
-                progress.show(last, 1.0, ended=True)
-            last = what
-            progress.show(what, done, figure)
-
+    with one_after_the_other(console) as report:
         record = train_weights(
             request, report, lambda note: console.print(f"note: {note}", markup=False, soft_wrap=True)
         )
-        progress.show(last, 1.0, ended=True)
     if "begun_from" in record:
         print_start(record["begun_from"], console)
     _print_figures(record, request, console)

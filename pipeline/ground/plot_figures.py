@@ -25,7 +25,7 @@ class PlotFigures:
     pixels: int  # whose centres lie in it
     mapped_pixels: int  # of them, those with a class
     area_m2: float | None  # of the mapped pixels; None where nobody knows how large they are
-    confidence: float | None  # mean over the mapped pixels
+    confidence: float | None  # mean over the mapped pixels that have one
     shares: dict[str, float | None]  # of the mapped ground, by class; of the pixels where that is not known
 
 
@@ -56,13 +56,14 @@ def _figures(
     ground = place.pixel_areas_m2(rows, columns)
     weight = np.where(mapped, 1.0 if ground is None else np.nan_to_num(ground), 0.0)
     by_class, total = np.bincount(drawn[mapped], weight[mapped], len(names)), float(weight.sum())
-    count = int(mapped.sum())
+    count, sure = int(mapped.sum()), confidence[rows, columns][mapped]
+    sure = sure[np.isfinite(sure)]  # what is unknown has no confidence
     return PlotFigures(
         plot,
         int(inside.sum()),
         count,
         None if ground is None else total,
-        float(confidence[rows, columns][mapped].mean(dtype=np.float64)) if count else None,
+        float(sure.mean(dtype=np.float64)) if sure.size else None,
         {name: float(one) / total if total else None for name, one in zip(names, by_class, strict=True)},
     )
 

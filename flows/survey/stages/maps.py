@@ -189,7 +189,7 @@ def ground(run: SurveyRun, class_map: StageRef, mosaic: StageRef) -> Wanted | No
 
     def build(path: Path) -> None:
         found = load_class_map(class_map.path / "class_map.zarr")
-        colours = coarse_colours(mosaic)
+        unsure, colours = np.isnan(found.confidence).astype(np.uint8), coarse_colours(mosaic)
         about = {"rig_pose": asdict(grid.frame.view.pose), "scene_pixels": grid.counts()}
         writer = GroundMapWriter(path / STORE, grid.geobox, ClassNames(found.names, found.colours), about=about)
         for rows, columns in map_blocks(grid.shape, BLOCK):  # what is not seen is 255, NaN and 0
@@ -198,6 +198,7 @@ def ground(run: SurveyRun, class_map: StageRef, mosaic: StageRef) -> Wanted | No
                 classes_at(found.classes, pixels),
                 image_at(found.confidence[..., None], pixels)[..., 0],
             )
+            confidence[classes_at(unsure, pixels) == 1] = np.nan  # of the class unknown, whatever lies beside it
             picture = np.nan_to_num(np.rint(image_at(colours, pixels, factor=run.grid.factor))).astype(np.uint8)
             writer.write_block(rows, columns, classes, confidence, picture)
             run.report(rows.stop / grid.shape[0])

@@ -16,6 +16,7 @@ from odc.geo.geobox import GeoBox
 from pipeline.geometry.grid import SceneGrid
 from pipeline.ground.field_places import NoPlace, PlacedPicture, PosedField
 from pipeline.ground.map_grid import ground_grid
+from pipeline.ground.plot_figures import figures_of_plots
 from pipeline.ground.view import GroundView, RigPose
 from pipeline.ground.zones import field_zones, on_field, pixels_inside
 
@@ -159,6 +160,15 @@ def test_zones_that_leave_nothing_out_are_none() -> None:
     assert field_zones(everything, ~everything) is None
     assert field_zones(None, None) is None
     assert field_zones(None, everything) is not None
+
+
+def test_a_plot_is_as_sure_as_its_pixels_that_are() -> None:
+    """Three pixels of 0.5, 0.7 and 0.9, one of the class unknown: the mean is of the three; of none it is None."""
+    classes, confidence = np.array([[0, 0], [0, 1]], np.uint8), np.array([[0.5, 0.7], [0.9, np.nan]], np.float32)
+    plots = {"all": shapely.box(0, 0, 2, 2), "strange": shapely.box(1, 1, 2, 2)}
+    whole, strange = figures_of_plots(plots, NoPlace((2, 2)), classes, confidence, ("crop", "unknown"))
+    assert (whole.pixels, whole.confidence) == (4, pytest.approx(0.7))
+    assert (whole.shares["unknown"], strange.shares["unknown"], strange.confidence) == (0.25, 1.0, None)
 
 
 def test_without_a_place_polygons_are_pixels() -> None:

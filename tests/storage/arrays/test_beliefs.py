@@ -10,8 +10,18 @@ import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 
+from models.reading.remembered import FAINTEST as FAINTEST_BELIEVED
 from pipeline.errors import ChunkError, IncompleteStoreError, ShapeError
-from storage.arrays.beliefs import DAY_STEP, NOTHING, STEP, BeliefStore, create_belief, write_belief_tile, write_changes
+from storage.arrays.beliefs import (
+    DAY_STEP,
+    FAINTEST,
+    NOTHING,
+    STEP,
+    BeliefStore,
+    create_belief,
+    write_belief_tile,
+    write_changes,
+)
 from storage.arrays.class_maps import ClassNames
 
 LEGEND = ClassNames(("soil", "maize", "weed"), np.arange(9, dtype=np.uint8).reshape(3, 3))
@@ -55,6 +65,11 @@ def test_what_is_read_is_what_was_written_within_half_a_step(
     clear = first - second > STEP
     np.testing.assert_array_equal(found[known].argmax(axis=-1)[clear], values[known].argmax(axis=-1)[clear])
     assert np.abs(found[known] - values[known])[values[known] > -12].max() < 1.5 * STEP
+
+
+def test_the_faintest_belief_is_the_faintest_that_is_stored() -> None:
+    """Models and stores import nothing of each other, and mean the same least probability."""
+    assert FAINTEST == FAINTEST_BELIEVED
 
 
 def test_a_part_is_read_alone(tmp_path: Path) -> None:
