@@ -34,7 +34,15 @@ from storage.readers.cube_sources import (
     check_numbers,
 )
 from storage.readers.envi_cubes import open_envi_cube
-from storage.readers.raster_tags import bad_bands, bad_bands_said, bands_said, place_of_envi, place_of_file, void_pixels
+from storage.readers.raster_tags import (
+    bad_bands,
+    bad_bands_said,
+    bands_said,
+    is_mask,
+    place_of_envi,
+    place_of_file,
+    void_pixels,
+)
 from storage.readers.scene_toml import BandWavelengths
 
 if TYPE_CHECKING:
@@ -42,6 +50,10 @@ if TYPE_CHECKING:
 
 TIFF_ENDINGS = (".tif", ".tiff")
 ALPHA_NOTE = "its alpha channel says where there are pixels, and is no band"
+NO_MASK_NOTE = (
+    "its channel called alpha holds what no mask does, and is taken as a band: programs call the fourth band of a file "
+    "alpha where nobody says what it is"
+)
 _ROWS = 64  # about as many as are read at a time
 
 
@@ -89,7 +101,14 @@ def open_tiff_rows(path: Path) -> TiffRows:
     with _tiff(rasterio, path, str(path)) as file:
         images, notes = _images(rasterio, path, file)
         names = [kind.name for kind in file.colorinterp]
+        deepest = max(np.dtype(name).itemsize for name in file.dtypes)
+        check_claim(path, file.height * file.width * deepest, path.stat().st_size)  # before any of it is read
+        check_memory(path, math.prod(max(file.block_shapes)) * file.count * deepest)
+        no_mask = "alpha" in names and not is_mask(file, names.index("alpha"))
+        if no_mask:
+            names = ["undefined" if name == "alpha" else name for name in names]
         keep, assumed, more = _named_bands(names)
+        more += (NO_MASK_NOTE,) if no_mask else ()
         geobox, where = place_of_file(file)
         known, told = bands_said(file, keep, path) if len(images) == 1 else (None, ())
         kind = np.result_type(*(np.dtype(file.dtypes[band]) for band in keep or [0]))

@@ -35,6 +35,7 @@ _UNITS = ("wavelength_units", "wavelengthunits", "wavelength_unit", "units")
 _WIDTHS = ("fwhm", "fwhm_nm")
 _LENGTHS = r"nm|nanomet(?:er|re)s?|µm|um|micromet(?:er|re)s?"
 _DESCRIBED = re.compile(rf"(?<![\w.])(\d+(?:\.\d+)?)\s*({_LENGTHS})\b", re.IGNORECASE)
+SAMPLED_PX, MOST_BETWEEN = 256, 0.1  # how a mask is told: so many pixels a side, of which so many are half there
 
 
 def place_of_file(file: Any) -> tuple[GeoBox | None, Notes]:
@@ -146,11 +147,24 @@ def _described(name: str | None) -> float | None:
     return float(found[1]) * (1.0 if found[2].lower().startswith("n") else 1000.0)
 
 
+def is_mask(file: Any, channel: int) -> bool:
+    """Tell whether a channel says where there are pixels: nearly all of its values are 0 or its greatest.
+
+    Of at most 256 x 256 px in the middle. Programs call the fourth band of bytes alpha where nobody says what it is.
+    """
+    high, wide = min(file.height, SAMPLED_PX), min(file.width, SAMPLED_PX)
+    window = importlib.import_module("rasterio").windows.Window(
+        (file.width - wide) // 2, (file.height - high) // 2, wide, high
+    )
+    values = file.read(channel + 1, window=window)
+    return bool(np.mean((values > 0) & (values < values.max())) <= MOST_BETWEEN)
+
+
 def void_pixels(file: Any, rows: Any, alpha: int | None) -> NDArray[np.bool_] | None:
     """(y, x) pixels of a window that alpha or the file's mask says are not there; None where it has neither."""
     if alpha is not None:
         return np.asarray(file.read(alpha + 1, window=rows) == 0)
-    mask = importlib.import_module("rasterio").enums.MaskFlags.per_dataset
-    if not file.count or mask not in file.mask_flag_enums[0]:
+    kinds, flags = importlib.import_module("rasterio").enums.MaskFlags, file.mask_flag_enums[0] if file.count else []
+    if kinds.per_dataset not in flags or kinds.alpha in flags:  # a channel that is called alpha and is none
         return None
     return np.asarray(file.read_masks(1, window=rows) == 0)

@@ -97,12 +97,18 @@ def test_deep_colour_png_keeps_its_16_bits(tmp_path: Path) -> None:
 
 
 def test_geotiff_says_its_colours(tmp_path: Path) -> None:
-    """A band after red, green and blue that is not alpha is assumed near infrared."""
+    """A band after red, green and blue that is no mask is assumed near infrared, also where it is called alpha."""
     values = np.random.default_rng(0).integers(0, 255, (4, 5, 4), dtype=np.uint8)
     tifffile.imwrite(tmp_path / "n.tif", values, photometric="rgb", extrasamples=["unspecified"])
     tifffile.imwrite(tmp_path / "a.tif", values, photometric="rgb", extrasamples=["unassalpha"])
     assert load_scene_file(tmp_path / "n.tif").wavelength_nm.tolist() == [640, 550, 460, 800]
-    assert load_scene_file(tmp_path / "a.tif").wavelength_nm.tolist() == [640, 550, 460]
+    mistaken = load_scene_file(tmp_path / "a.tif")
+    np.testing.assert_array_equal(mistaken.values, values)
+    assert mistaken.wavelength_nm.tolist() == [640, 550, 460, 800]
+    assert any("holds what no mask does" in note for note in mistaken.provenance)
+    values[..., 3] = np.where(values[..., 3] > 99, 255, 0)
+    tifffile.imwrite(tmp_path / "m.tif", values, photometric="rgb", extrasamples=["unassalpha"])
+    assert load_scene_file(tmp_path / "m.tif").wavelength_nm.tolist() == [640, 550, 460]
     tifffile.imwrite(tmp_path / "p.tif", np.moveaxis(values, -1, 0), photometric="minisblack", planarconfig="separate")
     np.testing.assert_array_equal(load_scene_file(tmp_path / "p.tif", wavelengths=NM[:4]).values, values)
 
