@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from flows.survey.run import SurveyRun
-from flows.terminal.figures import area_words, format_count, format_metres, format_percent, format_seconds
+from flows.terminal.figures import area_words, format_count, format_metres, format_percent, format_seconds, three_digits
 from pipeline.ground.field_scale import FieldScale
 from pipeline.planning.fine_pass import FinePlan
 
@@ -78,8 +78,8 @@ def figure_lines(figures: Mapping[str, Any]) -> list[str]:
     lines.append(f"lines: coarse {format_count(count['coarse'])}{fine}; a full scan {format_count(count['full_scan'])}")
     if figures["hectares_per_hour"] is not None:
         lines.append(
-            f"pace: {figures['hectares_per_hour']:.3g} ha an hour of the camera; a full scan "
-            f"{figures['full_scan_hectares_per_hour']:.3g}"
+            f"pace: {three_digits(figures['hectares_per_hour'])} ha an hour of the camera; a full scan "
+            f"{three_digits(figures['full_scan_hectares_per_hour'])}"
         )
     return lines
 

@@ -23,6 +23,7 @@ from flows.terminal.figures import (
     format_percent,
     format_points,
     format_seconds,
+    three_digits,
 )
 from pipeline.ground.field_scale import SECONDS_PER_HOUR
 from pipeline.planning.plain_scans import scan_words
@@ -194,8 +195,8 @@ def _field_words(field: Mapping[str, Any]) -> str:
     away = "" if field["range_m"] is None else f", {format_metres(field['range_m']['median'])} away in the middle"
     pace = field["hectares_per_hour"]
     return (
-        f"{view}{away}: {area_words(field['hectares'])} at {format_metres(field['ground_pixel_m'])} a pixel, {pace:.3g}"
-        f" ha an hour of the camera ({SECONDS_PER_HOUR / pace:.3g} s a hectare)."
+        f"{view}{away}: {area_words(field['hectares'])} at {format_metres(field['ground_pixel_m'])} a pixel, "
+        f"{three_digits(pace)} ha an hour of the camera ({three_digits(SECONDS_PER_HOUR / pace)} s a hectare)."
     )
 
 

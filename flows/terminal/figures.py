@@ -43,6 +43,13 @@ def format_count(count: float | None) -> str:
     return f"{round(count):,}".replace(",", "\u202f")
 
 
+def three_digits(value: float) -> str:
+    """A figure that is known to about three digits, whatever its size: 0.0823, 12.8, 43 700."""
+    if abs(value) < 100:
+        return f"{value:.3g}"
+    return format_count(round(value, 2 - math.floor(math.log10(abs(value)))))
+
+
 def format_percent(share: float | None) -> str:
     """A share as percent without decimals, one decimal below 10 %."""
     if not _known(share):

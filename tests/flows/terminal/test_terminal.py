@@ -19,6 +19,7 @@ from rich.tree import Tree
 
 from flows.publish.report import render_markdown
 from flows.schedule.history import FieldHistory, render_history, render_index
+from flows.terminal.figures import three_digits
 from flows.terminal.progress import StageProgress, Terminal
 from pipeline.errors import is_visible
 from storage.archive.whole_files import to_json
@@ -202,3 +203,12 @@ def test_a_narrow_terminal_keeps_bars_and_times() -> None:
     lines = progress_of(steps, **{**TERMINAL, "width": 80}).splitlines()
     assert any("━" in line and "0:00:00 fetching a file" in line and "…" in line for line in lines)
     assert any("0:00:00 left" in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [(0, "0"), (0.0823, "0.0823"), (12.83, "12.8"), (280.4, "280"), (999.6, "1 000"), (43712, "43 700")],
+)
+def test_figures_of_any_size_have_three_digits(value: float, words: str) -> None:
+    """No exponent however many hectares an hour there are."""
+    assert three_digits(value).replace("\u202f", " ") == words
