@@ -2,25 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from safetensors import safe_open
 
 from models.reading.familiar import Familiar, Limits
 from models.weights.files import Description, content_key, unusable
-from models.weights.sealed_files import (
-    DAMAGED,
-    broken_seal,
-    changed_tensor,
-    hash_without_seal,
-    read_about,
-    write_sealed,
-)
+from models.weights.sealed_files import changed_tensor, key_of_sealed, open_sealed, write_sealed
 from models.weights.trained_on import TrainedOn
 from pipeline.errors import WeightsError
 from pipeline.lazy import deferred
@@ -32,7 +23,6 @@ else:
 
 FORMAT = "spectralzoom-familiar/1"
 SUFFIX = ".familiar.safetensors"
-KEY_DIGITS = 20
 OF_COMPONENTS = ("centres", "covariance", "shot", "read")
 OF_LIMITS = ("rates", "light", "fine", "coarse")
 
@@ -90,17 +80,14 @@ def describe_familiar(weights: Path, described: Description, weights_key: str) -
     path = familiar_path(weights)
     if not path.is_file():
         return None
-    with _opened(path, "np") as file:
-        about = _checked(path, _described(path, file), described, weights_key)
+    with open_sealed(path, "np", FORMAT, _refused) as (_, about):
+        _checked(path, about, described, weights_key)
     return FamiliarFile(path, familiar_key(path), TrainedOn.read(about["trained_on"]))
 
 
 def familiar_key(path: Path) -> str:
     """Name the file by what it holds, 20 hexadecimal digits. Raises WeightsError where it cannot be read."""
-    try:
-        return hash_without_seal(path, {"format": FORMAT})[:KEY_DIGITS]
-    except (*DAMAGED, KeyError, TypeError, ValueError) as error:
-        raise _refused(path, str(error)[:120]) from error
+    return key_of_sealed(path, FORMAT, _refused)
 
 
 def load_familiar(weights: Path, described: Description) -> FamiliarWeights:
@@ -109,8 +96,8 @@ def load_familiar(weights: Path, described: Description) -> FamiliarWeights:
     Raises WeightsError where it is damaged, of another format, or was measured for other weights.
     """
     path = familiar_path(weights)
-    with _opened(path, "pt") as file:
-        about = _checked(path, _described(path, file), described, content_key(weights))
+    with open_sealed(path, "pt", FORMAT, _refused) as (file, about):
+        _checked(path, about, described, content_key(weights))
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
     if wrong := changed_tensor(about, tensors) or unusable(tensors, spreads=("light", "rates")):
         raise _refused(path, wrong)
@@ -125,27 +112,8 @@ def load_familiar(weights: Path, described: Description) -> FamiliarWeights:
     return FamiliarWeights(familiar, about["weights_key"], TrainedOn.read(about["trained_on"]), about["record"])
 
 
-@contextmanager
-def _opened(path: Path, framework: str) -> Iterator[Any]:
-    try:
-        with safe_open(path, framework=framework) as file:
-            yield file
-    except DAMAGED as error:
-        raise _refused(path, str(error)[:120]) from error
-
-
-def _described(path: Path, file: Any) -> dict[str, Any]:
-    """What the file says of itself, as it was written."""
-    about = read_about(file)
-    if about.get("format") != FORMAT:
-        raise _refused(path, f"it holds {about.get('format', 'no format mark')}, expected {FORMAT}")
-    if wrong := broken_seal(about):
-        raise _refused(path, wrong)
-    return about
-
-
-def _checked(path: Path, about: dict[str, Any], described: Description, weights_key: str) -> dict[str, Any]:
-    """The description, which is of these very weights."""
+def _checked(path: Path, about: Mapping[str, Any], described: Description, weights_key: str) -> None:
+    """Refuse a description that lacks something, or is of other weights (WeightsError)."""
     try:
         TrainedOn.read(about["trained_on"])
         key, columns, _ = str(about["weights_key"]), int(about["columns"]), (about["steps"], about["record"])
@@ -157,7 +125,6 @@ def _checked(path: Path, about: dict[str, Any], described: Description, weights_
             f" ({weights_key}, {described.config.columns}): move it away, or measure it for them with"
             f" spectralzoom train DATASET --familiar WEIGHTS -o {path.name}"
         )
-    return about
 
 
 def _refused(path: Path, why: str) -> WeightsError:

@@ -16,6 +16,7 @@ from models.network.sizes import SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis, check_basis, project
 from models.weights.sealed_files import (
     DAMAGED,
+    KEY_DIGITS,
     broken_seal,
     changed_tensor,
     hash_without_seal,
@@ -39,7 +40,6 @@ else:
 
 NORMALISATION = ("centre", "spread", "whitening")
 FORMAT, UNSEALED = "spectralzoom-weights/2", "spectralzoom-weights/1"  # the earlier one has no hashes
-KEY_DIGITS = 20
 SPREAD = "normalisation.spread"
 CALIBRATION = "calibration"  # of a record: how sure of themselves maps may be, and the temperature, where one is needed
 KINDS = {"F32": "torch.float32", "U8": "torch.uint8"}  # by safetensors' names

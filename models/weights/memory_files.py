@@ -2,24 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from safetensors import safe_open
-
 from models.network.sizes import MemorySizes
 from models.weights.files import Description, unusable
-from models.weights.sealed_files import (
-    DAMAGED,
-    broken_seal,
-    changed_tensor,
-    hash_without_seal,
-    read_about,
-    write_sealed,
-)
+from models.weights.sealed_files import changed_tensor, key_of_sealed, open_sealed, write_sealed
 from pipeline.errors import WeightsError
 from pipeline.lazy import deferred
 
@@ -34,7 +24,6 @@ else:
 
 FORMAT = "spectralzoom-memory/1"
 SUFFIX = ".memory.safetensors"
-KEY_DIGITS = 20
 MOST_WIDTH = 1024
 
 
@@ -65,8 +54,8 @@ def describe_reader(weights: Path, described: Description) -> ReaderFile | None:
     path = memory_path(weights)
     if not path.is_file():
         return None
-    with _opened(path, "np") as file:
-        sizes = _checked(path, _described(path, file), described)
+    with open_sealed(path, "np", FORMAT, _refused) as (_, about):
+        sizes = _checked(path, about, described)
     return ReaderFile(path, memory_key(path), sizes)
 
 
@@ -94,10 +83,7 @@ def save_memory(memory: MemoryWeights, path: Path) -> None:
 
 def memory_key(path: Path) -> str:
     """Name a reader by what it holds, 20 hexadecimal digits. Raises WeightsError where the file cannot be read."""
-    try:
-        return hash_without_seal(path, {"format": FORMAT})[:KEY_DIGITS]
-    except (*DAMAGED, KeyError, TypeError, ValueError) as error:
-        raise _refused(path, str(error)[:120]) from error
+    return key_of_sealed(path, FORMAT, _refused)
 
 
 def load_memory(path: Path, described: Description) -> MemoryWeights:
@@ -105,8 +91,7 @@ def load_memory(path: Path, described: Description) -> MemoryWeights:
 
     Raises WeightsError where it is damaged, of another format, or for other classes or columns than the weights have.
     """
-    with _opened(path, "pt") as file:
-        about = _described(path, file)
+    with open_sealed(path, "pt", FORMAT, _refused) as (file, about):
         sizes = _checked(path, about, described)
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
     if wrong := changed_tensor(about, tensors) or unusable(tensors, spreads=()):
@@ -119,25 +104,6 @@ def load_memory(path: Path, described: Description) -> MemoryWeights:
         raise _refused(path, str(error).splitlines()[-1].strip()) from error
     names = tuple(map(str, about["class_names"]))
     return MemoryWeights(reader.eval(), str(about["weights_key"]), names, dict(about["record"]))
-
-
-@contextmanager
-def _opened(path: Path, framework: str) -> Iterator[Any]:
-    try:
-        with safe_open(path, framework=framework) as file:
-            yield file
-    except DAMAGED as error:
-        raise _refused(path, str(error)[:120]) from error
-
-
-def _described(path: Path, file: Any) -> dict[str, Any]:
-    """What the file says of itself, as it was written."""
-    about = read_about(file)
-    if about.get("format") != FORMAT:
-        raise _refused(path, f"it holds {about.get('format', 'no format mark')}, expected {FORMAT}")
-    if wrong := broken_seal(about):
-        raise _refused(path, wrong)
-    return about
 
 
 def _checked(path: Path, about: Mapping[str, Any], described: Description) -> MemorySizes:

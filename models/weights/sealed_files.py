@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +28,7 @@ else:
     torch = deferred("torch")
     safetensors_torch = deferred("safetensors.torch")
 
+KEY_DIGITS = 20
 ABOUT = "about"  # the text's name in the file
 TENSORS, SEAL = "tensors", "seal"  # entries of the description: hashes of the tensors by name, and its own
 # what reading a description may raise over bytes that are not what they should be
@@ -55,6 +56,35 @@ def read_about(file: Any) -> dict[str, Any]:
     """Give the description of a file that `safetensors.safe_open` opened; empty where there is none."""
     about = json.loads((file.metadata() or {}).get(ABOUT, "{}"))
     return about if isinstance(about, dict) else {}
+
+
+@contextmanager
+def open_sealed(
+    path: Path, framework: str, form: str, refused: Callable[[Path, str], WeightsError]
+) -> Iterator[tuple[Any, dict[str, Any]]]:
+    """Open a file of one format, with what it says of itself, as it was written.
+
+    ``framework`` as of `safetensors.safe_open`. Raises what ``refused`` makes of the path and of what is wrong: bytes
+    that are damaged, another format, a broken seal.
+    """
+    try:
+        with safe_open(path, framework=framework) as file:
+            about = read_about(file)
+            if about.get("format") != form:
+                raise refused(path, f"it holds {about.get('format', 'no format mark')}, expected {form}")
+            if wrong := broken_seal(about):
+                raise refused(path, wrong)
+            yield file, about
+    except DAMAGED as error:
+        raise refused(path, str(error)[:120]) from error
+
+
+def key_of_sealed(path: Path, form: str, refused: Callable[[Path, str], WeightsError]) -> str:
+    """Name a file of one format by what it holds, 20 hexadecimal digits; ``refused`` as of `open_sealed`."""
+    try:
+        return hash_without_seal(path, {"format": form})[:KEY_DIGITS]
+    except (*DAMAGED, KeyError, TypeError, ValueError) as error:
+        raise refused(path, str(error)[:120]) from error
 
 
 def broken_seal(about: Mapping[str, Any]) -> str:
