@@ -24,7 +24,8 @@ from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.effect import Effect, SweepBlock
 from pipeline.simulator.effects.probe import Unit, stored_mean, unit_at
 from pipeline.simulator.effects.registry import BY_NAME
-from pipeline.simulator.render import dark_frame, expected_light, read_out
+from pipeline.simulator.readout import dark_frame, read_out
+from pipeline.simulator.render import expected_light
 from pipeline.simulator.selection.choice import UNIT_WORDS
 from pipeline.simulator.selection.verification import (
     contrast_about,

@@ -21,7 +21,8 @@ from pipeline.simulator.effects.line import SLIT
 from pipeline.simulator.effects.probe import Probe, noise_electrons
 from pipeline.simulator.effects.registry import EFFECTS, RAYS
 from pipeline.simulator.effects.registry import FOOTPRINT as BLURS
-from pipeline.simulator.render import Choice, dark_frame, expected_light, read_out
+from pipeline.simulator.readout import dark_frame, read_out
+from pipeline.simulator.render import Choice, expected_light
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.scene import RasterScene

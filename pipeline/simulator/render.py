@@ -5,37 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import SceneError, SettingsError, ShapeError
+from pipeline.errors import SettingsError
 from pipeline.geometry.mirror import direction_to_scene, position_to_direction, position_to_normal
 from pipeline.geometry.scan import Sweep, line_positions, shifted_position
-from pipeline.simulator.effects.counting import (
-    DARK_CURRENT,
-    DEFECTS,
-    EXACT,
-    READ_NOISE,
-    SATURATION,
-    SHOT,
-    dark_electrons,
-    dead_elements,
-    hot_electrons,
-    well_reached,
-)
 from pipeline.simulator.effects.effect import OFF, Effect, SweepBlock
 from pipeline.simulator.effects.line import box_of, box_parts, folded_positions, smeared_positions
-from pipeline.simulator.effects.noise import (
-    LEAST_MERGED_READ_E,
-    least_expected,
-    merged_noise,
-    normal_deviates,
-    photon_counts,
-    rounded_counts,
-)
 from pipeline.simulator.optics.kernel_fit import Footprint, Moments, fold
 from pipeline.simulator.optics.rays import RayViews, exact_views, middle_normal, straight_views
 from pipeline.simulator.optics.scene_light import Looker
@@ -191,124 +171,3 @@ def views_all_over(rig: Rig, sweep: Sweep, *, exact: bool) -> RayViews:
     lines = np.linspace(0, len(whole) - 1, LOOKS).round().astype(np.intp)
     slopes = np.linspace(-0.5, 0.5, LOOKS) * rig.camera.samples * rig.camera.ifov_rad
     return _tangents(whole[lines][:, None], slopes, exact=exact).flat()
-
-
-def read_out(light: Light, block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> NDArray[np.uint16]:
-    """Turn expected electrons into DN, with the readout's effects among those chosen.
-
-    The converter always rounds (half to even) and never gives less than 0 or more than its full scale.
-
-    ``light``: (line, sample, band) of the block; negative values count as 0. [e-]
-    Returns (line, sample, band) uint16, before binning.
-    Raises SceneError: a number is not finite; names the first. ShapeError: the light is not the block's.
-    """
-    expected_shape = (len(block.lines), block.rig.camera.samples, len(block.wavelength_nm))
-    if light.shape != expected_shape:
-        raise ShapeError(f"expected light of {expected_shape} (line, sample, band), got {light.shape}")
-    readout = Readout(block, Choice.of(chosen))
-    raw = np.empty(light.shape, np.uint16)
-    for row, number in enumerate(block.numbers):
-        raw[row] = readout.converted(readout.electrons(light[row], int(number)))
-    return raw
-
-
-def dark_frame(block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> Light:
-    """Give what the chosen readout shows without light, on average, (sample, band) float32, before rounding. [DN]"""
-    readout, camera = Readout(block, Choice.of(chosen)), block.rig.camera
-    dark = np.zeros((camera.samples, len(block.wavelength_nm)), np.float32)
-    dark += readout.added
-    dark /= np.float32(camera.electrons_per_dn)
-    dark += np.float32(camera.dark_dn)
-    return np.minimum(dark, np.float32(camera.full_scale_dn), out=dark)
-
-
-@dataclass(frozen=True)
-class Readout:
-    """The readout of one block's samples under a choice of effects."""
-
-    block: SweepBlock
-    choice: Choice
-
-    def electrons(self, light: Light, number: int) -> Light:
-        """Give what leaves the amplifier for one line's light, (sample, band). [e-]"""
-        expected = np.maximum(light, 0)
-        if self.dead is not None:
-            expected[self.dead] = 0
-        expected += self.added
-        if not np.isfinite(expected.max(initial=0.0)):
-            sample, band = np.argwhere(~np.isfinite(expected))[0]
-            raise SceneError(
-                f"sweep {self.block.sweep.name}: line {number}, sample {sample}, band {band}"
-                f" expects {expected[sample, band]} electrons; give a scene and a rig of finite numbers"
-            )
-        shot = self._variant(SHOT.name)
-        if shot == OFF:
-            return self._with_read_noise(self._within_well(expected), number)
-        deviate = self._deviates(SHOT.name, number)
-        if shot == EXACT:
-            return self._with_read_noise(self._within_well(photon_counts(expected, deviate)), number)
-        merged = self.read_noise_e >= LEAST_MERGED_READ_E and self.well_e is None
-        least = least_expected(self.read_noise_e if merged else 0.0)
-        dim = np.flatnonzero(expected < np.float32(least)) if least else np.zeros(0, np.intp)
-        exact = photon_counts(expected.take(dim), deviate.take(dim))
-        if merged:
-            electrons = merged_noise(expected, self.read_noise_e, deviate)
-            if dim.size:
-                read = self._deviates(READ_NOISE.name, number).take(dim)
-                electrons.reshape(-1)[dim] = exact + read * np.float32(self.read_noise_e)
-            return electrons
-        counts = rounded_counts(expected, deviate)
-        counts.reshape(-1)[dim] = exact
-        return self._with_read_noise(self._within_well(counts), number)
-
-    def converted(self, electrons: Light) -> NDArray[np.uint16]:
-        """Give the converter's numbers, rounded half to even, within 0 and its full scale."""
-        camera = self.block.rig.camera
-        dn = electrons / np.float32(camera.electrons_per_dn)
-        dn += np.float32(camera.dark_dn)
-        np.clip(np.rint(dn, out=dn), 0, camera.full_scale_dn, out=dn)
-        return dn.astype(np.uint16)
-
-    @cached_property
-    def added(self) -> Light | np.float32:
-        """Electrons that come without light: a number, or (sample, band) where there are hot elements."""
-        dark = self._variant(DARK_CURRENT.name) != OFF
-        same = np.float32(dark_electrons(self.block.rig) if dark else 0.0)
-        if self._variant(DEFECTS.name) == OFF or not self.block.rig.detector.hot_share:
-            return same
-        return hot_electrons(self.block.rig, len(self.block.wavelength_nm)) + same
-
-    @cached_property
-    def dead(self) -> NDArray[np.bool_] | None:
-        """Elements without response, (sample, band); None where there are none."""
-        if self._variant(DEFECTS.name) == OFF or not self.block.rig.detector.dead_share:
-            return None
-        return dead_elements(self.block.rig, len(self.block.wavelength_nm))
-
-    @cached_property
-    def read_noise_e(self) -> float:
-        """Standard deviation of the amplifier's noise; 0 where it is off. [e-]"""
-        return 0.0 if self._variant(READ_NOISE.name) == OFF else self.block.rig.camera.read_noise_e
-
-    @cached_property
-    def well_e(self) -> float | None:
-        """Electrons that an element holds; None where the converter ends before any could overflow, or it is off."""
-        on = self._variant(SATURATION.name) != OFF and well_reached(self.block.rig, self.read_noise_e)
-        return self.block.rig.detector.well_e if on else None
-
-    def _within_well(self, electrons: Light) -> Light:
-        return electrons if self.well_e is None else np.minimum(electrons, np.float32(self.well_e), out=electrons)
-
-    def _with_read_noise(self, electrons: Light, number: int) -> Light:
-        if self.read_noise_e:
-            electrons += self._deviates(READ_NOISE.name, number) * np.float32(self.read_noise_e)
-        return electrons
-
-    def _deviates(self, stream: str, number: int) -> Light:
-        """Standard normal deviates of one line, (sample, band)."""
-        size = self.block.rig.camera.samples, len(self.block.wavelength_nm)
-        return normal_deviates(self.block.stream(stream, number), math.prod(size)).reshape(size)
-
-    def _variant(self, name: str) -> str:
-        ideal = self.block.rig.detector.noiseless and name in (SHOT.name, READ_NOISE.name)
-        return OFF if ideal else self.choice.variant(name)

@@ -24,7 +24,8 @@ from pipeline.simulator.effects.pointing import Pointing
 from pipeline.simulator.effects.registry import USUAL
 from pipeline.simulator.effects.sensor import PRNU, STRIPING
 from pipeline.simulator.effects.spectrometer import RESPONSE, SMILE
-from pipeline.simulator.render import Choice, dark_frame, expected_light, read_out
+from pipeline.simulator.readout import dark_frame, read_out
+from pipeline.simulator.render import Choice, expected_light
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
 from pipeline.source import AT_REST, Line, References

@@ -19,7 +19,7 @@ from pipeline.simulator.effects.counting import DARK_CURRENT, QUANTISATION, READ
 from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.noise import merged_noise, normal_deviates, photon_counts, rounded_counts
 from pipeline.simulator.effects.sensor import PRNU
-from pipeline.simulator.render import read_out
+from pipeline.simulator.readout import read_out
 from pipeline.simulator.rig_model import Detector, Rig
 
 LINES, SAMPLES, BANDS = 16, 640, 270

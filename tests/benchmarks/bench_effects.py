@@ -16,7 +16,8 @@ from pipeline.simulator.effects.effect import Effect, Light, SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.effects.probe import Probe, noise_electrons
 from pipeline.simulator.effects.registry import EFFECTS
-from pipeline.simulator.render import expected_light, read_out
+from pipeline.simulator.readout import read_out
+from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Rig
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene

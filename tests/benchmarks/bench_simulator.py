@@ -18,7 +18,8 @@ from pipeline.simulator.effects.effect import Effect, SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.effects.probe import noise_electrons
 from pipeline.simulator.effects.registry import EFFECTS
-from pipeline.simulator.render import expected_light, read_out
+from pipeline.simulator.readout import read_out
+from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene

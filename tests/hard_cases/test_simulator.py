@@ -17,7 +17,8 @@ from pipeline.simulator.effects.counting import SHOT
 from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.effects.registry import EFFECTS, READOUT
-from pipeline.simulator.render import expected_light, read_out
+from pipeline.simulator.readout import read_out
+from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Detector, Optics, Rig
 from pipeline.simulator.selection.options import ALWAYS_ON
 from pipeline.simulator.selection.survey_probe import probe_scene

@@ -19,7 +19,8 @@ from pipeline.simulator.effects.lighting import DRIFT
 from pipeline.simulator.effects.line import ROTATION
 from pipeline.simulator.effects.mirror_path import LAG
 from pipeline.simulator.effects.registry import EFFECTS
-from pipeline.simulator.render import expected_light, read_out
+from pipeline.simulator.readout import read_out
+from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, MirrorMotion, Optics, Rig, Sky
 from pipeline.simulator.scenes.daylight import sun_elevation_deg
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene

@@ -27,7 +27,7 @@ from pipeline.simulator.effects.counting import (
 )
 from pipeline.simulator.effects.noise import CHIP_SAMPLES, MOST_VARIATION, divergence
 from pipeline.simulator.effects.probe import Probe, Unit
-from pipeline.simulator.render import read_out
+from pipeline.simulator.readout import read_out
 from pipeline.simulator.rig_model import Detector, Rig
 from tests.pipeline.simulator.spectral_light import block_of, probe_of
 

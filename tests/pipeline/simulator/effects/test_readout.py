@@ -24,7 +24,7 @@ from pipeline.simulator.effects.counting import (
     hot_electrons,
 )
 from pipeline.simulator.effects.effect import SweepBlock
-from pipeline.simulator.render import dark_frame, read_out
+from pipeline.simulator.readout import dark_frame, read_out
 from pipeline.simulator.rig_model import Detector, Rig
 
 SWEEP = Sweep("fine", "fine", "x", strip_px=0.0, start_px=-32.0, lines=64)
