@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 from rich.console import Console
 from rich.markup import escape
@@ -29,6 +30,7 @@ from pipeline.simulator.simulated import SimulatedSource
 
 EVERY_S = 0.2
 KEPT_CAPTURES = 64
+EMULATED = ("camera", "optics", "mirror", "detector", "air", "sky")  # tables that say what the rig is like
 USUAL_SIZE = (256, 256)  # of a built-in scene [px]
 
 
@@ -96,12 +98,9 @@ def _tell(request: EmulateRequest, served: ServedRig, console: Console, *, as_js
             wanted = {name: getattr(settings, name) for name in names}
             wanted |= {"size": size, "tol": str(settings.tol), "source": "rig"}
             given = [f"{key} = {_toml_value(value)}" for key, value in wanted.items() if value is not None]
-            request.out.write_text(
-                "\n".join(
-                    ["# A survey of an emulated rig, for as long as that runs.", *given, "", _toml_table("rig", table)]
-                ),
-                encoding="utf-8",
-            )
+            tables = [_toml_table(name, values) for name, values in {**_tables_changed(settings), "rig": table}.items()]
+            lines = ["# A survey of an emulated rig, for as long as that runs.", *given, "", *tables]
+            request.out.write_text("\n".join(lines), encoding="utf-8")
         except OSError as error:
             raise SettingsError(f"cannot write {request.out}: {error.strerror}; choose another --out") from error
         console.print(f"survey it with: spectralzoom survey {escape(str(request.out))}")
@@ -129,11 +128,24 @@ def _rig_table(served: ServedRig, rig: SurveyRig) -> dict[str, object]:
     }
 
 
+def _tables_changed(settings: Settings) -> dict[str, dict[str, object]]:
+    """What of the emulated rig is not usual, by table: a survey of it has to know the same camera."""
+    told, usual = settings.to_dict(), Settings().to_dict()
+    found = {}
+    for name in EMULATED:
+        own, other = (cast("dict[str, object]", one[name]) for one in (told, usual))
+        if own != other:
+            found[name] = {key: value for key, value in own.items() if value != other[key] and value is not None}
+    return found
+
+
 def _toml_table(name: str, values: dict[str, object]) -> str:
     return "\n".join([f"[{name}]", *(f"{key} = {_toml_value(value)}" for key, value in values.items()), ""])
 
 
 def _toml_value(value: object) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     return f"[{', '.join(map(_toml_value, value))}]" if isinstance(value, tuple) else str(value)

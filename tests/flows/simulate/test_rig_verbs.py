@@ -178,9 +178,10 @@ def test_rig_in_order(command_line: CommandLine, tmp_path: Path) -> None:
 
 
 def test_emulated_rig_is_checked_by_the_file_that_it_writes(command_line: CommandLine, tmp_path: Path) -> None:
-    """The file is a survey's settings: both devices are where it says, mounted so, until the emulation ends."""
+    """The file is a survey's settings of the same rig: both devices are where it says, until the emulation ends."""
     file = tmp_path / "emulated.toml"
-    wanted = {"size": "64x48", "bands": "40,90", "effects": "all", "seed": "3", "rig.mirror_axes": "y,-x"}
+    wanted: dict[str, object] = {"size": "64x48", "bands": "40,90", "effects": "all", "seed": "3"}
+    wanted |= {"rig.mirror_axes": "y,-x", "camera.samples": "320", "detector.noiseless": True, "optics.focus_m": 40.0}
     settings = emulated_settings(None, wanted)
     request = EmulateRequest(settings, ("split-replies:1",), 0, 20.0, file)
     ended, codes = threading.Event(), []
@@ -190,7 +191,9 @@ def test_emulated_rig_is_checked_by_the_file_that_it_writes(command_line: Comman
     try:
         while thread.is_alive() and not file.exists():
             thread.join(0.05)
-        rig = load_settings(file).rig
+        written = load_settings(file)
+        assert written.simulated_rig == settings.simulated_rig
+        rig = written.rig
         assert (rig.provenance, rig.mirror_axes) == ("emulated", "y,-x")
         told = tomllib.loads(file.read_text())
         assert {key: told[key] for key in ("scene", "size", "bands", "seed", "source")} == {
