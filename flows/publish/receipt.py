@@ -103,6 +103,7 @@ class Receipt(TypedDict):
     field: NotRequired[dict[str, Any]]  # its size, field of view, ground pixel and range, hectares an hour
     plan: NotRequired[dict[str, Any]]  # how the fine pass was laid out, and what the other orientation would cost
     scans: NotRequired[dict[str, dict[str, Any]]]  # plain ones by the weights' record, where there is one
+    look: NotRequired[dict[str, Any]]  # which part of a remembered field was looked at, and what was expected of it
     memory: NotRequired[dict[str, Any]]  # what became of what was remembered, where the map goes on from an earlier run
     pointing: NotRequired[dict[str, Any]]  # only where the mirror may look beside the plan
     lines: NotRequired[dict[str, Any]]  # sweeps with lines lost, repeated, out of order, late or invalid
@@ -129,7 +130,20 @@ class Header:
 
 
 COSTS = ("lines", "samples", "bytes_raw", "bytes_stored", "capture_s", "tokens", "multiply_adds")
-FINDINGS = ("field", "plan", "scans", "memory", "pointing", "lines", "ground", "zones", "plots", "unknown", "pixels")
+FINDINGS = (
+    "field",
+    "plan",
+    "scans",
+    "look",
+    "memory",
+    "pointing",
+    "lines",
+    "ground",
+    "zones",
+    "plots",
+    "unknown",
+    "pixels",
+)
 _SAVING_FIELDS = ("done", "full", "ratio", "full_is")
 _SPLIT_FIELDS = ("glance", "score", "encode", "decode")
 _STAGE_FIELDS = ("name", "key", "state", "wall_s", "cpu_s", "peak_rss_bytes", "bytes_in", "bytes_out")

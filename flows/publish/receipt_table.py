@@ -164,6 +164,8 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
             )
         if plan["lines"]:
             words.append(_sentence(plan["orientation"]["sentence"]))
+    if look := found.get("look"):
+        words.append(_look_words(look))
     if memory := found.get("memory"):
         words.append(_memory_words(memory))
     if unknown := found.get("unknown"):
@@ -216,6 +218,20 @@ def _unknown_words(unknown: Mapping[str, Any], accuracy: Mapping[str, Any] | Non
             " These weights do not know this field: train some on labelled scenes of it"
             " (spectralzoom train DATASET), or leave the class out with --unknown off."
         )
+    return text
+
+
+def _look_words(look: Mapping[str, Any]) -> str:
+    """Which part of a remembered field was looked at, and why."""
+    seen = format_percent(look["share"])
+    text = f"Lines {look['lines']} were looked at, {seen} of the field; the rest is as remembered."
+    if "expected_gain" in look:
+        text += (
+            f" There the look was expected to bring most, {100 * look['expected_gain']:.2g} points of mIoU, where about"
+            f" {format_percent(look['expected_wrong'])} of what is remembered would be wrong."
+        )
+    if look.get("due_left"):
+        text += f" {format_count(look['due_left'])} of {format_count(look['due'])} seats that were due had to wait."
     return text
 
 

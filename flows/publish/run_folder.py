@@ -25,14 +25,16 @@ from flows.publish.report import Picture, render_report
 from flows.publish.run_layers import block_of, field_map, read_coarse
 from flows.publish.zone_findings import PLOTS_FILE, find_zones, plots_csv
 from flows.settings.load import anchor_paths
+from flows.settings.values import LOOK_WHOLE
 from flows.survey.extent import work_done, work_of_map
+from flows.survey.memory import told_of_memory
 from flows.survey.run import SurveyRun, now
 from flows.survey.scan_choice import as_told
 from flows.survey.stages.accuracy import load_accuracy
 from flows.survey.stages.attention import load_orientation, load_plan
 from flows.survey.stages.capture import captured
 from flows.survey.stages.effects import load_manifest
-from flows.survey.stages.maps import STORE, memory_told, strange_pixels
+from flows.survey.stages.maps import STORE, strange_pixels
 from flows.survey.stages.placement import SEATS_AT_ONCE, line_facts, load_registration, seen_shares
 from flows.survey.survey import STAGES, Products, StageRunner
 from pipeline.errors import IncompleteStoreError
@@ -292,8 +294,11 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
             "spared_score": plan.wanted_worth - plan.worth,
         }
     found: dict[str, Any] = {"field": field_figures(run, plan), "plan": told}
-    if (memory := memory_told(products.of("draw_map"))) is not None:
+    if (memory := told_of_memory(products.of("draw_map").path)) is not None:
         found["memory"] = memory
+    if run.settings.look != LOOK_WHOLE:
+        share = len(plan.seats) / len(run.grid.valid_seats())
+        found["look"] = {"lines": run.settings.look, "share": share, **({} if run.look is None else run.look.as_told())}
     passes = {"coarse": products.get("register_coarse"), "fine": products.get("register_fine")}
     pointing = {name: _pointing(ref) for name, ref in passes.items() if ref is not None}
     if "fine" in pointing:

@@ -25,7 +25,7 @@ from flows.settings.survey_settings import (
     MapChoice,
     Settings,
 )
-from flows.settings.values import parse_moment, parse_text, to_whole, unit_guess
+from flows.settings.values import LOOK_PART, LOOK_WHOLE, parse_moment, parse_text, to_whole, unit_guess
 from models.network.sizes import TRAINED_VGG_FROM, VGG_FROM
 from pipeline.errors import BudgetError, PoseError, SettingsError
 from pipeline.rig.device_settings import MOST_PAIRS
@@ -307,6 +307,19 @@ def _wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]:
     if settings.zones.plots_name is not None and settings.zones.plots is None:
         place = place_of("zones.plots_name", origin.get("zones.plots_name"))
         yield f"{place} = {settings.zones.plots_name!r} names plots, and there are none: give --plots FILE too"
+    if settings.look == LOOK_PART and settings.seconds is None:
+        place = place_of("look", origin.get("look"))
+        yield f"{place} = 'part' looks where the seconds are worth most: give --seconds too"
+    if settings.look not in (LOOK_WHOLE, LOOK_PART) and settings.scan_step is None:
+        yield f"{place_of('look', origin.get('look'))} names lines of a plain scan: give its --scan-step too"
+    if settings.look != LOOK_WHOLE and settings.pointing_px:
+        yield (
+            f"{place_of('look', origin.get('look'))}: a mirror that may look beside the plan (pointing_px = "
+            f"{settings.pointing_px:g}) ties its sweeps by what they share, so that none is left out; leave it out"
+        )
+    if settings.refresh is not None and settings.look == LOOK_WHOLE:
+        place = place_of("refresh", origin.get("refresh"))
+        yield f"{place} says how old a place may become of which a visit looks at a part: give --look part too"
     if settings.pose is None and settings.map != MapChoice():
         yield "[map] says how to draw the ground, which needs to know where the rig stands: give [pose]"
 

@@ -20,8 +20,10 @@ from flows.settings.values import (
     Bytes,
     Effects,
     Goal,
+    Look,
     Memory,
     Name,
+    Refresh,
     SceneName,
     Scheduler,
     Size,
@@ -111,6 +113,18 @@ class Settings:
         "auto",
         "What of the field is remembered: latest (what its newest run left), the name of a run, or none; auto is latest"
         " for surveys that are served, else none",
+    )
+    look: Look = stated(
+        "whole",
+        "What a plain scan looks at: whole (the field), part (with --seconds, of a field that is remembered: the lines "
+        "that promise most there), or lines by hand, as a receipt tells them: 0:12-310,1:0-40",
+    )
+    refresh: Refresh | None = stated(
+        None,
+        "With --look part: how old what is remembered of any place may become, such as 14d or 36h; what would be older "
+        "is looked at before all else",
+        "d",
+        example="14d",
     )
     scene: SceneName = stated(
         "farm", "`farm` (built in; `farm@2`), or a file: PNG, JPEG, GeoTIFF, .npy, .npz, .mat, ENVI, Zarr"

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Annotated
@@ -14,6 +15,7 @@ from typing import Annotated
 from pydantic import ByteSize, PlainValidator, TypeAdapter, ValidationError
 
 from pipeline.errors import BudgetError, SettingsError
+from pipeline.planning.part_looks import LineRun
 from pipeline.planning.plain_scans import MIOU
 from pipeline.setting_fields import number_words, numbers_of
 from pipeline.simulator.effects.probe import Unit
@@ -244,6 +246,47 @@ def parse_scene(value: object) -> str:
     return value
 
 
+LOOK_WHOLE, LOOK_PART = "whole", "part"
+
+
+def parse_look(value: object) -> str:
+    """``whole``, ``part``, or runs of lines of the scan's sweeps, such as 0:12-310,1:0-40."""
+    word = str(value).strip().lower()
+    return word if word in (LOOK_WHOLE, LOOK_PART) else look_words(parse_look_runs(word))
+
+
+def parse_look_runs(text: str) -> tuple[LineRun, ...]:
+    """Runs of lines, each the number of a sweep, its first line and the one after its last."""
+    found = [re.fullmatch(r"(\d{1,6}):(\d{1,9})-(\d{1,9})", part.strip()) for part in text.split(",")]
+    runs = [(int(one[1]), int(one[2]), int(one[3])) for one in found if one is not None]
+    if len(runs) < len(found) or any(first >= stop for _, first, stop in runs):
+        raise ValueError(
+            "must be whole, part, or runs of lines as receipts tell them, SWEEP:FIRST-STOP with commas such as"
+            f" 0:12-310,1:0-40; got {text!r}"
+        )
+    return tuple(runs)
+
+
+def look_words(runs: Iterable[LineRun]) -> str:
+    """Runs of lines as one text; see `parse_look_runs`."""
+    return ",".join(f"{sweep}:{first}-{stop}" for sweep, first, stop in runs)
+
+
+LEAST_REFRESH, MOST_REFRESH = 1 / 24, 3660.0  # days
+_DAYS = {"h": 1 / 24, "d": 1.0, "w": 7.0}
+
+
+def parse_refresh(value: object) -> float:
+    """Days, from a number of them or text such as 14d, 36h or 2w."""
+    text = str(value).strip().lower()
+    unit = text[-1:] if text[-1:] in _DAYS else ""
+    number = None if isinstance(value, bool) else _to_float(text.removesuffix(unit))
+    days = None if number is None else number * _DAYS.get(unit, 1.0)
+    if days is None or not LEAST_REFRESH <= days <= MOST_REFRESH:
+        raise ValueError(f"must be a time of 1h to {MOST_REFRESH:g}d, such as 14d, 36h or 2w; got {value!r}")
+    return days
+
+
 UNKNOWN_AUTO, UNKNOWN_OFF = "auto", "off"
 LEAST_UNKNOWN, MOST_UNKNOWN = 0.05, 5.0  # percent
 
@@ -273,4 +316,6 @@ Scheduler = Annotated[str, PlainValidator(parse_scheduler)]
 Size = Annotated[tuple[int, int], PlainValidator(parse_size)]
 Effects = Annotated[str, PlainValidator(parse_effects)]
 Bands = Annotated[tuple[int, ...], PlainValidator(parse_bands)]
+Look = Annotated[str, PlainValidator(parse_look)]
+Refresh = Annotated[float, PlainValidator(parse_refresh)]
 Wavelengths = Annotated[tuple[float, ...], PlainValidator(parse_wavelengths)]

@@ -8,11 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.settings.survey_settings import Settings
+from flows.settings.values import LOOK_WHOLE, parse_look_runs
 from pipeline.errors import SettingsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, Sweep
 from pipeline.planning.area_cover import sweeps_over
 from pipeline.planning.coverage import cheapest_full, coarse_sweeps, plain_sweeps, with_margin
+from pipeline.planning.part_looks import sweeps_of_runs
 from pipeline.planning.prices import check_budget
 from pipeline.rectify.registration.overlaps import LEAST_OVERLAP_PX
 
@@ -58,8 +60,9 @@ def lay_out_sweeps(
     """Give the axis that lines lie along, the coarse sweeps or those of a plain scan, and those of the full scan.
 
     Lines that show none of the ``shown`` (seat,) seats are left out, but for a mirror that may look beside the plan:
-    its sweeps are tied together by what they share. Raises SettingsError: the mirror may be so far off that overlaps
-    take whole lines; PoseError: the field is beyond the mirror's range.
+    its sweeps are tied together by what they share. Of the looks those lines are left that the settings name. Raises
+    SettingsError: the mirror may be so far off that overlaps take whole lines, or lines are named that the scan does
+    not have; PoseError: the field is beyond the mirror's range.
     """
     camera, cost, apart = settings.camera, settings.cost, 2 * settings.pointing_px
 
@@ -74,7 +77,10 @@ def lay_out_sweeps(
     else:
         overlap, exposure_ms = _overlap(settings, grid.factor), settings.coarse_exposure_ms
         looks = coarse_sweeps(grid, camera, along, overlap_px=overlap, exposure_ms=exposure_ms)
-    return along, with_margin(cut(looks), camera, apart), with_margin(full, camera, apart)
+    looks = cut(looks)
+    if settings.look != LOOK_WHOLE:
+        looks = sweeps_of_runs(looks, parse_look_runs(settings.look))
+    return along, with_margin(looks, camera, apart), with_margin(full, camera, apart)
 
 
 def _overlap(settings: Settings, step: int) -> float:

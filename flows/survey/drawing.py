@@ -56,6 +56,7 @@ class Drawing:
     memory: FieldMemory | None = None  # what is remembered of the field
     left_out: Path | None = None  # (y, x) pixels of which zones have no map drawn
     unknown: UnknownRule | None = None  # which pixels are called unknown
+    part: bool = False  # of the field was looked at: of the rest today's look says nothing
 
     def __call__(self, region: Region) -> Drawn:
         """Read what was seen of the region coarsely and finely, and store the part of the map that is kept."""
@@ -70,6 +71,7 @@ class Drawing:
         if self.unknown is not None:
             familiar, bands = self.weights.load_familiar(), len(store.wavelength_nm)
             unknown = self.unknown.pixels(familiar, seen, columns, seats, bands) & (drawn.classes != UNLABELLED)
+            unknown &= ~self._away(region, seats)
             drawn.log_probability[unknown] = np.nan  # of what these pixels show the classes say nothing
         del columns  # a memory takes their room
         looked = self._looked(region, self._within_zones(region, drawn.log_probability), seats, seen)
@@ -77,6 +79,8 @@ class Drawing:
         comparison, changed = None, None
         if self.memory is None:
             after = first_belief(looked)
+            if self.part:
+                classes, confidence = after.classes()
         else:
             remembered = self.memory.of(region, weights)
             after = recall(remembered, looked, self.weights.load_reader())
@@ -101,11 +105,22 @@ class Drawing:
     def _looked(
         self, region: Region, log_probability: NDArray[np.float32], seats: NDArray[np.int64], seen: CoarseLook
     ) -> Looked:
-        grid = region.grid
-        detailed = np.zeros(grid.seat_shape, np.bool_)
-        detailed.ravel()[seats] = True
-        pixels = np.repeat(np.repeat(detailed, grid.patch, axis=0), grid.patch, axis=1)[: grid.height, : grid.width]
-        return Looked(log_probability, pixels, seen.columns, self.light, self.step)
+        away = self._away(region, seats)
+        if away.any():
+            log_probability = np.where(away[..., None], np.float32(np.nan), log_probability)
+        return Looked(log_probability, _pixels_of(region, seats), seen.seen_columns, self.light, self.step)
+
+    def _away(self, region: Region, seats: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """(y, x) pixels of a region that a look at a part of its field did not show."""
+        return ~_pixels_of(region, seats) if self.part else np.zeros((region.grid.height, region.grid.width), np.bool_)
+
+
+def _pixels_of(region: Region, seats: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """(y, x) pixels of some seats of a region."""
+    grid = region.grid
+    detailed = np.zeros(grid.seat_shape, np.bool_)
+    detailed.ravel()[seats] = True
+    return np.repeat(np.repeat(detailed, grid.patch, axis=0), grid.patch, axis=1)[: grid.height, : grid.width]
 
 
 @dataclass(frozen=True)
@@ -154,7 +169,7 @@ class FieldMemory:
         values, age, light = (_framed(part, gaps) for part in store.read(rows, columns))
         if self.classes != tuple(range(values.shape[-1])):
             values = in_classes(values, self.classes)
-        coarse, cell = look_at(weights, self.mosaic, region).columns, region.grid.factor
+        coarse, cell = look_at(weights, self.mosaic, region).seen_columns, region.grid.factor
         moves = [
             _moved(slice(0, size), round(by / cell), size)
             for size, by in zip(coarse.shape, self.shift_px, strict=False)

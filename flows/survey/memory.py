@@ -10,11 +10,13 @@ from typing import Any
 
 from flows.settings.load import anchor_paths
 from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
+from flows.settings.values import LOOK_PART, LOOK_WHOLE
 from pipeline.errors import IncompleteStoreError, SettingsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.simulator.scenes.farm.farm_scene import USUAL_DAY, USUAL_HOUR
 from storage.archive.archive import Archive, run_stem
 from storage.archive.keys import StageRef, published_runs
+from storage.archive.manifests import read_table
 from storage.archive.records import Run, read_run
 from storage.arrays.beliefs import BeliefStore
 from storage.arrays.mosaics import mosaic_shape
@@ -22,9 +24,10 @@ from storage.arrays.mosaics import mosaic_shape
 NONE, LATEST, AUTO = "none", "latest", "auto"
 LOOKED_THROUGH = 60  # newest runs of a field among which the visit before is looked for
 BELIEF = "belief"  # a product of runs
+MEMORY = "memory.json"  # beside a map that goes on from an earlier one: what became of the memory
 OF_THE_LOOK = (  # settings that the same light has alike
     *("scene", "source", "seed", "size", "visit", "day", "hour", "effects", "pointing_px"),
-    *("scan_step", "scan_exposure_ms", "coarse_exposure_ms", "budget", "policy", "threshold"),
+    *("look", "scan_step", "scan_exposure_ms", "coarse_exposure_ms", "budget", "policy", "threshold"),
 )
 
 
@@ -85,9 +88,14 @@ def _before(archive: Archive, settings: Settings, name: str) -> Iterator[Run]:
 
 
 def _is_this_look(run: Run, settings: Settings) -> bool:
-    """Whether a run was made of the very light that a survey asks for: what it saw is no earlier look."""
+    """Whether a run was made of the very light that a survey asks for: what it saw is no earlier look.
+
+    Of a survey that leaves it to the memory where to look, that choice says nothing.
+    """
     asked = anchor_paths(settings.to_dict(), Path.cwd())
-    return all(run.settings.get(part) == asked[part] for part in OF_THE_LOOK)
+    chosen = ("look", "scan_step", "scan_exposure_ms") if settings.look == LOOK_PART else ()
+    before = {"look": LOOK_WHOLE, **run.settings}
+    return all(before.get(part) == asked[part] for part in OF_THE_LOOK if part not in chosen)
 
 
 def _usable(
@@ -142,6 +150,12 @@ def _days_since(run: Run, settings: Settings) -> float:
         return farm[0] - day + (farm[1] - hour) / 24
     created = _called_moment(run.created)
     return 0.0 if created is None else float((datetime.now(UTC).date() - created.date()).days)
+
+
+def told_of_memory(store: Path) -> dict[str, Any] | None:
+    """What became of the memory that the map of a store goes on from; None of a field's first look."""
+    told = store / MEMORY
+    return dict(read_table(told)) if told.is_file() else None
 
 
 def _called_moment(text: Any) -> datetime | None:

@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
-from flows.settings.values import UNKNOWN_AUTO, UNKNOWN_OFF
+from flows.settings.values import LOOK_PART, UNKNOWN_AUTO, UNKNOWN_OFF
 from flows.survey.beyond_training import beyond_training
 from flows.survey.capture_plan import CapturePlan, plan_capture
+from flows.survey.look_choice import LookChoice, choose_look
 from flows.survey.memory import AUTO, NONE, Prior, find_prior
 from flows.survey.scan_choice import ScanChoice, choose_plain_scan
 from flows.survey.scene import (
@@ -61,7 +62,7 @@ from storage.archive.keys import array_digest
 from storage.arrays.layout import AngularGrid, image_spec
 from storage.arrays.tile_work import MosaicWork, tile_budget
 from storage.readers.raster_files import load_raster
-from storage.remote.opening import open_archive
+from storage.remote.opening import is_archive, open_archive
 
 
 def check_memory(settings: Settings, source: SimulatedSource, grid: SceneGrid, plan: CapturePlan) -> None:
@@ -133,6 +134,7 @@ class SurveyRun(CaptureRun):
     plan: CapturePlan
     scans: ScanChoice
     zones: SurveyZones  # what the survey keeps to, and plots
+    look: LookChoice | None = None  # the part of a remembered field that is looked at, where one was chosen
     prior: Prior | None = None  # the run whose belief is gone on from
     reader: ReaderFile | None = None  # the reader of memories beside the weights, where there is one
     familiar: FamiliarFile | None = None  # what is familiar to the weights, where pixels may be called unknown
@@ -201,6 +203,16 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     label_notes = check_labels(scene, described)
     grid = SceneGrid(*scene.shape, described.config.patch, described.config.factor)
     zones = open_zones(settings, place_of_field(settings, scene), grid)
+    name = settings.name or Path(scene.name).stem
+    remembered: tuple[Prior | None, tuple[str, ...]] | None = None
+    if settings.look == LOOK_PART:  # what is remembered says where to look: nothing else is asked for so early
+        archive = open_archive(settings.out) if archive is None and is_archive(settings.out) else archive
+        remembered = (None, ()) if archive is None else find_prior(archive, settings, name, grid, described.class_names)
+    reader = describe_reader(path, described)
+    if reader is not None and not planning:
+        load_memory(reader.path, described)  # refuses tensors that are not those that were written
+    prior = None if remembered is None else remembered[0]
+    settings, look, look_notes = choose_look(settings, prior, described, path, reader, grid, zones.shown)
     settings, scans = choose_plain_scan(settings, described, path, grid, len(scene.wavelength_nm), zones.shown)
     plan = plan_capture(settings, grid, zones.shown)
     key = content_key(path)
@@ -217,15 +229,11 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     if vgg is not None and not planning:
         vgg.saliency(load())  # refuses one that does not go with the weights
         vgg_notes = (f"VGG19 from {vgg.path.name}: {vgg.report()}",)
-    reader = describe_reader(path, described)
-    if reader is not None and not planning:
-        load_memory(reader.path, described)  # refuses tensors that are not those that were written
     simulated, planned = make_source(scene, settings), (*plan.coarse, *plan.full)
     source = field_source(scene, settings, simulated, planned)
     check_memory(settings, simulated, grid, plan)
     archive = open_archive(settings.out) if archive is None else archive
-    name = settings.name or Path(scene.name).stem
-    prior, prior_notes = find_prior(archive, settings, name, grid, described.class_names)
+    prior, prior_notes = remembered or find_prior(archive, settings, name, grid, described.class_names)
     if settings.prior != AUTO:  # what is meant when it is asked for again
         settings = replace(settings, prior=NONE if prior is None else prior.run)
     return SurveyRun(
@@ -242,10 +250,11 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
         plan=plan,
         scans=scans,
         zones=zones,
+        look=look,
         prior=prior,
         reader=reader,
         familiar=familiar,
-        notes=(*notes, *zones.notes, *prior_notes, *sealing, *outside, *vgg_notes, *label_notes),
+        notes=(*notes, *zones.notes, *prior_notes, *look_notes, *sealing, *outside, *vgg_notes, *label_notes),
         refused=refused,
     )
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.settings.survey_settings import Settings
-from flows.settings.values import parse_goals
+from flows.settings.values import LOOK_WHOLE, parse_goals
 from flows.survey.capture_plan import lay_out_sweeps
 from models.weights.files import Description
 from pipeline.errors import BudgetError, SettingsError, WeightsError
@@ -34,7 +34,7 @@ class ScanChoice:
     """The scan that a survey takes, if it takes a plain one, and those that the weights' record tells of."""
 
     offered: tuple[PlainScan, ...] = ()  # none without a record
-    chosen: PlainScan | None = None  # None of a survey in two passes, and of a scan that the record does not tell of
+    chosen: PlainScan | None = None  # None of a survey in two passes, and of what the record does not tell of
 
     def best_within(self, seconds: float) -> PlainScan | None:
         """The scan that is likely to score most in so many seconds; None where there is none."""
@@ -84,11 +84,13 @@ def choose_plain_scan(
         if name not in record.scores:
             known = ", ".join(one for one in record.scores if one != MIOU)
             raise SettingsError(f"--goal {name}={100 * goals[name]:g}: the weights tell apart {known}")
-    camera, cost = settings.camera, settings.cost
-    sweeps = {step: lay_out_sweeps(replace(settings, scan_step=step), grid, shown)[1] for step in record.steps}
+    camera, cost, whole = settings.camera, settings.cost, replace(settings, look=LOOK_WHOLE)
+    sweeps = {step: lay_out_sweeps(replace(whole, scan_step=step), grid, shown)[1] for step in record.steps}
     scans = plain_scans(record, sweeps, camera, cost, bands, seconds=settings.seconds)
     chosen, exposure_ms = None, settings.scan_exposure_ms or camera.exposure_ms
-    if settings.scan_step in sweeps and record.knows(exposure_ms):
+    if settings != whole:  # of a part of a field the record says nothing
+        chosen = None
+    elif settings.scan_step in sweeps and record.knows(exposure_ms):
         chosen = priced_scan(record, sweeps[settings.scan_step], camera, cost, bands, exposure_ms)
     elif settings.plain and settings.scan_step is None:
         if not scans:

@@ -41,6 +41,14 @@ class CoarseLook:
     origin: tuple[int, int] = field(default=(0, 0), kw_only=True)  # row and column of the field's seat it begins at
     living: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (token,) which are read; None: all
     strange: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (y, x) of the scene: a value is no reading
+    filled: NDArray[np.bool_] | None = field(default=None, kw_only=True)  # (y, x) nothing was seen of; None: of all was
+
+    @property
+    def seen_columns(self) -> NDArray[np.float32]:
+        """The columns with NaN where nothing was seen, and others only were filled in."""
+        return (
+            self.columns if self.filled is None else np.where(self.filled[..., None], np.float32(np.nan), self.columns)
+        )
 
 
 @dataclass(frozen=True)
@@ -133,8 +141,9 @@ def look_coarsely(
         raise ShapeError(f"the coarse mosaic is {(filled, width)}, the scene grid expects {(rows, width)}")
     y, x = grid.padded_shape
     columns = np.ascontiguousarray(pad_by_reflection(columns, (y // grid.factor, x // grid.factor)), np.float32)
+    dead = dead_pixels(columns)
     living = _mend(columns, config)
-    return CoarseLook(grid, columns, origin=origin, living=living, strange=strange)
+    return CoarseLook(grid, columns, origin=origin, living=living, strange=strange, filled=dead if dead.any() else None)
 
 
 def _mend(columns: NDArray[np.float32], config: SegmenterConfig) -> NDArray[np.bool_] | None:

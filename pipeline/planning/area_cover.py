@@ -20,7 +20,7 @@ def sweeps_over(sweeps: Sequence[Sweep], grid: SceneGrid, camera: LineCamera, sh
     Lines stay where they lie and keep their order, between the first and the last that is needed none is left out, and
     the lines that resampling reads beside a pixel are among them. Of a sweep with all its lines nothing changes.
     """
-    cut = ((sweep, _needed(sweep, grid, camera, np.flatnonzero(shown))) for sweep in sweeps)
+    cut = ((sweep, lines_showing(sweep, grid, camera, np.flatnonzero(shown))) for sweep in sweeps)
     return [_part(sweep, lines) for sweep, lines in cut if lines is not None]
 
 
@@ -29,8 +29,8 @@ def _part(sweep: Sweep, lines: tuple[int, int]) -> Sweep:
     return replace(sweep, start_px=sweep.start_px + first * sweep.step, lines=stop - first)
 
 
-def _needed(sweep: Sweep, grid: SceneGrid, camera: LineCamera, seats: NDArray[np.intp]) -> tuple[int, int] | None:
-    """First line that shows something of the seats and the one after the last; None where none does."""
+def lines_showing(sweep: Sweep, grid: SceneGrid, camera: LineCamera, seats: NDArray[np.intp]) -> tuple[int, int] | None:
+    """Give the first line that shows something of the seats and the one after the last; None where none does."""
     origin, size = grid.seat_origin(seats), np.array([grid.height, grid.width])
     low, high = origin - size / 2, np.minimum(origin + grid.patch, size) - size / 2
     along, scan = (1, 0) if sweep.along == "x" else (0, 1)

@@ -124,7 +124,7 @@ def plain_scans(
     found = []
     shortest, longest = record.exposures_ms[0], min(camera.exposure_ms, record.exposures_ms[-1])
     for step in record.steps:
-        tried = _exposures(shortest, longest)
+        tried = exposures_between(shortest, longest)
         if seconds is not None and tried:
             tried += _longest_within(seconds, sweeps[step], camera, cost, shortest, longest)
         found += [priced_scan(record, sweeps[step], camera, cost, bands, exposure_ms) for exposure_ms in tried]
@@ -141,8 +141,8 @@ def priced_scan(
     return PlainScan(step, exposure_ms, cost.seconds(exposed, camera), size, expected, spread)
 
 
-def _exposures(shortest: float, longest: float) -> list[float]:
-    """Exposures to try, evenly by their logarithm, both ends among them."""
+def exposures_between(shortest: float, longest: float) -> list[float]:
+    """Give exposures to try, evenly by their logarithm, both ends among them; none from a longer to a shorter."""
     if longest < shortest:
         return []
     count = max(math.ceil(EXPOSURES_AN_OCTAVE * math.log2(longest / shortest)), 1)

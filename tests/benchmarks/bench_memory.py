@@ -7,7 +7,8 @@ scans in full every k-th visit and holds the map between has the same seconds in
 and looked for three days later. Farms that no training saw, each with noise of its own.
 
 `python tests/benchmarks/bench_memory.py season` draws the season alone, `days` the visits after a few days, `changes`
-what was planted, `light` fields that did not change under another sun, `wrong` memories that are none of the field.
+what was planted, `light` fields that did not change under another sun, `wrong` memories that are none of the field,
+`parts` visits that look at a part: fields as wide as four strips of a narrower camera.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
+from itertools import combinations, product
 from pathlib import Path
 
 import numpy as np
@@ -29,8 +31,19 @@ from flows.survey.stages.maps import MOST_TURN_PX
 from flows.tradeoff.plans import plain_look
 from flows.training.look import chosen_effects
 from models.evaluation.metrics import confusion, mean_iou
+from models.reading.doubts import SeatDoubts
 from models.reading.inference import segment
-from models.reading.remembered import Belief, Looked, Remembered, changed_shares, compare, first_belief, recall
+from models.reading.remembered import (
+    COME_TRUE,
+    Belief,
+    Looked,
+    Remembered,
+    carried,
+    changed_shares,
+    compare,
+    first_belief,
+    recall,
+)
 from models.training.looks import REFERENCE_MS
 from models.weights.files import Weights, describe_weights, load_weights
 from models.weights.memory_files import MemoryWeights, load_memory, memory_path
@@ -38,6 +51,8 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel
 from pipeline.planning.coverage import cheapest_full, plain_sweeps
+from pipeline.planning.part_looks import SeatRows, part_look, seats_shown, sweeps_of_runs
+from pipeline.planning.plain_scans import ScanRecord
 from pipeline.rectify.registration.field_shift import field_shift
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
@@ -55,6 +70,8 @@ WEIGHTS = Path(__file__).resolve().parents[2] / "models" / "shipped" / "farm.saf
 SURE = 0.97
 PLANTED, PLANTED_SEEDS = 3, range(1, 10)  # changes of each kind on each land, and the lands
 LOW_SUN, HIGH_SUN = 6.2, 12.0  # hours of June 21 at which the sun stands at 20 and 61 degrees
+STRIPS = LineCamera(samples=160)  # of which a field is four strips wide
+PART_DAYS, PART_SHARES = (3, 7), (0.35, 0.6)  # days without a look; seconds of a visit, of those of a whole quick look
 WRONG_SEEDS = (7, 8, 9)  # lands whose memories are of others, moved, turned or old: nothing was settled on them
 WORSE = 0.5  # points that a map may lose by a memory that is wrong
 Classes = NDArray[np.uint8]
@@ -123,7 +140,7 @@ def _unless_surer(before: Seen, now: Seen) -> Classes:
 
 def rows() -> list[Row]:
     """All figures."""
-    return [*after_days(), *season(), *planted_changes(), *other_light(), *wrong_memories()]
+    return [*after_days(), *season(), *planted_changes(), *other_light(), *wrong_memories(), *parts()]
 
 
 def after_days() -> Iterator[Row]:
@@ -197,6 +214,65 @@ def _remembered(looks: Sequence[Seen], *, reader: bool = True) -> list[float]:
         belief = _later(looks[number - 1], belief, looks[number], days, reader=reader)
         scores.append(looks[number].score(belief.classes()[0]))
     return scores
+
+
+def parts() -> Iterator[Row]:
+    """A part of a field looked at in some of a quick look's seconds: where the memory promises most, or anywhere."""
+    found: dict[str, list[float]] = {}
+    grid = SceneGrid(*SHAPE, _weights().config.patch, _weights().config.factor)
+    along, _, _ = cheapest_full(grid, STRIPS, COST)
+    sweeps = plain_sweeps(grid, STRIPS, along, step=QUICK[0], exposure_ms=QUICK[1])
+    rows, whole_s = SeatRows.of(sweeps, grid, STRIPS), COST.seconds(sweeps, STRIPS)
+    iou = ScanRecord.read(_weights().record["scans"]).expected(*QUICK)
+    wrong = np.array([(1 - iou[name]) / (1 + iou[name]) for name in _weights().class_names])
+    for seed, days in product(SEEDS, PART_DAYS):
+        before = look_at_farm(seed, FIRST_DAY, HOUR, ANEW)
+        now = look_at_farm(seed, FIRST_DAY + days, HOUR, QUICK, 1)
+        first = first_belief(before.looked)
+        unseen = carried(Remembered(first, None, days), _memory().reader)
+        doubts = SeatDoubts.of([(unseen.log_probability, unseen.age_days)], grid, len(wrong), come_true=COME_TRUE)
+        worth = doubts.worth(wrong)
+
+        score = partial(_part_score, before, now, first, days, grid)
+        alone = [seats_shown([sweep], grid, STRIPS) for sweep in sweeps]
+        found.setdefault(f"{days} d, nothing looked at, 0 s", []).append(now.score(unseen.classes()[0]))
+        for share in PART_SHARES:
+            seconds = share * whole_s
+            look = part_look(rows, worth, STRIPS, COST, exposure_ms=QUICK[1], seconds=seconds)
+            assert look is not None
+            chosen = seats_shown(sweeps_of_runs(sweeps, look.runs), grid, STRIPS)
+            lines = sum(stop - start for _, start, stop in look.runs) / sum(sweep.lines for sweep in sweeps)
+            name = f"{days} d, {seconds:.1f} s where the memory promises most"
+            found.setdefault(name, []).append(score(chosen))
+            count = max(round(lines * len(sweeps)), 1)
+            others = [np.any(some, axis=0) for some in combinations(alone, count)]
+            found.setdefault(f"{days} d, {count} of {len(sweeps)} strips, any", []).append(
+                float(np.mean([score(some) for some in others]))
+            )
+        found.setdefault(f"{days} d, the whole field, {whole_s:.1f} s", []).append(score(np.any(alone, axis=0)))
+    for name, values in found.items():
+        yield Row(f"a part, {name}", _figure(values))
+
+
+def _part_score(
+    before: Seen, now: Seen, first: Belief, days: float, grid: SceneGrid, shown: NDArray[np.bool_]
+) -> float:
+    """mIoU of the map after a look at some (seat,) seats."""
+    looked = _only(now.looked, seat_image(shown, grid), grid.factor)
+    return now.score(_later(before, first, replace(now, looked=looked), days).classes()[0])
+
+
+def seat_image(shown: NDArray[np.bool_], grid: SceneGrid) -> NDArray[np.bool_]:
+    """(y, x) pixels of (seat,) seats."""
+    seats = shown.reshape(grid.seat_shape)
+    return np.repeat(np.repeat(seats, grid.patch, axis=0), grid.patch, axis=1)[: grid.height, : grid.width]
+
+
+def _only(looked: Looked, where: NDArray[np.bool_], factor: int) -> Looked:
+    """A look that shows some pixels alone."""
+    values = np.where(where[..., None], looked.log_probability, np.float32(np.nan))
+    coarse = np.where(where[::factor, ::factor, None], looked.coarse, np.float32(np.nan))
+    return replace(looked, log_probability=values, seen=looked.seen & where, coarse=coarse)
 
 
 def planted_changes() -> Iterator[Row]:
@@ -348,6 +424,7 @@ PARTS = {
     "changes": planted_changes,
     "light": other_light,
     "wrong": wrong_memories,
+    "parts": parts,
 }
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flows.settings.values import LOOK_WHOLE
 from flows.survey.field_work import FieldWork, region_params
 from flows.survey.run import SurveyRun
 from flows.survey.stage import Product, Wanted, stage
@@ -18,6 +19,7 @@ from pipeline.geometry.grid import seat_pixels
 from pipeline.geometry.scan import Sweep, exposing
 from pipeline.planning.fine_pass import FinePlan, plan_fine
 from pipeline.planning.orientation import compare_orientations, find_rows
+from pipeline.planning.part_looks import seats_shown
 from pipeline.planning.plain_scans import scan_words
 from storage.archive.keys import StageRef, array_digest
 from storage.archive.manifests import read_table, write_table
@@ -96,7 +98,10 @@ def _whole_field(run: SurveyRun) -> tuple[NDArray[np.float64], FinePlan]:
     """No scores, and the plan of a plain scan: every seat is seen, and there is nothing to go back for."""
     sweep = run.plan.coarse[0]
     words = scan_words(sweep.step, exposing(run.camera, sweep).exposure_ms)
-    plan = FinePlan([], run.grid.valid_seats(), 0.0, 0.0, "scan", f"the field was scanned once: {words}")
+    seats, what = run.grid.valid_seats(), "the field was"
+    if run.settings.look != LOOK_WHOLE:
+        seats, what = np.flatnonzero(seats_shown(run.plan.coarse, run.grid, run.camera)), "a part of the field was"
+    plan = FinePlan([], seats, 0.0, 0.0, "scan", f"{what} scanned once: {words}")
     return np.zeros(int(np.prod(run.grid.seat_shape))), _kept_seats(run, plan)
 
 

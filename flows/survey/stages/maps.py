@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flows.settings.values import LOOK_WHOLE
 from flows.survey.drawing import Drawing, FieldMemory, UnknownRule, draw_field, memory_lies, whole_pixels
 from flows.survey.field_work import FieldWork, look_at, region_params, seat_columns
+from flows.survey.memory import MEMORY
 from flows.survey.run import SurveyRun
 from flows.survey.stage import Product, Wanted, stage
 from models.reading.inference import CoarseLook, Glance, read_glance
@@ -30,11 +32,10 @@ from storage.arrays.layout import SHARD_ROWS, open_group, read_array, read_bands
 from storage.arrays.mosaics import open_patches
 from storage.arrays.quicklooks import choose_bands, develop, stretch
 
-CLASS_MAP = Product("segment", version=7, files=("class_map.zarr", "belief.zarr"), by_weights=True)
+CLASS_MAP = Product("segment", version=8, files=("class_map.zarr", "belief.zarr"), by_weights=True)
 STRANGE = "strange.json"  # beside a map, where values were no readings
 LEFT_OUT = "left_out.npy"  # beside a map while it is drawn: the pixels of which none is
 MOST_TURN_PX = 12.0  # that a field's corners may lie off by, as it is turned, so that its memory is of use
-MEMORY = "memory.json"  # beside a map that goes on from an earlier one: what became of the memory
 
 
 @stage("draw_map", "class map", CLASS_MAP, of=("rectify", "cut_patches"), unit="operations of the map", size="pixels")
@@ -74,6 +75,8 @@ def draw_map(run: SurveyRun, mosaic: StageRef, patches: StageRef) -> Wanted:
     }
     if run.familiar is not None and unknown is not None:
         params["unknown"] = {"familiar": run.familiar.key, **asdict(unknown)}
+    if run.settings.look != LOOK_WHOLE:
+        params["part"] = True
     if prior is not None:
         reader = None if run.reader is None else run.reader.key
         params |= {"days": prior.days, "classes": list(prior.classes), "reader": reader, "light": _light(run)}
@@ -109,7 +112,8 @@ def _drawing(
     made = (path / "class_map.zarr").resolve(), (path / "belief.zarr").resolve()
     light, step = _light(run)
     left_out = None if run.zones.left_out is None else (path / LEFT_OUT).resolve()
-    return Drawing(work.weights, *seen, *made, light, step, memory, left_out, unknown)
+    part = run.settings.look != LOOK_WHOLE
+    return Drawing(work.weights, *seen, *made, light, step, memory, left_out, unknown, part)
 
 
 def _unknown_rule(run: SurveyRun) -> UnknownRule | None:
@@ -150,12 +154,6 @@ def _memory_told(run: SurveyRun, lies: FieldShift, comparison: MemoryAgreement |
         "changed_px": 0 if put_aside else sum(count for count, _, _ in pairs),
         "changes": [] if put_aside else [list(pair) for pair in sorted(pairs, key=lambda pair: -pair[0])],
     }
-
-
-def memory_told(class_map: StageRef) -> dict[str, Any] | None:
-    """What became of the memory that a map goes on from; None of a field's first look."""
-    told = class_map.path / MEMORY
-    return dict(read_table(told)) if told.is_file() else None
 
 
 def strange_pixels(class_map: StageRef) -> dict[str, int]:

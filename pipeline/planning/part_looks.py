@@ -1,0 +1,230 @@
+"""Looks at a part of a field: which lines of a scan are worth their seconds, where a field is known already.
+
+The seats of a field lie in rows along the lines of the sweeps that show them. A look takes one run of lines of a sweep,
+or none of it. At a price of a second each sweep has a best run, in closed form (the largest sum of neighbours); the
+lowest price at which all of them together end in time is searched for.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import SettingsError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import CostModel, Sweep, exposing, scene_to_sweep
+from pipeline.planning.area_cover import lines_showing
+
+PRICES = 24  # tried from one at which nothing pays to one at which everything does
+HALVINGS = 12  # of what lies between two of them
+Floats = NDArray[np.float64]
+LineRun = tuple[int, int, int]  # number of the sweep, its first line, and the one after its last
+
+
+@dataclass(frozen=True)
+class PartLook:
+    """Runs of lines of a scan, what they cost and what they are worth."""
+
+    runs: tuple[LineRun, ...]
+    seconds: float
+    worth: float
+
+
+@dataclass(frozen=True)
+class SeatRows:
+    """How the seats of a field lie in the sweeps of a scan: row after row along the lines.
+
+    ``row`` (seat,) is the number of each seat's row among all rows of all sweeps, -1 where no sweep shows its middle;
+    ``first`` and ``stop`` (sweep, row) are the lines that show a row, 0 and 0 where none does.
+    """
+
+    sweeps: tuple[Sweep, ...]
+    row: NDArray[np.intp]
+    first: NDArray[np.intp]
+    stop: NDArray[np.intp]
+
+    @staticmethod
+    def of(sweeps: Sequence[Sweep], grid: SceneGrid, camera: LineCamera) -> SeatRows:
+        """Those of the seats of a field, each in the sweep whose lines have it nearest to their middle."""
+        seats = grid.valid_seats()
+        along_x = sweeps[0].along == "x"
+        down, across = np.divmod(seats, grid.seat_shape[1])
+        rank, many = (down, grid.seat_shape[0]) if along_x else (across, grid.seat_shape[1])
+        nearest = _nearest_sweep(sweeps, grid, camera, seats)
+        row = np.full(int(np.prod(grid.seat_shape)), -1, np.intp)
+        shown = nearest >= 0
+        row[seats[shown]] = nearest[shown] * many + rank[shown]
+        first, stop = np.zeros((2, len(sweeps), many), np.intp)
+        for number, sweep in enumerate(sweeps):
+            for place in np.unique(rank[nearest == number]).tolist():
+                of_row = seats[(nearest == number) & (rank == place)]
+                lines = lines_showing(sweep, grid, camera, of_row)
+                first[number, place], stop[number, place] = (0, 0) if lines is None else lines
+        return SeatRows(tuple(sweeps), row, first, stop)
+
+    @cached_property
+    def there(self) -> NDArray[np.bool_]:
+        """(sweep, row) that lines show."""
+        return np.asarray(self.stop > self.first)
+
+    def sums(self, worth: Floats) -> Floats:
+        """What looks at the seats (seat,) of each row are worth together, (sweep, row)."""
+        shown = self.row >= 0
+        found = np.bincount(self.row[shown], worth[shown], self.first.size).reshape(self.first.shape)
+        return np.where(self.there, found, 0.0)
+
+
+def _nearest_sweep(
+    sweeps: Sequence[Sweep], grid: SceneGrid, camera: LineCamera, seats: NDArray[np.intp]
+) -> NDArray[np.intp]:
+    """(seat,) number of the sweep whose lines have the middle of a seat nearest to their own; -1 where none has it."""
+    size = np.array([grid.height, grid.width])
+    origin = grid.seat_origin(seats)
+    middle = (origin + np.minimum(origin + grid.patch, size)) / 2 - size / 2
+    along, scan = (1, 0) if sweeps[0].along == "x" else (0, 1)
+    beside = np.full((len(sweeps), len(seats)), np.inf)
+    for number, sweep in enumerate(sweeps):
+        at = scene_to_sweep(sweep, camera, middle[:, along], middle[:, scan])
+        half = camera.samples / sweep.binning / 2
+        off = np.abs(at[:, 1] - (half - 0.5)) / half
+        on_it = (off <= 1) & (at[:, 0] >= -0.5) & (at[:, 0] <= sweep.lines - 0.5)
+        beside[number] = np.where(on_it, off, np.inf)
+    return np.where(np.isfinite(beside.min(axis=0)), beside.argmin(axis=0), -1)
+
+
+def sweeps_of_runs(sweeps: Sequence[Sweep], runs: Sequence[LineRun]) -> list[Sweep]:
+    """Give the sweeps of runs of lines, in the order of the scan.
+
+    Raises SettingsError: a run is of a sweep or of lines that the scan does not have, or a sweep has two.
+    """
+    taken: dict[int, Sweep] = {}
+    for number, first, stop in runs:
+        if not 0 <= number < len(sweeps):
+            raise SettingsError(f"the look is at sweep {number}, the scan has sweeps 0 to {len(sweeps) - 1}")
+        sweep = sweeps[number]
+        if not 0 <= first < stop <= sweep.lines:
+            raise SettingsError(
+                f"the look is at lines {first} to {stop} of sweep {number}, which has lines 0 to {sweep.lines}"
+            )
+        if number in taken:
+            raise SettingsError(f"the look names sweep {number} twice; one run of its lines is taken")
+        taken[number] = replace(sweep, start_px=sweep.start_px + first * sweep.step, lines=stop - first)
+    return [taken[number] for number in sorted(taken)]
+
+
+def seats_shown(sweeps: Sequence[Sweep], grid: SceneGrid, camera: LineCamera) -> NDArray[np.bool_]:
+    """(seat,) of which a line of some sweeps shows something."""
+    seats, shown = grid.valid_seats(), np.zeros(int(np.prod(grid.seat_shape)), np.bool_)
+    for sweep in sweeps:
+        shown[seats] |= lines_over(sweep, grid, camera, seats)
+    return shown
+
+
+def lines_over(sweep: Sweep, grid: SceneGrid, camera: LineCamera, seats: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """(n,) whether a sweep's own samples lie on each of some seats."""
+    origin, size = grid.seat_origin(seats), np.array([grid.height, grid.width])
+    low, high = origin - size / 2, np.minimum(origin + grid.patch, size) - size / 2
+    along, scan = (1, 0) if sweep.along == "x" else (0, 1)
+    across = np.stack([low, low, high, high])[..., along], np.stack([low, high, low, high])[..., scan]
+    at = scene_to_sweep(sweep, camera, *across)
+    ends = sweep.lines - 0.5, camera.samples // sweep.binning - 0.5
+    inside = [(at[..., axis].max(axis=0) > -0.5) & (at[..., axis].min(axis=0) < end) for axis, end in enumerate(ends)]
+    return np.asarray(inside[0] & inside[1])
+
+
+def part_look(
+    rows: SeatRows, worth: Floats, camera: LineCamera, cost: CostModel, *, exposure_ms: float, seconds: float
+) -> PartLook | None:
+    """Choose the runs of lines that are worth most of those that end in time; None where no run pays or ends.
+
+    ``worth`` is that of a look at each seat, (seat,); none is below 0.
+    """
+    sweeps = [replace(sweep, exposure_ms=exposure_ms) for sweep in rows.sweeps]
+    values = rows.sums(worth)
+    total = float(values.sum())
+    if not total > 0:
+        return None
+    exposed = exposing(camera, sweeps[0])
+    line_s, setup_s = exposed.frame_ms * 1e-3, cost.setup_seconds(exposed)
+
+    def at_price(price: float) -> PartLook:
+        runs = [
+            (number, *run)
+            for number, (row, first, stop) in enumerate(zip(values, rows.first, rows.stop, strict=True))
+            if (run := _best_run(row, first, stop, price * line_s, price * setup_s)) is not None
+        ]
+        taken = sweeps_of_runs(sweeps, runs)
+        worth = sum(
+            float(values[number, (rows.first[number] >= first) & (rows.stop[number] <= stop)].sum())
+            for number, first, stop in runs
+        )
+        return PartLook(tuple(runs), cost.seconds(taken, camera) if taken else 0.0, worth)
+
+    least, most = 1e-6 * total / cost.seconds(sweeps, camera), 1e3 * total / line_s
+    prices = np.geomspace(most, least, PRICES)
+    best, dear, cheap = None, float(prices[0]), None
+    for price in prices.tolist():
+        look = at_price(price)
+        if look.seconds > seconds:
+            cheap = price
+            break
+        dear, best = price, look if best is None or look.worth > best.worth else best
+    for _ in range(HALVINGS if cheap is not None else 0):
+        assert cheap is not None
+        middle = math.sqrt(dear * cheap)
+        look = at_price(middle)
+        if look.seconds > seconds:
+            cheap = middle
+        else:
+            dear, best = middle, look if best is None or look.worth > best.worth else best
+    found = _first_rows(rows, values, sweeps, camera, cost, seconds) if best is None or not best.runs else best
+    return found if found is not None and found.runs else None
+
+
+def _best_run(
+    values: Floats, first: NDArray[np.intp], stop: NDArray[np.intp], line_price: float, setup_price: float
+) -> tuple[int, int] | None:
+    """The run of lines worth most beyond its price, first and the one after the last; None where none is."""
+    there = np.flatnonzero(stop > first)
+    if not there.size:
+        return None
+    summed = np.concatenate([[0.0], np.cumsum(values[there])])
+    begins = summed[:-1] - line_price * first[there]
+    ends = summed[1:] - line_price * stop[there]
+    least = np.minimum.accumulate(begins)
+    left = ends - least
+    last = int(left.argmax())
+    if left[last] <= setup_price:
+        return None
+    begin = int(np.flatnonzero(begins[: last + 1] == least[last])[0])
+    return int(first[there[begin]]), int(stop[there[last]])
+
+
+def _first_rows(
+    rows: SeatRows, values: Floats, sweeps: Sequence[Sweep], camera: LineCamera, cost: CostModel, seconds: float
+) -> PartLook | None:
+    """Of looks at a single row the one worth most, where no price leaves one that ends in time."""
+    order = np.argsort(-values, axis=None, kind="stable")
+    for place in order[values.ravel()[order] > 0].tolist():
+        number, row = divmod(place, values.shape[1])
+        run = (number, int(rows.first[number, row]), int(rows.stop[number, row]))
+        taken_s = cost.seconds(sweeps_of_runs(sweeps, [run]), camera)
+        if taken_s <= seconds:
+            return PartLook((run,), taken_s, float(values[number, row]))
+    return None
+
+
+def cheapest_row_seconds(rows: SeatRows, camera: LineCamera, cost: CostModel, exposure_ms: float) -> float:
+    """Give the seconds of the cheapest look at a single row of seats; inf where no line shows any."""
+    prices = [
+        cost.seconds([replace(sweep, lines=int(lines[there].min()), exposure_ms=exposure_ms)], camera)
+        for sweep, lines, there in zip(rows.sweeps, rows.stop - rows.first, rows.there, strict=True)
+        if there.any()
+    ]
+    return min(prices, default=math.inf)

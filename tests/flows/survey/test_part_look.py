@@ -1,0 +1,184 @@
+"""A visit that looks at a part of a field: at the lines that promise most, the rest is as it is remembered."""
+
+from __future__ import annotations
+
+import io
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from PIL import Image
+from rich.console import Console
+
+from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
+from flows.settings.load import load_settings
+from models.weights.files import save_weights, with_record
+from pipeline.errors import BudgetError, PipelineError, SettingsError, WeightsError
+from storage.archive.records import read_run
+from tests.conftest import RGB_NM, Survey, patchy_scene, random_weights
+from tests.remembered_work import without_effects
+
+pytestmark = pytest.mark.usefixtures("no_effects")
+
+RECORD = {
+    "scenes": 3,
+    "steps": [1, 2],
+    "exposures_ms": [25.0, 6.0],
+    "miou": [[0.99, 0.98], [0.97, 0.95]],
+    "per_class_iou": {"class_1": [[0.99, 0.97], [0.96, 0.94]]},
+}
+WHOLE: dict[str, Any] = {"budget": None, "scan_step": "2", "scan_exposure_ms": "25", "name": "north"}
+PART: dict[str, Any] = {"budget": None, "look": "part", "prior": "latest", "name": "north", "seconds": "2.1"}
+FIRST, LATER, LAST = "2026-06-01T10:00:00Z", "2026-06-04T10:00:00Z", "2026-06-07T10:00:00Z"
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Tiny weights with a record of plain scans."""
+    path = tmp_path_factory.mktemp("recorded") / "weights.safetensors"
+    save_weights(with_record(random_weights(RGB_NM), scans=RECORD), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def visits(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey, recorded: Path) -> tuple[Path, Any, Any]:
+    """A whole look at a field, and one at a part of it three days later; not to be changed."""
+    out = tmp_path_factory.mktemp("visits") / "archive"
+    with without_effects():
+        first = survey_png(out, **WHOLE, visit=FIRST, weights=str(recorded))
+        return out, first, survey_png(out, **PART, visit=LATER, weights=str(recorded))
+
+
+@pytest.fixture
+def visited(visits: tuple[Path, Any, Any], tmp_path: Path) -> Path:
+    """A copy of that archive."""
+    return Path(shutil.copytree(visits[0], tmp_path / "archive"))
+
+
+def product(out: Path, published: Any, name: str) -> xr.Dataset:
+    """A store of a run."""
+    return xr.open_zarr(out / published.receipt["products"][name], consolidated=False)
+
+
+def test_a_part_is_looked_at_and_the_rest_remembered(visits: tuple[Path, Any, Any]) -> None:
+    """In its seconds; where lines went the map is of today, elsewhere three days old, and it is whole."""
+    out, first, part = visits
+    look, age = part.receipt["look"], product(out, part, "belief").age.values
+    assert 0.1 < look["share"] < 0.9
+    assert part.receipt["savings"]["capture_s"]["done"] == pytest.approx(look["seconds"])
+    assert look["seconds"] <= 2.1
+    assert sorted(np.unique(age)) == [0.0, 3.0]
+    assert (age == 0).mean() == pytest.approx(look["share"], abs=0.15)
+    before, now = (product(out, one, "class_map").classes.values for one in (first, part))
+    assert (now != 255).all()
+    assert (now == before)[age > 0].mean() > 0.95  # what fades may tip where two classes were nearly as likely
+    assert part.receipt["memory"]["put_aside"] is None
+
+
+def test_receipt_and_page_say_what_was_looked_at(visits: tuple[Path, Any, Any]) -> None:
+    """Lines, share, and what was expected of them; beside a plan that names the part."""
+    _, _, part = visits
+    look = part.receipt["look"]
+    assert part.receipt["settings"]["look"] == look["lines"]
+    assert look["expected_gain"] >= 0
+    page = (part.folder / "report.html").read_text(encoding="utf-8")
+    assert f"Lines {look['lines']} were looked at" in page
+    assert "a part of the field was scanned once: every" in part.receipt["plan"]["reason"]
+    assert any("looks at" in note and "points of mIoU" in note for note in part.receipt["settings"]["notes"])
+
+
+def test_the_same_visit_finds_its_own_lines(visited: Path, visits: Any, survey_png: Survey, recorded: Path) -> None:
+    """Asked again it goes on from the visit before it, as it did, and captures nothing."""
+    again = survey_png(visited, **PART, visit=LATER, weights=str(recorded))
+    assert again.receipt["settings"]["look"] == visits[2].receipt["settings"]["look"]
+    assert again.receipt["memory"]["run"] == visits[1].folder.name
+    states = {stage["name"]: stage["state"] for stage in again.receipt["stages"]}
+    assert states["capture_coarse"] == states["draw_map"] == "cached"
+
+
+def test_better_weights_read_the_lines_that_were_taken(visited: Path, visits: Any, tmp_path: Path) -> None:
+    """Reprocessing makes both visits again, of the light that there is, whatever these weights would have looked at."""
+    other = tmp_path / "other.safetensors"
+    save_weights(with_record(random_weights(RGB_NM, width=4), scans=RECORD), other)
+    run_reprocess(ReprocessRequest(visited, weights=other), Console(quiet=True))
+    runs = [read_run(path, {}) for path in sorted(visited.glob("runs/*"))]
+    before, again = (run for run in runs if run.settings["look"] == visits[2].receipt["settings"]["look"])
+    assert again.receipt["products"]["class_map"] != before.receipt["products"]["class_map"]
+    assert again.receipt["products"]["raw_coarse"] == before.receipt["products"]["raw_coarse"]
+
+
+def test_of_a_field_that_nobody_knows_all_is_looked_at(survey_png: Survey, recorded: Path, tmp_path: Path) -> None:
+    """Said, and the seconds buy a plain scan of it."""
+    text = io.StringIO()
+    flags = {**PART, "seconds": "5", "weights": str(recorded)}
+    first = survey_png(tmp_path / "archive", console=Console(file=text, width=300), **flags)
+    assert "nothing is remembered: the whole field is looked at" in text.getvalue()
+    assert "look" not in first.receipt
+    assert first.receipt["settings"]["look"] == "whole"
+
+
+def test_what_is_due_is_looked_at_first(visited: Path, visits: Any, survey_png: Survey, recorded: Path) -> None:
+    """With --refresh the lines that the visit before left out, and the notes count them."""
+    part = survey_png(visited, **{**PART, "refresh": "8d", "seconds": "2.4"}, visit=LAST, weights=str(recorded))
+    look, age = part.receipt["look"], product(visited, part, "belief").age.values
+    before = product(visited, visits[2], "belief").age.values
+    assert look["due"] > 0
+    assert look["due_left"] == 0
+    assert (age[before == 3.0] == 0).all()
+    notes = " ".join(part.receipt["settings"]["notes"])
+    assert f"{look['due']} of the {look['due']} seats that were due are among them" in notes
+
+
+def test_what_is_beyond_another_fields_part_has_no_class(
+    visited: Path, survey_png: Survey, recorded: Path, tmp_path: Path
+) -> None:
+    """A memory of another field is put aside, and where nobody looked nothing is said of this one."""
+    values, labels = patchy_scene((96, 128), 3, seed=77)
+    Image.fromarray(values.astype(np.uint8)).save(tmp_path / "other.png")
+    Image.fromarray(labels).save(tmp_path / "labels.png")
+    scene = {"scene": str(tmp_path / "other.png"), "labels": str(tmp_path / "labels.png")}
+    other = survey_png(visited, **PART, **scene, visit=LAST, weights=str(recorded))
+    if other.receipt["memory"]["put_aside"] is None:
+        pytest.skip("so small a part of the other field looks like this one to these weights")
+    classes = product(visited, other, "class_map").classes.values
+    assert 0.05 < (classes == 255).mean() < 1 - other.receipt["look"]["share"] + 0.15
+
+
+@pytest.mark.parametrize(
+    ("flags", "error", "told"),
+    [
+        ({"seconds": None, "scan_step": "2"}, SettingsError, "'part' looks where the seconds are worth most: give"),
+        ({"look": "0:5-9", "seconds": None}, SettingsError, "names lines of a plain scan: give its --scan-step too"),
+        ({"look": "0:9-5"}, SettingsError, "must be whole, part, or runs of lines as receipts tell them"),
+        ({"look": "somewhere"}, SettingsError, "must be whole, part, or runs of lines"),
+        ({"look": "7:0-5", "seconds": None, "scan_step": "2"}, SettingsError, "at sweep 7, the scan has sweeps 0 to 0"),
+        ({"pointing_px": "4"}, SettingsError, "ties its sweeps by what they share"),
+        ({"look": None, "refresh": "14d"}, SettingsError, "--refresh says how old a place may become"),
+        ({"refresh": "a while"}, SettingsError, "must be a time of 1h to 3660d, such as 14d"),
+        ({"seconds": "1"}, BudgetError, r"no look at any part of the field ends in time; the least takes 1\.\d s"),
+    ],
+)
+def test_what_cannot_be_looked_at_is_refused_in_a_sentence(
+    visits: Any, survey_png: Survey, recorded: Path, flags: dict[str, Any], error: type[PipelineError], told: str
+) -> None:
+    """Before anything is captured, with what to do."""
+    before = sorted(visits[0].rglob("*"))
+    with pytest.raises(error, match=told):
+        survey_png(visits[0], **{**PART, "visit": LAST, "weights": str(recorded), **flags})
+    assert sorted(visits[0].rglob("*")) == before
+
+
+def test_weights_without_a_record_look_at_all(visited: Path, survey_png: Survey, weights: Path) -> None:
+    """No part can be chosen by them, which is said."""
+    with pytest.raises(WeightsError, match="have no record of plain scans, by which a part of a field is chosen"):
+        survey_png(visited, **PART, visit=LAST, weights=str(weights))
+
+
+@pytest.mark.parametrize(("text", "days"), [("14d", 14.0), ("36h", 1.5), ("2w", 14.0), (7, 7.0)])
+def test_times_are_read_in_days(text: Any, days: float) -> None:
+    """With a unit or as a number of days."""
+    given = {"scene": "farm", "look": "part", "seconds": "9", "refresh": text}
+    assert load_settings(None, given).refresh == days

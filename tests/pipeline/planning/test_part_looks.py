@@ -1,0 +1,116 @@
+"""Looks at a part of a field: every seat has its line, and no run of lines in the same seconds is worth more."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.errors import SettingsError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import Axis, CostModel
+from pipeline.planning.coverage import plain_sweeps
+from pipeline.planning.part_looks import SeatRows, cheapest_row_seconds, part_look, seats_shown, sweeps_of_runs
+
+GRID, CAMERA, COST = SceneGrid(320, 416, 16, 4), LineCamera(samples=160), CostModel()
+EXPOSURE_MS = 5.0
+
+
+def rows_of(along: Axis = "x", step: int = 2) -> SeatRows:
+    """Rows of seats in the sweeps of a scan, three strips of them."""
+    return SeatRows.of(plain_sweeps(GRID, CAMERA, along, step=step, exposure_ms=EXPOSURE_MS), GRID, CAMERA)
+
+
+ROWS = rows_of()
+WHOLE_S = COST.seconds(list(ROWS.sweeps), CAMERA)
+worths = st.integers(0, 2**32 - 1).map(lambda seed: _patchy(np.random.default_rng(seed)))
+
+
+def _patchy(rng: np.random.Generator) -> np.ndarray:
+    """Worth of the seats, much of it in a few places."""
+    worth = rng.random(GRID.seat_shape) * 0.1
+    top, left = rng.integers(0, GRID.seat_shape[0] - 4), rng.integers(0, GRID.seat_shape[1] - 4)
+    worth[top : top + 4, left : left + 4] += 5 * rng.random()
+    return np.asarray(worth.ravel())
+
+
+@pytest.mark.parametrize("along", ["x", "y"])
+@pytest.mark.parametrize("step", [1, 2, 4])
+def test_every_seat_is_in_a_row_whose_lines_show_it(along: Axis, step: int) -> None:
+    """The lines of a row show the seats of that row, and all rows together the field."""
+    rows = rows_of(along, step)
+    assert (rows.row[GRID.valid_seats()] >= 0).all()
+    for number, place in np.argwhere(rows.there)[:: 7 if step > 1 else 3]:
+        run = (int(number), int(rows.first[number, place]), int(rows.stop[number, place]))
+        shown = seats_shown(sweeps_of_runs(rows.sweeps, [run]), GRID, CAMERA)
+        assert shown[rows.row == number * rows.first.shape[1] + place].all()
+
+
+@given(worths, st.floats(0.02, 1.2))
+def test_no_run_of_the_same_sweep_is_worth_more_in_its_seconds(worth: np.ndarray, share: float) -> None:
+    """Each chosen run is worth most of all runs of its sweep that have as many lines or fewer."""
+    look = part_look(ROWS, worth, CAMERA, COST, exposure_ms=EXPOSURE_MS, seconds=share * WHOLE_S)
+    sums = ROWS.sums(worth)
+    for number, first, stop in () if look is None else look.runs:
+        firsts, stops, values = ROWS.first[number], ROWS.stop[number], sums[number]
+        taken = values[(firsts >= first) & (stops <= stop)].sum()
+        for begin, end in combinations(range(len(values) + 1), 2):
+            if stops[end - 1] - firsts[begin] <= stop - first:
+                assert values[begin:end].sum() <= taken * (1 + 1e-9)
+
+
+@given(worths, st.floats(0.02, 1.2))
+def test_looks_end_in_time_and_are_worth_what_they_show(worth: np.ndarray, share: float) -> None:
+    """Seconds are those of the cost model, at most those given; the worth is that of the rows the lines show."""
+    look = part_look(ROWS, worth, CAMERA, COST, exposure_ms=EXPOSURE_MS, seconds=share * WHOLE_S)
+    if look is None:
+        assert cheapest_row_seconds(ROWS, CAMERA, COST, EXPOSURE_MS) > share * WHOLE_S
+        return
+    sweeps = sweeps_of_runs(ROWS.sweeps, look.runs)
+    assert look.seconds == COST.seconds(sweeps, CAMERA) <= share * WHOLE_S
+    assert look.worth <= worth[seats_shown(sweeps, GRID, CAMERA)].sum() * (1 + 1e-9)
+
+
+@given(worths)
+def test_more_seconds_are_worth_no_less(worth: np.ndarray) -> None:
+    """And all the seconds of the whole scan buy all that a scan is worth."""
+    shares = (0.3, 0.5, 0.7, 0.9, 1.0)
+    looks = [part_look(ROWS, worth, CAMERA, COST, exposure_ms=EXPOSURE_MS, seconds=one * WHOLE_S) for one in shares]
+    found = [0.0 if look is None else look.worth for look in looks]
+    assert found == sorted(found)
+    assert found[-1] == pytest.approx(ROWS.sums(worth).sum())
+
+
+def test_what_is_worth_much_is_looked_at_first() -> None:
+    """Of a field known but for one block, a look of few seconds is at the lines that show that block."""
+    worth = np.zeros(GRID.seat_shape)
+    worth[5:8, 3:6] = 1.0
+    look = part_look(ROWS, worth.ravel(), CAMERA, COST, exposure_ms=EXPOSURE_MS, seconds=2.5)
+    assert look is not None
+    assert seats_shown(sweeps_of_runs(ROWS.sweeps, look.runs), GRID, CAMERA)[worth.ravel() > 0].all()
+    assert len(look.runs) == 1
+
+
+def test_nothing_is_looked_at_where_nothing_is_worth_it() -> None:
+    """Without any worth, and without the seconds of a single row, there is no look."""
+    nothing, one = np.zeros(int(np.prod(GRID.seat_shape))), np.ones(int(np.prod(GRID.seat_shape)))
+    assert part_look(ROWS, nothing, CAMERA, COST, exposure_ms=EXPOSURE_MS, seconds=WHOLE_S) is None
+    assert part_look(ROWS, one, CAMERA, COST, exposure_ms=EXPOSURE_MS, seconds=1.0) is None
+
+
+@pytest.mark.parametrize(
+    ("runs", "told"),
+    [
+        ([(3, 0, 5)], "look is at sweep 3, the scan has sweeps 0 to 2"),
+        ([(0, 0, 100_000)], "lines 0 to 100000 of sweep 0, which has lines 0 to"),
+        ([(1, 0, 5), (1, 9, 12)], "names sweep 1 twice"),
+    ],
+)
+def test_lines_that_a_scan_does_not_have_are_refused(runs: list[tuple[int, int, int]], told: str) -> None:
+    """With what it has."""
+    with pytest.raises(SettingsError, match=told):
+        sweeps_of_runs(ROWS.sweeps, runs)
