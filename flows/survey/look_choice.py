@@ -18,7 +18,7 @@ from models.reading.doubts import SeatDoubts
 from models.reading.remembered import COME_TRUE, Belief, Remembered, carried, in_classes
 from models.weights.files import Description
 from models.weights.memory_files import ReaderFile, load_memory
-from pipeline.errors import BudgetError, WeightsError
+from pipeline.errors import BudgetError, SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.part_looks import (
     PartLook,
@@ -34,6 +34,7 @@ from storage.arrays.beliefs import BeliefStore
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 STRIP_SEATS = 4  # rows of seats of a belief that are read at a time
+POORER = 0.05  # of mIoU below the best scan of the record: poorer looks spoil what is remembered better
 DUE = 1e3  # times what looks at all of a field can gain: what is due comes first
 
 
@@ -139,15 +140,23 @@ def _best_look(settings: Settings, grid: SceneGrid, wanted: _Wanted, shown: Mask
     assert seconds is not None  # checked with the settings
     found: list[tuple[int, float, PartLook]] = []
     least: list[float] = []
+    enough = float(record.scores[MIOU].max()) - POORER
     shortest, longest = record.exposures_ms[0], min(camera.exposure_ms, record.exposures_ms[-1])
     for step in record.steps:
         whole = replace(settings, look=LOOK_WHOLE, scan_step=step, scan_exposure_ms=None)
         rows = SeatRows.of(lay_out_sweeps(whole, grid, shown)[1], grid, camera)
         for exposure_ms in exposures_between(shortest, longest):
+            if record.expected(step, exposure_ms)[MIOU] < enough:
+                continue
             worth = wanted.worth(wanted.gains(step, exposure_ms))
             look = part_look(rows, worth, camera, cost, exposure_ms=exposure_ms, seconds=seconds)
             found += [] if look is None else [(step, exposure_ms, look)]
-        least.append(cheapest_row_seconds(rows, camera, cost, shortest))
+            least.append(cheapest_row_seconds(rows, camera, cost, exposure_ms))
+    if not least:
+        raise SettingsError(
+            f"camera.exposure_ms = {camera.exposure_ms:g}: no scan of so short exposures is good enough for a part of a"
+            " field; leave --look out"
+        )
     if not found:
         raise BudgetError(
             f"--seconds {seconds:g}: no look at any part of the field ends in time; the least takes {min(least):.1f} s"

@@ -33,7 +33,7 @@ class SeatDoubts:
 
     pixels: Floats  # (seat, class, step)
     doubt: Floats  # (step,) of the pixels of a step, at most
-    age_days: Floats  # (seat,) of its oldest pixel; inf where one was never looked at
+    age_days: Floats  # (seat,) of its oldest pixel of which anything is known; inf where of none is
 
     @staticmethod
     def of(
@@ -50,7 +50,7 @@ class SeatDoubts:
         """
         doubt = np.geomspace(LEAST_DOUBT, 1.0, STEPS)
         rows, columns = grid.seat_shape
-        pixels, ages = np.zeros((rows * columns, classes, STEPS)), np.zeros(rows * columns)
+        pixels, ages = np.zeros((rows * columns, classes, STEPS)), np.full(rows * columns, -np.inf)
         top, across = 0, np.arange(grid.width) // grid.patch
         for belief, age in strips:
             if belief.shape[1:] != (grid.width, classes) or top % grid.patch:
@@ -61,11 +61,11 @@ class SeatDoubts:
             believed = np.where(np.isfinite(belief[..., 0]), np.nan_to_num(belief, nan=-np.inf).argmax(axis=-1), 0)
             place = (seat * classes + believed) * STEPS + step
             pixels += np.bincount(place.ravel(), minlength=pixels.size).reshape(pixels.shape)
-            np.maximum.at(ages, seat.ravel(), np.where(np.isfinite(age), age, np.inf).ravel())
+            np.maximum.at(ages, seat.ravel(), np.where(np.isfinite(age), age, -np.inf).ravel())
             top += len(belief)
         if top != grid.height:
             raise ShapeError(f"a belief has {top} rows, its field {grid.height}")
-        return SeatDoubts(pixels, doubt, ages)
+        return SeatDoubts(pixels, doubt, np.where(ages < 0, np.inf, ages))
 
     def expected_wrong(self) -> float:
         """Give the share of the field's pixels that are expected to be wrong."""

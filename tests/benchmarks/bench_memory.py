@@ -8,7 +8,7 @@ and looked for three days later. Farms that no training saw, each with noise of 
 
 `python tests/benchmarks/bench_memory.py season` draws the season alone, `days` the visits after a few days, `changes`
 what was planted, `light` fields that did not change under another sun, `wrong` memories that are none of the field,
-`parts` visits that look at a part: fields as wide as four strips of a narrower camera.
+`parts` visits that look at a part: fields as wide as four strips of a narrower camera, `strips` a season of them.
 """
 
 from __future__ import annotations
@@ -72,6 +72,7 @@ PLANTED, PLANTED_SEEDS = 3, range(1, 10)  # changes of each kind on each land, a
 LOW_SUN, HIGH_SUN = 6.2, 12.0  # hours of June 21 at which the sun stands at 20 and 61 degrees
 STRIPS = LineCamera(samples=160)  # of which a field is four strips wide
 PART_DAYS, PART_SHARES = (3, 7), (0.35, 0.6)  # days without a look; seconds of a visit, of those of a whole quick look
+SEASON_SHARES = (0.15, 0.25)  # seconds of a visit of a season, of those of a full scan
 WRONG_SEEDS = (7, 8, 9)  # lands whose memories are of others, moved, turned or old: nothing was settled on them
 WORSE = 0.5  # points that a map may lose by a memory that is wrong
 Classes = NDArray[np.uint8]
@@ -140,7 +141,15 @@ def _unless_surer(before: Seen, now: Seen) -> Classes:
 
 def rows() -> list[Row]:
     """All figures."""
-    return [*after_days(), *season(), *planted_changes(), *other_light(), *wrong_memories(), *parts()]
+    return [
+        *after_days(),
+        *season(),
+        *planted_changes(),
+        *other_light(),
+        *wrong_memories(),
+        *parts(),
+        *season_of_parts(),
+    ]
 
 
 def after_days() -> Iterator[Row]:
@@ -216,42 +225,92 @@ def _remembered(looks: Sequence[Seen], *, reader: bool = True) -> list[float]:
     return scores
 
 
+@dataclass(frozen=True)
+class Strips:
+    """A field as wide as four strips of a camera, and what its quick looks at parts cost and show."""
+
+    grid: SceneGrid
+    rows: SeatRows
+    whole_s: float  # of a quick look at all of it
+    full_s: float  # of a full scan
+
+    @staticmethod
+    def of_field() -> Strips:
+        """Those of the farms that everything here looks at."""
+        grid = SceneGrid(*SHAPE, _weights().config.patch, _weights().config.factor)
+        along, _, _ = cheapest_full(grid, STRIPS, COST)
+        quick, full = (
+            plain_sweeps(grid, STRIPS, along, step=step, exposure_ms=exposure_ms)
+            for step, exposure_ms in (QUICK, REFERENCE)
+        )
+        return Strips(grid, SeatRows.of(quick, grid, STRIPS), COST.seconds(quick, STRIPS), COST.seconds(full, STRIPS))
+
+    def chosen(self, before: Seen, belief: Belief, days: float, seconds: float) -> tuple[NDArray[np.bool_], float]:
+        """(seat,) that the memory has looked at in so many seconds, and the share of the lines that show them."""
+        unseen = carried(Remembered(belief, None, days), _memory().reader)
+        names, scans = _weights().class_names, ScanRecord.read(_weights().record["scans"])
+        iou = np.array([scans.expected(*QUICK)[name] for name in names])
+        strips = [(unseen.log_probability, unseen.age_days)]
+        worth = SeatDoubts.of(strips, self.grid, len(names), come_true=COME_TRUE).worth((1 - iou) / (1 + iou))
+        look = part_look(self.rows, worth, STRIPS, COST, exposure_ms=QUICK[1], seconds=seconds)
+        assert look is not None
+        sweeps = self.rows.sweeps
+        lines = sum(stop - start for _, start, stop in look.runs) / sum(sweep.lines for sweep in sweeps)
+        return seats_shown(sweeps_of_runs(sweeps, look.runs), self.grid, STRIPS), lines
+
+    @property
+    def alone(self) -> list[NDArray[np.bool_]]:
+        """(seat,) that each strip shows."""
+        return [seats_shown([sweep], self.grid, STRIPS) for sweep in self.rows.sweeps]
+
+
 def parts() -> Iterator[Row]:
     """A part of a field looked at in some of a quick look's seconds: where the memory promises most, or anywhere."""
     found: dict[str, list[float]] = {}
-    grid = SceneGrid(*SHAPE, _weights().config.patch, _weights().config.factor)
-    along, _, _ = cheapest_full(grid, STRIPS, COST)
-    sweeps = plain_sweeps(grid, STRIPS, along, step=QUICK[0], exposure_ms=QUICK[1])
-    rows, whole_s = SeatRows.of(sweeps, grid, STRIPS), COST.seconds(sweeps, STRIPS)
-    iou = ScanRecord.read(_weights().record["scans"]).expected(*QUICK)
-    wrong = np.array([(1 - iou[name]) / (1 + iou[name]) for name in _weights().class_names])
+    field = Strips.of_field()
     for seed, days in product(SEEDS, PART_DAYS):
         before = look_at_farm(seed, FIRST_DAY, HOUR, ANEW)
         now = look_at_farm(seed, FIRST_DAY + days, HOUR, QUICK, 1)
         first = first_belief(before.looked)
+        score = partial(_part_score, before, now, first, days, field.grid)
         unseen = carried(Remembered(first, None, days), _memory().reader)
-        doubts = SeatDoubts.of([(unseen.log_probability, unseen.age_days)], grid, len(wrong), come_true=COME_TRUE)
-        worth = doubts.worth(wrong)
-
-        score = partial(_part_score, before, now, first, days, grid)
-        alone = [seats_shown([sweep], grid, STRIPS) for sweep in sweeps]
         found.setdefault(f"{days} d, nothing looked at, 0 s", []).append(now.score(unseen.classes()[0]))
         for share in PART_SHARES:
-            seconds = share * whole_s
-            look = part_look(rows, worth, STRIPS, COST, exposure_ms=QUICK[1], seconds=seconds)
-            assert look is not None
-            chosen = seats_shown(sweeps_of_runs(sweeps, look.runs), grid, STRIPS)
-            lines = sum(stop - start for _, start, stop in look.runs) / sum(sweep.lines for sweep in sweeps)
-            name = f"{days} d, {seconds:.1f} s where the memory promises most"
-            found.setdefault(name, []).append(score(chosen))
-            count = max(round(lines * len(sweeps)), 1)
-            others = [np.any(some, axis=0) for some in combinations(alone, count)]
-            found.setdefault(f"{days} d, {count} of {len(sweeps)} strips, any", []).append(
-                float(np.mean([score(some) for some in others]))
-            )
-        found.setdefault(f"{days} d, the whole field, {whole_s:.1f} s", []).append(score(np.any(alone, axis=0)))
+            seconds = share * field.whole_s
+            chosen, lines = field.chosen(before, first, days, seconds)
+            found.setdefault(f"{days} d, {seconds:.1f} s where the memory promises most", []).append(score(chosen))
+            count = max(round(lines * len(field.alone)), 1)
+            others = [np.any(some, axis=0) for some in combinations(field.alone, count)]
+            name = f"{days} d, {count} of {len(field.alone)} strips, any"
+            found.setdefault(name, []).append(float(np.mean([score(some) for some in others])))
+        name = f"{days} d, the whole field, {field.whole_s:.1f} s"
+        found.setdefault(name, []).append(score(np.any(field.alone, axis=0)))
     for name, values in found.items():
         yield Row(f"a part, {name}", _figure(values))
+
+
+def season_of_parts() -> Iterator[Row]:
+    """Thirty visits to a field four strips wide, each at a part of it, in a share of a full scan's seconds."""
+    found: dict[str, list[float]] = {}
+    field, moments = Strips.of_field(), [day + hour / 24 for day, hour in SEASON]
+    for seed in SEEDS:
+        first = look_at_farm(seed, *SEASON[0], REFERENCE)
+        quick = [first, *(look_at_farm(seed, *moment, QUICK, 1) for moment in SEASON[1:])]
+        for share in (*SEASON_SHARES, None):
+            belief, before, scores = first_belief(first.looked), first, [first.score(first.alone)]
+            for number in range(1, len(quick)):
+                now, days = quick[number], moments[number] - moments[number - 1]
+                if share is not None:
+                    shown, _ = field.chosen(before, belief, days, share * field.full_s)
+                    now = replace(now, looked=_only(now.looked, seat_image(shown, field.grid), field.grid.factor))
+                belief = _later(before, belief, now, days)
+                scores.append(now.score(belief.classes()[0]))
+                before = now
+            seconds = field.whole_s if share is None else share * field.full_s
+            name = f"{seconds:.1f} s a visit, {seconds / field.full_s:.0%} of a full scan's"
+            found.setdefault(name, []).append(float(np.mean(scores)))
+    for name, values in found.items():
+        yield Row(f"season of parts, {name}", _figure(values))
 
 
 def _part_score(
@@ -425,6 +484,7 @@ PARTS = {
     "light": other_light,
     "wrong": wrong_memories,
     "parts": parts,
+    "strips": season_of_parts,
 }
 
 
