@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.survey.run import SurveyRun, weights_path
+from flows.survey.run import SurveyRun
+from flows.survey.survey_model import weights_path
 from models.network.sizes import saliency_bytes
 from models.policies.policies import IMAGE_POLICIES, NETWORK_POLICIES, score_seats
 from models.policies.vgg_file import VggFile

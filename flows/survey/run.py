@@ -6,15 +6,14 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
-from flows.settings.values import LOOK_PART, UNKNOWN_AUTO, UNKNOWN_OFF
+from flows.settings.survey_settings import Settings
+from flows.settings.values import LOOK_PART
 from flows.survey.beyond_training import beyond_training
 from flows.survey.capture_plan import CapturePlan, plan_capture
 from flows.survey.look_choice import LookChoice, choose_look
@@ -31,21 +30,13 @@ from flows.survey.scene import (
     judged_labels,
     open_scene,
 )
+from flows.survey.survey_model import SurveyModel, vgg_file
 from flows.survey.zones import SurveyZones, open_zones, place_of_field
 from models.policies.vgg_file import VggFile
-from models.weights.familiar_files import FamiliarFile, describe_familiar, familiar_path, load_familiar
-from models.weights.files import (
-    Description,
-    Weights,
-    check_two_scale,
-    content_key,
-    describe_weights,
-    load_weights,
-    unsealed_note,
-)
-from models.weights.memory_files import ReaderFile, describe_reader, load_memory
-from models.weights.trained_on import TRAINED_ON, TrainedOn
-from pipeline.errors import SettingsError, WeightsError
+from models.weights.familiar_files import FamiliarFile
+from models.weights.files import Description, Weights
+from models.weights.memory_files import ReaderFile
+from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
@@ -164,7 +155,7 @@ class SurveyRun(CaptureRun):
     @cached_property
     def vgg(self) -> VggFile | None:
         """VGG19 for the policies ``vgg-static`` and ``vgg-trained``."""
-        return _vgg_file(self.settings)
+        return vgg_file(self.settings)
 
     @property
     def place_key(self) -> dict[str, Any]:
@@ -187,11 +178,8 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     """
     settings = for_rig(settings)
     check_scene_there(settings)
-    path = weights_path(settings)
-    described, load = describe_weights(path), Once(lambda: load_weights(path))
-    check_two_scale(described.config, path)
-    if not planning:
-        load()  # refuses tensors that do not fit
+    model = SurveyModel.open(settings, planning=planning)
+    described, path = model.described, model.path
     refused = farm_refusal(settings)
     if refused is not None and not planning:
         raise SettingsError(refused)
@@ -199,43 +187,30 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     if not planning:  # what the rig would find there: no stage's work
         scene.raster.drawn()
         scene.light()
-    _check_bands(scene, described, path)
+    model.check_bands(scene.wavelength_nm)
     label_notes = check_labels(scene, described)
     grid = SceneGrid(*scene.shape, described.config.patch, described.config.factor)
     zones = open_zones(settings, place_of_field(settings, scene), grid)
-    name = settings.name or Path(scene.name).stem
-    remembered: tuple[Prior | None, tuple[str, ...]] | None = None
-    if settings.look == LOOK_PART:  # what is remembered says where to look: nothing else is asked for so early
-        archive = open_archive(settings.out) if archive is None and is_archive(settings.out) else archive
-        remembered = (None, ()) if archive is None else find_prior(archive, settings, name, grid, described.class_names)
-    reader = describe_reader(path, described)
-    if reader is not None and not planning:
-        load_memory(reader.path, described)  # refuses tensors that are not those that were written
-    prior = None if remembered is None else remembered[0]
-    settings, look, look_notes = choose_look(settings, prior, described, path, reader, grid, zones.shown)
-    settings, scans = choose_plain_scan(settings, described, path, grid, len(scene.wavelength_nm), zones.shown)
-    plan = plan_capture(settings, grid, zones.shown)
-    key = content_key(path)
-    familiar = describe_familiar(path, described, key)
-    outside = beyond_training(settings, scene, described, _trained_on(described, familiar), path)
-    familiar = _asked_familiar(settings, familiar, path)
-    if familiar is not None and not planning:
-        load_familiar(path, described)  # refuses tensors that are not those that were written
+    outside = beyond_training(settings, scene, described, model.trained_on, path)
+    familiar = model.asked_familiar(settings)
     if settings.mask is not None:
         check_mask(settings.mask, scene.shape)
-    sealing = () if described.sealed else (unsealed_note(path),)
-    vgg = _vgg_file(settings)
-    vgg_notes: tuple[str, ...] = ()
-    if vgg is not None and not planning:
-        vgg.saliency(load())  # refuses one that does not go with the weights
-        vgg_notes = (f"VGG19 from {vgg.path.name}: {vgg.report()}",)
+    name, found = settings.name or Path(scene.name).stem, None
+    if settings.look == LOOK_PART:  # what is remembered says where to look: nothing else is asked for so early
+        archive = open_archive(settings.out) if archive is None and is_archive(settings.out) else archive
+        found = (None, ()) if archive is None else find_prior(archive, settings, name, grid, described.class_names)
+    prior = None if found is None else found[0]
+    settings, look, look_notes = choose_look(settings, prior, described, path, model.reader, grid, zones.shown)
+    settings, scans = choose_plain_scan(settings, described, path, grid, len(scene.wavelength_nm), zones.shown)
+    plan = plan_capture(settings, grid, zones.shown)
     simulated, planned = make_source(scene, settings), (*plan.coarse, *plan.full)
     source = field_source(scene, settings, simulated, planned)
     check_memory(settings, simulated, grid, plan)
     archive = open_archive(settings.out) if archive is None else archive
-    prior, prior_notes = remembered or find_prior(archive, settings, name, grid, described.class_names)
+    prior, prior_notes = found or find_prior(archive, settings, name, grid, described.class_names)
     if settings.prior != AUTO:  # what is meant when it is asked for again
         settings = replace(settings, prior=NONE if prior is None else prior.run)
+    said = (*notes, *zones.notes, *prior_notes, *look_notes, *model.notes(planning=planning), *outside, *label_notes)
     return SurveyRun(
         settings=settings,
         archive=archive,
@@ -244,17 +219,17 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
         scene=scene,
         planned=planned,
         described=described,
-        load=load,
-        weights_key=key,
+        load=model.load,
+        weights_key=model.key,
         grid=grid,
         plan=plan,
         scans=scans,
         zones=zones,
         look=look,
         prior=prior,
-        reader=reader,
+        reader=model.reader,
         familiar=familiar,
-        notes=(*notes, *zones.notes, *prior_notes, *look_notes, *sealing, *outside, *vgg_notes, *label_notes),
+        notes=said,
         refused=refused,
     )
 
@@ -265,57 +240,6 @@ def make_source(scene: RasterScene, settings: Settings) -> SimulatedSource:
     if settings.source == "sim" and settings.pointing_px:
         pointing = PointingErrors(offset_px=settings.pointing_px, jitter_px=0.0, seed=settings.seed)
     return SimulatedSource(scene, settings.simulated_rig, settings.seed, {}, name=settings.source, pointing=pointing)
-
-
-def _vgg_file(settings: Settings) -> VggFile | None:
-    if settings.vgg is None:
-        return None
-    return VggFile.found(Path(settings.vgg), trained=settings.policy == "vgg-trained")
-
-
-def weights_path(settings: Settings) -> Path:
-    """Where a survey's weights lie; the house's own for its scenes (SettingsError: none given for one's own scene)."""
-    if settings.weights is not None:
-        return Path(settings.weights)
-    if settings.scene not in BUILT_IN_SCENES:
-        raise SettingsError(
-            f"--weights is missing: the weights that come with SpectralZoom know the built-in farm only;"
-            f" train some for {settings.scene} with: spectralzoom train DATASET -o my.safetensors"
-        )
-    return shipped_weights()
-
-
-def shipped_weights() -> Path:
-    """The weights that come with the house."""
-    return Path(str(resources.files("models") / "shipped" / "farm.safetensors"))
-
-
-def _check_bands(scene: RasterScene, weights: Description, path: Path) -> None:
-    """Refuse weights of which no spectral column is reached by a band (WeightsError)."""
-    _, reached = weights.basis.matrix(scene.wavelength_nm)
-    if not reached.any():
-        low, high = weights.basis.low_nm, weights.basis.high_nm
-        raise WeightsError(
-            f"the weights {path.name} are for {low:.0f}-{high:.0f} nm; the scene's bands lie at"
-            f" {scene.wavelength_nm.min():.0f}-{scene.wavelength_nm.max():.0f} nm: use weights trained on such data"
-        )
-
-
-def _trained_on(described: Description, familiar: FamiliarFile | None) -> TrainedOn | None:
-    """What the weights were trained on, by their record, or by the file beside them; None where neither tells."""
-    if TRAINED_ON in described.record:
-        return TrainedOn.read(described.record[TRAINED_ON])
-    return None if familiar is None else familiar.trained_on
-
-
-def _asked_familiar(settings: Settings, familiar: FamiliarFile | None, path: Path) -> FamiliarFile | None:
-    """What is familiar, where pixels may be called unknown. Raises WeightsError: nobody knows it, but it is asked."""
-    if settings.unknown not in (UNKNOWN_AUTO, UNKNOWN_OFF) and familiar is None:
-        raise WeightsError(
-            f"--unknown {settings.unknown}: nobody measured what is familiar to {path.name}; do so with: spectralzoom"
-            f" train DATASET --familiar {path} -o {familiar_path(path)}, or leave --unknown out"
-        )
-    return None if settings.unknown == UNKNOWN_OFF else familiar
 
 
 def now() -> str:

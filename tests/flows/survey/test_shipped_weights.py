@@ -16,8 +16,9 @@ from flows.evaluate import command as evaluate_command
 from flows.evaluate.command import run_evaluate
 from flows.evaluate.frames import EvaluateRequest
 from flows.settings.load import load_settings
-from flows.survey.run import open_run, shipped_weights
+from flows.survey.run import open_run
 from flows.survey.stages.accuracy import columns_of_all_seats
+from flows.survey.survey_model import shipped_weights
 from models.evaluation.metrics import mean_iou
 from models.evaluation.placement import Controls, run_controls
 from models.reading.inference import glance

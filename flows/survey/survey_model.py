@@ -1,0 +1,123 @@
+"""The weights that a survey reads with, and what lies beside them: opened, and refused where it does not fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
+from flows.settings.values import UNKNOWN_AUTO, UNKNOWN_OFF
+from models.policies.vgg_file import VggFile
+from models.weights.familiar_files import FamiliarFile, describe_familiar, familiar_path, load_familiar
+from models.weights.files import (
+    Description,
+    Weights,
+    check_two_scale,
+    content_key,
+    describe_weights,
+    load_weights,
+    unsealed_note,
+)
+from models.weights.memory_files import ReaderFile, describe_reader, load_memory
+from models.weights.trained_on import TRAINED_ON, TrainedOn
+from pipeline.errors import SettingsError, WeightsError
+from pipeline.lazy import Once
+
+
+@dataclass(frozen=True)
+class SurveyModel:
+    """The weights of a survey, and what lies beside them."""
+
+    path: Path
+    described: Description
+    load: Once[Weights]
+    key: str
+    reader: ReaderFile | None
+    familiar: FamiliarFile | None
+    vgg: VggFile | None
+
+    @staticmethod
+    def open(settings: Settings, *, planning: bool) -> SurveyModel:
+        """Open those that the settings name; unless for ``planning`` all tensors are read.
+
+        Raises WeightsError: what is missing, does not go together, or is not as it was written; SettingsError: no
+        weights are named, and none come with the house for the scene.
+        """
+        path = weights_path(settings)
+        described, load = describe_weights(path), Once(lambda: load_weights(path))
+        check_two_scale(described.config, path)
+        key = content_key(path)
+        reader, familiar = describe_reader(path, described), describe_familiar(path, described, key)
+        model = SurveyModel(path, described, load, key, reader, familiar, vgg_file(settings))
+        if not planning:
+            load()
+            if reader is not None:
+                load_memory(reader.path, described)
+            if familiar is not None and settings.unknown != UNKNOWN_OFF:
+                load_familiar(path, described)
+            if model.vgg is not None:
+                model.vgg.saliency(load())  # refuses one that does not go with the weights
+        return model
+
+    def notes(self, *, planning: bool) -> tuple[str, ...]:
+        """What is to be said of these files."""
+        sealing = () if self.described.sealed else (unsealed_note(self.path),)
+        if self.vgg is None or planning:
+            return sealing
+        return (*sealing, f"VGG19 from {self.vgg.path.name}: {self.vgg.report()}")
+
+    def check_bands(self, wavelength_nm: NDArray[np.floating]) -> None:
+        """Refuse weights of which no spectral column is reached by a band (WeightsError)."""
+        weights = self.described
+        _, reached = weights.basis.matrix(wavelength_nm)
+        if not reached.any():
+            low, high = weights.basis.low_nm, weights.basis.high_nm
+            raise WeightsError(
+                f"the weights {self.path.name} are for {low:.0f}-{high:.0f} nm; the scene's bands lie at"
+                f" {wavelength_nm.min():.0f}-{wavelength_nm.max():.0f} nm: use weights trained on such data"
+            )
+
+    @property
+    def trained_on(self) -> TrainedOn | None:
+        """What the weights were trained on, by their record, or by the file beside them; None where neither tells."""
+        if TRAINED_ON in self.described.record:
+            return TrainedOn.read(self.described.record[TRAINED_ON])
+        return None if self.familiar is None else self.familiar.trained_on
+
+    def asked_familiar(self, settings: Settings) -> FamiliarFile | None:
+        """What is familiar, where pixels may be called unknown; WeightsError where it is asked and nobody knows it."""
+        if settings.unknown not in (UNKNOWN_AUTO, UNKNOWN_OFF) and self.familiar is None:
+            raise WeightsError(
+                f"--unknown {settings.unknown}: nobody measured what is familiar to {self.path.name}; do so with: "
+                f"spectralzoom train DATASET --familiar {self.path} -o {familiar_path(self.path)}, or leave --unknown"
+                " out"
+            )
+        return None if settings.unknown == UNKNOWN_OFF else self.familiar
+
+
+def weights_path(settings: Settings) -> Path:
+    """Where a survey's weights lie; the house's own for its scenes (SettingsError: none given for one's own scene)."""
+    if settings.weights is not None:
+        return Path(settings.weights)
+    if settings.scene not in BUILT_IN_SCENES:
+        raise SettingsError(
+            f"--weights is missing: the weights that come with SpectralZoom know the built-in farm only;"
+            f" train some for {settings.scene} with: spectralzoom train DATASET -o my.safetensors"
+        )
+    return shipped_weights()
+
+
+def shipped_weights() -> Path:
+    """The weights that come with the house."""
+    return Path(str(resources.files("models") / "shipped" / "farm.safetensors"))
+
+
+def vgg_file(settings: Settings) -> VggFile | None:
+    """VGG19 for the policies that ask it; None for the others."""
+    if settings.vgg is None:
+        return None
+    return VggFile.found(Path(settings.vgg), trained=settings.policy == "vgg-trained")
