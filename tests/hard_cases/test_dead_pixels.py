@@ -200,3 +200,16 @@ def test_21_the_pad_is_a_mirror_image():
         assert not (
             grid.valid_share().ravel()[np.setdiff1d(np.arange(grid.valid_share().size), grid.valid_seats())]
         ).any()
+
+
+def test_18_what_was_filled_is_not_called_seen():
+    """Columns are filled in where nothing was seen, so that the rest can be read; whoever compares looks gets NaN."""
+    weights, grid = plain_weights(), SceneGrid(48, 64, 8, 2)
+    values = _scene(24, 32)
+    values[8:16, 8:16] = np.nan
+    seen = look_coarsely(weights, [values], NM, grid)
+    assert np.isfinite(seen.columns).all()
+    unseen = np.isnan(seen.seen_columns).all(axis=-1)
+    assert unseen[8:16, 8:16].all()
+    assert unseen.sum() == 64
+    assert np.array_equal(seen.seen_columns[~unseen], seen.columns[~unseen])

@@ -25,10 +25,10 @@ pytestmark = pytest.mark.usefixtures("no_effects")
 
 RECORD = {
     "scenes": 3,
-    "steps": [1, 2],
+    "steps": [1, 2, 4],
     "exposures_ms": [25.0, 6.0],
-    "miou": [[0.99, 0.98], [0.97, 0.95]],
-    "per_class_iou": {"class_1": [[0.99, 0.97], [0.96, 0.94]]},
+    "miou": [[0.99, 0.98], [0.97, 0.95], [0.9, 0.8]],
+    "per_class_iou": {"class_1": [[0.99, 0.97], [0.96, 0.94], [0.9, 0.8]]},
 }
 WHOLE: dict[str, Any] = {"budget": None, "scan_step": "2", "scan_exposure_ms": "25", "name": "north"}
 PART: dict[str, Any] = {"budget": None, "look": "part", "prior": "latest", "name": "north", "seconds": "2.1"}
@@ -68,6 +68,7 @@ def test_a_part_is_looked_at_and_the_rest_remembered(visits: tuple[Path, Any, An
     out, first, part = visits
     look, age = part.receipt["look"], product(out, part, "belief").age.values
     assert 0.1 < look["share"] < 0.9
+    assert part.receipt["settings"]["scan_step"] < 4  # lines that are cheaper, and poorer than what is remembered
     assert part.receipt["savings"]["capture_s"]["done"] == pytest.approx(look["seconds"])
     assert look["seconds"] <= 2.1
     assert sorted(np.unique(age)) == [0.0, 3.0]

@@ -42,6 +42,14 @@ def test_a_look_is_worth_what_it_mends_of_each_class() -> None:
     assert worth[0] == pytest.approx(2 * worth[1])
 
 
+def test_of_doubts_a_share_comes_true() -> None:
+    """Where half do, half as many pixels are expected to be wrong, and a look mends less."""
+    strips = [(believed(0.6), np.zeros((8, 12)))]
+    whole, half = (SeatDoubts.of(strips, GRID, 3, come_true=share) for share in (1.0, 0.5))
+    assert half.expected_wrong() == pytest.approx(0.5 * whole.expected_wrong(), rel=whole.doubt[1] / whole.doubt[0] - 1)
+    assert 0 < half.worth(np.full(3, 0.1)).sum() < whole.worth(np.full(3, 0.1)).sum()
+
+
 def test_a_look_that_sees_worse_than_is_remembered_is_worth_nothing() -> None:
     """However much of the field it shows."""
     doubts = SeatDoubts.of([(believed(0.95), np.zeros((8, 12)))], GRID, 3)

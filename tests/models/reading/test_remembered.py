@@ -20,6 +20,7 @@ from models.reading.remembered import (
     Belief,
     Looked,
     Remembered,
+    carried,
     changed_shares,
     compare,
     faded,
@@ -286,3 +287,18 @@ def test_a_seat_counts_its_pixels_of_another_class() -> None:
     memory = Remembered(Belief(before, *np.zeros((2, 8, 16), np.float32)), None, 1.0)
     shares = changed_shares(memory, Belief(now, *np.zeros((2, 8, 16), np.float32)), 8)
     np.testing.assert_array_equal(shares, [[0.125, 0.0]])
+
+
+@READERS
+@given(seed=seeds)
+def test_a_memory_that_nobody_looks_at_is_carried(reader: MemoryReader | None, seed: int) -> None:
+    """It is what recalling it by a look that sees nothing gives: as sure of itself as before or less, and older."""
+    memory = a_memory(np.random.default_rng(seed))
+    today = carried(memory, reader)
+    assert np.allclose(np.exp(today.log_probability).sum(axis=-1), 1, atol=1e-4)
+    assert np.array_equal(today.age_days, memory.belief.age_days + np.float32(memory.days))
+    if reader is None:
+        assert (today.log_probability.max(axis=-1) <= memory.belief.log_probability.max(axis=-1) + 1e-6).all()
+        assert np.array_equal(today.classes()[0], memory.belief.classes()[0])
+    else:
+        assert not np.array_equal(today.log_probability, memory.belief.log_probability)
