@@ -65,7 +65,7 @@ class LookChoice:
 
 
 @dataclass(frozen=True)
-class _Wanted:
+class LookWorth:
     """What looks at the seats of a field are worth."""
 
     record: ScanRecord
@@ -116,7 +116,7 @@ def choose_look(
     there = grid.valid_share().ravel() > 0 if shown is None else shown
     strips, classes = _strips(prior, grid, reader, weights), len(weights.class_names)
     doubts = SeatDoubts.of(strips, grid, classes, come_true=1.0 if reader is None else COME_TRUE)
-    wanted = _Wanted(
+    wanted = LookWorth(
         ScanRecord.read(content), weights.class_names, doubts, there & _is_due(settings, prior, doubts), there
     )
     step, exposure_ms, look = _best_look(settings, grid, wanted, shown)
@@ -134,7 +134,9 @@ def choose_look(
     return chosen, choice, (f"{choice.sentence} ({scan_words(step, exposure_ms)})",)
 
 
-def _best_look(settings: Settings, grid: SceneGrid, wanted: _Wanted, shown: Mask | None) -> tuple[int, float, PartLook]:
+def _best_look(
+    settings: Settings, grid: SceneGrid, wanted: LookWorth, shown: Mask | None
+) -> tuple[int, float, PartLook]:
     """Step, exposure and lines of the look worth most, the cheapest of those that are as good but for `LOSS`."""
     record, camera, cost, seconds = wanted.record, settings.camera, settings.cost, settings.seconds
     assert seconds is not None  # checked with the settings

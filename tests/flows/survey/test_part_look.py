@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,12 @@ from rich.console import Console
 
 from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
 from flows.settings.load import load_settings
+from flows.survey.look_choice import LookWorth
+from models.reading.doubts import SeatDoubts
 from models.weights.files import save_weights, with_record
 from pipeline.errors import BudgetError, PipelineError, SettingsError, WeightsError
+from pipeline.geometry.grid import SceneGrid
+from pipeline.planning.plain_scans import ScanRecord
 from storage.archive.records import read_run
 from tests.conftest import RGB_NM, Survey, patchy_scene, random_weights
 from tests.remembered_work import without_effects
@@ -88,6 +93,7 @@ def test_receipt_and_page_say_what_was_looked_at(visits: tuple[Path, Any, Any]) 
     page = (part.folder / "report.html").read_text(encoding="utf-8")
     assert f"Lines {look['lines']} were looked at" in page
     assert "a part of the field was scanned once: every" in part.receipt["plan"]["reason"]
+    assert "such a scan scores about" not in page  # the record tells of scans of all, which remember nothing
     assert any("looks at" in note and "points of mIoU" in note for note in part.receipt["settings"]["notes"])
 
 
@@ -123,14 +129,33 @@ def test_of_a_field_that_nobody_knows_all_is_looked_at(survey_png: Survey, recor
 
 def test_what_is_due_is_looked_at_first(visited: Path, visits: Any, survey_png: Survey, recorded: Path) -> None:
     """With --refresh the lines that the visit before left out, and the notes count them."""
-    part = survey_png(visited, **{**PART, "refresh": "8d", "seconds": "2.4"}, visit=LAST, weights=str(recorded))
-    look, age = part.receipt["look"], product(visited, part, "belief").age.values
-    before = product(visited, visits[2], "belief").age.values
-    assert look["due"] > 0
-    assert look["due_left"] == 0
-    assert (age[before == 3.0] == 0).all()
+    flags = {**PART, "seconds": "2.1", "refresh": "8d", "weights": str(recorded)}
+    part = survey_png(visited, **flags, visit=LAST)
+    due, look = product(visited, visits[2], "belief").age.values == 3.0, part.receipt["look"]
+    assert (product(visited, part, "belief").age.values[due] < 1).any()
+    assert 0 < look["due"] - look["due_left"] < look["due"]
     notes = " ".join(part.receipt["settings"]["notes"])
-    assert f"{look['due']} of the {look['due']} seats that were due are among them" in notes
+    assert f"{look['due'] - look['due_left']} of the {look['due']} seats that were due are among them" in notes
+    page = " ".join((part.folder / "report.html").read_text(encoding="utf-8").split())
+    assert f"{look['due_left']} of {look['due']} seats that were due had to wait" in page
+
+
+def test_nothing_is_worth_more_than_what_is_due() -> None:
+    """A seat that is due counts more than all that the others gain; without gains the oldest counts most."""
+    grid = SceneGrid(4, 16, 4, 1)
+    belief, age = (
+        np.log([0.6, 0.4]) * np.ones((4, 16, 1)),
+        np.repeat([[1.0, 2.0, 3.0, 4.0]], 4, axis=0).repeat(4, axis=1),
+    )
+    doubts = SeatDoubts.of([(belief, age)], grid, 2)
+    record, all_seats = ScanRecord.read(RECORD), np.ones(4, bool)
+    wanted = LookWorth(record, ("class_0", "class_1"), doubts, np.array([False, True, False, False]), all_seats)
+    gains = wanted.gains(1, 25.0)
+    assert (gains > 0).all()
+    assert wanted.worth(gains)[1] > 10 * wanted.worth(gains)[[0, 2, 3]].sum()
+    nobody = replace(wanted, due=np.zeros(4, bool))
+    assert np.array_equal(nobody.worth(gains), gains)
+    assert np.argsort(nobody.worth(np.zeros(4))).tolist() == [0, 1, 2, 3]
 
 
 def test_what_is_beyond_another_fields_part_has_no_class(

@@ -12,11 +12,12 @@ from hypothesis import strategies as st
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import Axis, CostModel
+from pipeline.geometry.scan import Axis, CostModel, exposing
 from pipeline.planning.coverage import plain_sweeps
 from pipeline.planning.part_looks import SeatRows, cheapest_row_seconds, part_look, seats_shown, sweeps_of_runs
 
 GRID, CAMERA, COST = SceneGrid(320, 416, 16, 4), LineCamera(samples=160), CostModel()
+WIDER = LineCamera(samples=240)
 EXPOSURE_MS = 5.0
 
 
@@ -61,6 +62,38 @@ def test_no_run_of_the_same_sweep_is_worth_more_in_its_seconds(worth: np.ndarray
         for begin, end in combinations(range(len(values) + 1), 2):
             if stops[end - 1] - firsts[begin] <= stop - first:
                 assert values[begin:end].sum() <= taken * (1 + 1e-9)
+
+
+@given(worths, st.floats(0.65, 1.0))
+def test_no_other_runs_of_two_strips_are_worth_more(worth: np.ndarray, share: float) -> None:
+    """In no more seconds than were taken, set-ups included, where one load of the mirror's memory holds all lines."""
+    cost = CostModel(vector_pairs=100_000, capture_start_s=0.3)
+    rows = SeatRows.of(plain_sweeps(GRID, WIDER, "x", step=4, exposure_ms=EXPOSURE_MS), GRID, WIDER)
+    assert len(rows.sweeps) == 2
+    whole_s = cost.seconds(list(rows.sweeps), WIDER)
+    look = part_look(rows, worth**4, WIDER, cost, exposure_ms=EXPOSURE_MS, seconds=share * whole_s)
+    assert look is not None
+    sums, setup_s = rows.sums(worth**4), cost.setup_seconds(exposing(WIDER, rows.sweeps[0]))
+    line_s = exposing(WIDER, rows.sweeps[0]).frame_ms * 1e-3
+    options = []
+    for values, first, stop in zip(sums, rows.first, rows.stop, strict=True):
+        pairs = [(begin, end - 1) for begin, end in combinations(range(len(values) + 1), 2)]
+        runs = [(setup_s + line_s * (stop[end] - first[begin]), values[begin : end + 1].sum()) for begin, end in pairs]
+        options.append(np.array([(0.0, 0.0), *runs]))
+    seconds, values = (np.add.outer(options[0][:, one], options[1][:, one]) for one in (0, 1))
+    best = values[seconds + cost.reload_s <= look.seconds + 1e-9].max()
+    assert look.worth == pytest.approx(best)
+
+
+@pytest.mark.parametrize("along", ["x", "y"])
+def test_a_seat_that_two_strips_show_is_of_the_nearer(along: Axis) -> None:
+    """By how far its middle lies from the middle of their lines."""
+    rows = rows_of(along)
+    seats = GRID.valid_seats()
+    across = (GRID.seat_origin(seats) + GRID.patch / 2 - np.array([GRID.height, GRID.width]) / 2)[:, "yx".index(along)]
+    off = np.abs(across[:, None] - np.array([sweep.strip_px for sweep in rows.sweeps]))
+    own = off[np.arange(len(seats)), rows.row[seats] // rows.first.shape[1]]
+    assert (own <= off.min(axis=1) + 1).all()  # lines are turned by a pixel at most
 
 
 @given(worths, st.floats(0.02, 1.2))
