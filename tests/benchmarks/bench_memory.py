@@ -30,7 +30,16 @@ from flows.tradeoff.plans import plain_look
 from flows.training.look import chosen_effects
 from models.evaluation.metrics import confusion, mean_iou
 from models.reading.inference import segment
-from models.reading.remembered import Belief, Looked, Remembered, changed_shares, compare, first_belief, recall
+from models.reading.remembered import (
+    Belief,
+    Looked,
+    Remembered,
+    changed_from,
+    changed_shares,
+    compare,
+    first_belief,
+    recall,
+)
 from models.training.looks import REFERENCE_MS
 from models.weights.files import Weights, describe_weights, load_weights
 from models.weights.memory_files import MemoryWeights, load_memory, memory_path
@@ -211,7 +220,7 @@ def planted_changes() -> Iterator[Row]:
         now = _seen(changed, seed, QUICK)
         first = first_belief(before.looked)
         after = _later(before, first, now, 3.0)
-        told = changed_shares(Remembered(first, None, 3.0), after, patch) >= CHANGED_SHARE
+        told = changed_shares(changed_from(Remembered(first, None, 3.0), after), patch) >= CHANGED_SHARE
         for kind, place in places:
             covered = _shares(place, patch) >= 0.5
             hits.setdefault(kind, []).append(bool((told & covered).any()))
@@ -233,7 +242,7 @@ def other_light() -> Iterator[Row]:
             before, now = look_at_farm(seed, FIRST_DAY, early, ANEW), look_at_farm(seed, FIRST_DAY, late, QUICK, 1)
             first = first_belief(before.looked)
             after = _later(before, first, now, abs(late - early) / 24)
-            told = changed_shares(Remembered(first, None, 0.3), after, patch) >= CHANGED_SHARE
+            told = changed_shares(changed_from(Remembered(first, None, 0.3), after), patch) >= CHANGED_SHARE
             same = _shares(before.labels != now.labels, patch) == 0
             false, all_seats = false + int((told & same).sum()), all_seats + int(same.sum())
         share = false / all_seats
