@@ -8,17 +8,20 @@ and looked for three days later. Farms that no training saw, each with noise of 
 
 `python tests/benchmarks/bench_memory.py season` draws the season alone, `days` the visits after a few days, `changes`
 what was planted, `light` fields that did not change under another sun, `wrong` memories that are none of the field.
+`storage --size 128x96 --visits 3` says what so many visits to so small a farm store; alone it takes 640x512 px, ten.
 """
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
+from beside.stored_season import stored_rows
 from measure import Row
 from numpy.typing import NDArray
 from scipy.ndimage import rotate
@@ -65,6 +68,7 @@ SURE = 0.97
 PLANTED, PLANTED_SEEDS = 3, range(1, 10)  # changes of each kind on each land, and the lands
 LOW_SUN, HIGH_SUN = 6.2, 12.0  # hours of June 21 at which the sun stands at 20 and 61 degrees
 WRONG_SEEDS = (7, 8, 9)  # lands whose memories are of others, moved, turned or old: nothing was settled on them
+VISITS = 10  # of which it is measured what they store
 WORSE = 0.5  # points that a map may lose by a memory that is wrong
 Classes = NDArray[np.uint8]
 
@@ -132,7 +136,7 @@ def _unless_surer(before: Seen, now: Seen) -> Classes:
 
 def rows() -> list[Row]:
     """All figures."""
-    return [*after_days(), *season(), *planted_changes(), *other_light(), *wrong_memories()]
+    return [*after_days(), *season(), *planted_changes(), *other_light(), *wrong_memories(), *storage()]
 
 
 def after_days() -> Iterator[Row]:
@@ -351,19 +355,34 @@ def plant(
     return replace(scene, key=f"{scene.key}/planted", raster=SceneRaster.of(planes, labels)), places
 
 
-PARTS = {
+def storage(size_px: tuple[int, int] = SHAPE, visits: int = VISITS) -> Iterator[Row]:
+    """What the first visits of a season store, beside as many full scans."""
+    return stored_rows(size_px, SEASON[:visits], QUICK, REFERENCE)
+
+
+PARTS: dict[str, Callable[[], Iterator[Row]]] = {
     "days": after_days,
     "season": season,
     "changes": planted_changes,
     "light": other_light,
     "wrong": wrong_memories,
+    "storage": storage,
 }
 
 
 def main(arguments: Sequence[str]) -> int:
     """Print the rows of some parts."""
-    for name in arguments or PARTS:
-        for row in PARTS[name]():
+    parser = argparse.ArgumentParser(description="What a field's memory is worth, and what it stores.")
+    parser.add_argument("parts", nargs="*", metavar="part", help=f"some of {', '.join(PARTS)}; all where none is given")
+    parser.add_argument("--size", default=f"{SHAPE[1]}x{SHAPE[0]}", help="of the farm of the part storage [px]")
+    parser.add_argument("--visits", type=int, default=VISITS, help="of the part storage")
+    asked = parser.parse_args(arguments)
+    if unknown := set(asked.parts) - set(PARTS):
+        parser.error(f"no part {', '.join(sorted(unknown))}; there are {', '.join(PARTS)}")
+    columns, rows = map(int, asked.size.split("x"))
+    parts = PARTS | {"storage": partial(storage, (rows, columns), asked.visits)}
+    for name in asked.parts or parts:
+        for row in parts[name]():
             goal = "" if row.met is None else f", goal {row.goal}: {'met' if row.met else 'MISSED'}"
             print(f"{row.what}: {row.figure}{goal}", flush=True)
     return 0
