@@ -26,7 +26,8 @@ def test_changed_hectares_are_told_from_class_to_class() -> None:
     """Largest first; a pixel without a class today, as outside of zones, counts nothing."""
     now = np.array([[0, 0, 1, 1], [2, UNLABELLED, 2, 2]], np.uint8)
     old = np.array([[1, 255, 0, 0], [0, 0, 255, 255]], np.uint8)
-    legend = ("soil", "crop", "unknown"), np.zeros((3, 3), np.uint8)
+    names = "soil", "crop", "unknown", *(f"class_{number}" for number in range(3, 16))  # a pair is 255, too
+    legend = names, np.zeros((16, 3), np.uint8)
     found = changed_hectares(PLACE, old, ClassMap(now, np.ones(now.shape, np.float32), *legend))
     assert [(round(area, 6), *pair) for area, *pair in found] == [
         (0.02, "soil", "crop"),
