@@ -152,7 +152,11 @@ class OpenedRun:
 
     @property
     def ground_map(self) -> xarray.Dataset:
-        """Classes, confidence and picture on the map, where the survey had a ``[pose]``; its CRS in ``spatial_ref``."""
+        """All on the map, where the survey had a ``[pose]``; its CRS in ``spatial_ref``.
+
+        ``classes``, ``confidence`` and ``picture``; ``age`` [days], and of a later visit ``changed`` (share of the
+        patch) and ``changed_from`` (class before, 255 where it is the same).
+        """
         return self.dataset("ground_map")
 
     @property

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.archive.export_layers import ExportedRun
+from pipeline.geometry.grid import UNLABELLED
 from pipeline.products.areas import ShareEstimate, probable_shares, stratified_shares
 from storage.archive.whole_files import write_whole
 from storage.arrays.beliefs import BeliefStore
 from storage.arrays.ground_maps import open_image
-from storage.arrays.layout import SHARD_ROWS
 
 CSV = "text/csv"
 COLUMNS = (
@@ -86,10 +86,17 @@ def _estimate(run: ExportedRun, share: NDArray[np.float64]) -> tuple[ShareEstima
     if run.store("belief") is None:
         unknown = np.full(len(share), np.nan)
         return ShareEstimate(unknown, unknown), ""
+    return probable_shares(_probabilities(run, len(share)), len(share)), "probabilities"
+
+
+def _probabilities(run: ExportedRun, count: int) -> Iterator[NDArray[np.float32]]:
+    """What is believed of the pixels with a class, (y, x, class); of those called unknown that they are, for sure."""
     store = BeliefStore(run.path("belief"))
-    return probable_shares(_probabilities(store), len(share)), "probabilities"
-
-
-def _probabilities(store: BeliefStore) -> Iterator[NDArray[np.float32]]:
-    for first in range(0, store.shape[0], SHARD_ROWS):
-        yield np.exp(store.read(slice(first, first + SHARD_ROWS))[0])
+    for first, drawn in open_image(run.path("class_map"), "classes").rows():
+        values = np.exp(store.read(slice(first, first + len(drawn)))[0])
+        known = values.shape[-1]
+        values = np.pad(values, [(0, 0), (0, 0), (0, count - known)])
+        values[drawn == UNLABELLED] = np.nan
+        unknown = (drawn >= known) & (drawn != UNLABELLED)
+        values[unknown] = np.arange(count) == drawn[unknown, None]
+        yield values

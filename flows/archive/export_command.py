@@ -15,6 +15,7 @@ from rich.markup import escape
 
 from flows.archive.export_areas import CSV, write_areas
 from flows.archive.export_layers import ExportedRun, Layer, Rows, map_layers, open_exported, seen_rows
+from flows.archive.export_memory import memory_layers
 from flows.archive.export_spectra import spectral_layers
 from flows.archive.export_styles import write_layer_style
 from flows.archive.export_zones import check_zones, write_zones
@@ -106,7 +107,7 @@ def run_export(
     out = check_outside(out, opened.archive.root)
     about = describe_collection(opened)
     choice = check_zones(opened, choice)
-    layers = [*map_layers(opened), *spectral_layers(opened, choice)]
+    layers = [*map_layers(opened), *memory_layers(opened), *spectral_layers(opened, choice)]
     export = Export(opened, out)
     try:
         with _alone_in(out):
@@ -251,7 +252,7 @@ def name_stores(export: Export) -> None:
         "patches": ("Fine patches", nowhere),
     }
     if run.geobox is not None and run.map_product == "ground_map":
-        stores["ground_map"] = ("Class map, confidence and picture on the map", projection(run.geobox))
+        stores["ground_map"] = ("Class map, picture and what is remembered, on the map", projection(run.geobox))
     for product, (title, fields) in stores.items():
         if run.store(product) is not None:
             path = root / run.receipt["products"][product]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
 from flows.publish.receipt import Receipt, check_receipt
-from flows.survey.stages.maps import coarse_colours
+from flows.survey.stages.on_ground import coarse_colours
 from pipeline.errors import IncompleteStoreError, SettingsError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.georeference import zoomed_out
@@ -118,21 +118,16 @@ def map_layers(run: ExportedRun) -> list[Layer]:
     about = open_image(run.path(product), "classes").about
     colours = np.array(about.get("class_colours", ()), np.uint8).reshape(-1, 3)
     legend = ClassNames(tuple(about.get("class_names", ())), colours)
-    drawn = _layer(run, product, "classes", ("class",), nodata=UNLABELLED, legend=legend)
-    sure = _layer(run, product, "confidence", ("confidence",), nodata=np.nan)
-    seen = _picture(run) if product == "class_map" else _layer(run, product, "picture", RGB, nodata=0)
-    score = _of_seats(run, "attention", "score", ("score",))
-    layers = [
+    drawn = image_layer(run, product, "classes", ("class",), nodata=UNLABELLED, legend=legend)
+    sure = image_layer(run, product, "confidence", ("confidence",), nodata=np.nan)
+    seen = _picture(run) if product == "class_map" else image_layer(run, product, "picture", RGB, nodata=0)
+    score = seat_layer(run, "attention", "score", ("score",))
+    return [
         Layer("class_map", "Class map", ("data",), *drawn, fields=classes(legend)),
         Layer("confidence", "Probability of the class given", ("data", "confidence"), *sure, "1"),
         Layer("attention", "Worth of a fine look, by seat", ("data",), *score, "1"),
         Layer("rgb", "Picture of the coarse look", ("visual", "overview"), *seen),
     ]
-    memory = run.receipt.get("memory")
-    if memory is not None and memory["put_aside"] is None:
-        title = "Share of pixels with another class than remembered, by seat"
-        layers.append(Layer("changed", title, ("data",), *_of_seats(run, "belief", "changed", ("changed",)), "1"))
-    return layers
 
 
 def layer_tags(run: ExportedRun, product: str, place: Place) -> dict[str, str]:
@@ -156,7 +151,7 @@ def _place(run: ExportedRun, stored: StoredImage) -> Place:
     return Place(tuple(float(number) for number in transform))
 
 
-def _layer(
+def image_layer(
     run: ExportedRun,
     product: str,
     array: str,
@@ -165,6 +160,7 @@ def _layer(
     nodata: float,
     legend: ClassNames | None = None,
 ) -> tuple[CogImage, Callable[[], Rows]]:
+    """An image of a store as it stands there, on the store's own grid."""
     stored = open_image(run.path(product), array)
     place = _place(run, stored)
     shape = (stored.shape[0], stored.shape[1])
@@ -172,7 +168,7 @@ def _layer(
     return image, stored.rows
 
 
-def _of_seats(
+def seat_layer(
     run: ExportedRun, product: str, array: str, bands: tuple[str, ...]
 ) -> tuple[CogImage, Callable[[], Rows]]:
     """A figure of each seat, on the grid of the scene that their size in pixels gives."""

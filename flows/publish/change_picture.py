@@ -19,7 +19,7 @@ from flows.survey.memory import Prior
 from flows.terminal.figures import counted
 from pipeline.geometry.grid import UNLABELLED
 from storage.archive.keys import StageRef
-from storage.arrays.beliefs import DAY_STEP, NEVER, BeliefStore
+from storage.arrays.beliefs import BeliefStore
 from storage.arrays.class_maps import ClassNames
 from storage.arrays.layout import open_group, read_array
 
@@ -51,13 +51,11 @@ def remembered(prior: Prior | None, drawn: StageRef, receipt: Receipt) -> Earlie
     for number, earlier in enumerate(prior.classes):
         if earlier >= 0:
             names[earlier] = number
-    belief = drawn.path / "belief.zarr"
-    changed = BeliefStore(belief).changed()
+    belief = BeliefStore(drawn.path / "belief.zarr")
+    changed = belief.changed()
     assert changed is not None
-    ages = read_array(open_group(belief), "age")  # packed: all of a belief is many times as much
-    days = np.where(ages == NEVER, np.nan, ages * np.float32(DAY_STEP)).astype(np.float32)
     before = read_array(open_group(prior.belief.path / "class_map.zarr"), "classes")
-    return EarlierLook(prior.run, prior.days, names[before], changed, days)
+    return EarlierLook(prior.run, prior.days, names[before], changed, belief.age())
 
 
 def change_pictures(

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from flows.publish.ground_findings import ground_words
 from flows.publish.receipt import Accuracy, Receipt, Savings, is_pending
 from flows.publish.zone_findings import plot_rows, zone_words
 from flows.survey.scores import SHOWN, SHOWN_WORDS, definitions_differ, false_class_words, worst_class_words
@@ -181,10 +182,7 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
     if "zones" in found:
         words.append(zone_words(found["zones"]))
     if "ground" in found:
-        ground = found["ground"]
-        areas = [f"{name.replace('_', ' ')} {area_words(area)}" for name, area in ground["areas_ha"].items() if area]
-        place = f"{ground['crs']}, {ground['resolution_m']:.4g} m a pixel"
-        words.append(f"On the ground ({place}) the classes cover {', '.join(areas)}.")
+        words.append(ground_words(found["ground"]))
     return words
 
 

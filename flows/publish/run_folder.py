@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from flows.archive.field_figures import field_figures
 from flows.publish.change_picture import change_pictures, remembered
-from flows.publish.ground_findings import placed_findings, posed_findings
+from flows.publish.ground_findings import find_ground
 from flows.publish.panels import draw_ground
 from flows.publish.quicklook import QuicklookData, draw_quicklook
 from flows.publish.receipt import AccuracyIs, Header, Receipt, build_receipt, check_receipt, with_accuracy
@@ -34,7 +34,8 @@ from flows.survey.stages.accuracy import load_accuracy
 from flows.survey.stages.attention import load_orientation, load_plan
 from flows.survey.stages.capture import captured
 from flows.survey.stages.effects import load_manifest
-from flows.survey.stages.maps import STORE, strange_pixels
+from flows.survey.stages.maps import strange_pixels
+from flows.survey.stages.on_ground import STORE
 from flows.survey.stages.placement import SEATS_AT_ONCE, line_facts, load_registration, seen_shares
 from flows.survey.survey import STAGES, Products, StageRunner
 from pipeline.errors import IncompleteStoreError
@@ -48,6 +49,7 @@ from storage.archive.keys import StageRef
 from storage.archive.records import StageRecord, read_run
 from storage.archive.run_folders import RunDraft
 from storage.archive.whole_files import to_json
+from storage.arrays.beliefs import BeliefStore
 from storage.arrays.class_maps import load_class_map, load_class_names
 from storage.arrays.cubes import RawCube
 from storage.arrays.ground_maps import load_ground_map
@@ -305,11 +307,10 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
         pointing["fine"]["partly_seen"] = int(np.count_nonzero(seen_shares(run, products.of("cut_patches")) < 1))
     if pointing:
         found["pointing"] = {"prior_px": run.settings.pointing_px, **pointing}
-    for ground_map in products.there(["ground"]):
-        found["ground"] = posed_findings(load_ground_map(ground_map.path / STORE))
     class_map = products.of("draw_map")
     drawn = load_class_map(class_map.path / "class_map.zarr")
-    found |= placed_findings(run, drawn) | find_zones(run, drawn)
+    posed = next((load_ground_map(ref.path / STORE) for ref in products.there(["ground"])), None)
+    found |= find_ground(run, posed, drawn, BeliefStore(class_map.path / "belief.zarr")) | find_zones(run, drawn)
     unclassed = drawn.classes == UNLABELLED
     if (rate := run.settings.unknown_rate) is not None and run.familiar is not None:
         count = int(np.count_nonzero(drawn.classes == run.described.config.classes))

@@ -16,7 +16,7 @@ from flows.publish.page_spectra import PageSpectra, page_spectra
 from flows.publish.quicklook import QuicklookData, colours_of
 from flows.publish.receipt_table import days_words
 from flows.survey.run import SurveyRun
-from flows.survey.stages.maps import survey_grid
+from flows.survey.stages.on_ground import survey_grid
 from flows.survey.survey import Products
 from flows.terminal.figures import counted, format_seconds
 from pipeline.geometry.scan import Sweep, exposing

@@ -24,7 +24,7 @@ from models.reading.remembered import (
     Looked,
     MemoryAgreement,
     Remembered,
-    changed_shares,
+    changed_from,
     compare,
     first_belief,
     in_classes,
@@ -33,7 +33,7 @@ from models.reading.remembered import (
 from models.weights.files import Weights
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.rectify.registration.field_shift import FieldShift, field_shift
-from storage.arrays.beliefs import BeliefStore, write_belief_tile
+from storage.arrays.beliefs import BeliefStore, write_belief_tile, write_changes_tile
 from storage.arrays.class_maps import write_class_tile
 from storage.arrays.mosaics import mosaic_brightness, open_patches
 from storage.arrays.tile_work import let_tiles_go
@@ -76,7 +76,7 @@ class Drawing:
         del columns  # a memory takes their room
         looked = self._looked(region, self._within_zones(region, drawn.log_probability), seats, seen)
         classes, confidence = drawn.classes, drawn.confidence
-        comparison, changed = None, None
+        comparison, old = None, None
         if self.memory is None:
             after = first_belief(looked)
             if self.part:
@@ -86,14 +86,16 @@ class Drawing:
             after = recall(remembered, looked, self.weights.load_reader())
             classes, confidence = after.classes()
             comparison = compare(remembered, looked, after, region.kept_here)
-            changed = changed_shares(remembered, after, region.grid.patch)
+            old = changed_from(remembered, after)
         if self.unknown is not None and unknown is not None:
             classes[unknown], confidence[unknown] = self.unknown.number, np.nan
         origin = region.kept.top, region.kept.left
+        if old is not None:
+            write_changes_tile(self.belief, origin, region.crop(old))
         write_class_tile(self.out, origin, region.crop(classes), region.crop(confidence))
         write_belief_tile(self.belief, origin, *map(region.crop, (after.log_probability, after.age_days, after.light)))
         coarse = 0 if seen.strange is None else int(np.count_nonzero(region.crop_coarse(seen.strange)))
-        return Drawn((coarse, int(region.crop_seats(strange).sum())), comparison, changed)
+        return Drawn((coarse, int(region.crop_seats(strange).sum())), comparison)
 
     def _within_zones(self, region: Region, log_probability: NDArray[np.float32]) -> NDArray[np.float32]:
         """Today's look, (y, x, class), with nothing said of pixels that zones leave out: a memory of them stays."""
@@ -205,7 +207,6 @@ class Drawn:
 
     strange: Strange
     comparison: MemoryAgreement | None  # with what was remembered
-    changed: NDArray[np.float32] | None  # (seat_y, seat_x) of the region's scene
 
 
 @dataclass(frozen=True)
@@ -214,7 +215,6 @@ class DrawnField:
 
     strange: Strange
     comparison: MemoryAgreement | None  # with what was remembered; None of a field's first look
-    changed: NDArray[np.float32] | None  # (seat_y, seat_x) share of pixels with another class than remembered
 
 
 def draw_field(field: FieldWork, work: Drawing, report: Callable[[float], None]) -> DrawnField:
@@ -230,15 +230,7 @@ def draw_field(field: FieldWork, work: Drawing, report: Callable[[float], None])
     parts: list[Drawn] = run_blocks(work, field.regions, crew, report=report, paths=paths)
     strange = sum(part.strange[0] for part in parts), sum(part.strange[1] for part in parts)
     compared = [part.comparison for part in parts if part.comparison is not None]
-    changed = None
-    if compared:
-        changed = np.zeros(field.regions[0].field.seat_shape, np.float32)
-        for region, part in zip(field.regions, parts, strict=True):
-            assert part.changed is not None
-            whole = np.zeros(region.grid.seat_shape, np.float32)
-            whole[: part.changed.shape[0], : part.changed.shape[1]] = part.changed
-            changed[region.kept_seats.rows, region.kept_seats.columns] = region.crop_seats(whole)
-    return DrawnField(strange, reduce(add, compared) if compared else None, changed)
+    return DrawnField(strange, reduce(add, compared) if compared else None)
 
 
 REACH_PX = 64.0  # within which a memory that lies beside today's look is found

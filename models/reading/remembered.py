@@ -286,13 +286,18 @@ def _counted(rows: NDArray[np.intp], columns: NDArray[np.intp], classes: int) ->
     return np.bincount(rows * classes + columns, minlength=classes**2).reshape(classes, classes).astype(np.int64)
 
 
-def changed_shares(memory: Remembered, after: Belief, patch: int) -> Floats:
-    """Share of each seat's pixels that memory and map are sure of and give another class, (seat_y, seat_x)."""
+def changed_from(memory: Remembered, after: Belief) -> NDArray[np.uint8]:
+    """The class that a pixel (y, x) had where memory and map are sure of two different ones; 255 everywhere else."""
     before, now = memory.belief.log_probability, after.log_probability
     least = math.log(CERTAIN)
     sure = (before.max(axis=-1) > least) & (now.max(axis=-1) > least)  # NaN is not
-    other = sure & (np.nan_to_num(before, nan=-9).argmax(axis=-1) != np.nan_to_num(now, nan=-9).argmax(axis=-1))
-    y, x = (-(-size // patch) * patch for size in other.shape)
-    padded = np.pad(other, [(0, y - other.shape[0]), (0, x - other.shape[1])])
+    old, new = (np.nan_to_num(values, nan=-9).argmax(axis=-1) for values in (before, now))
+    return np.where(sure & (old != new), old, UNLABELLED).astype(np.uint8)
+
+
+def changed_shares(old: NDArray[np.uint8], patch: int) -> Floats:
+    """Share of each seat's pixels that ``old`` of `changed_from` has a class for, (seat_y, seat_x)."""
+    y, x = (-(-size // patch) * patch for size in old.shape)
+    padded = np.pad(old != UNLABELLED, [(0, y - old.shape[0]), (0, x - old.shape[1])])
     shares: Floats = padded.reshape(y // patch, patch, x // patch, patch).mean(axis=(1, 3), dtype=np.float32)
     return shares

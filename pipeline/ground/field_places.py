@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.errors import ShapeError
 from pipeline.ground.field_scale import FieldScale, scale_of_angles, scale_of_pixels, scale_of_view
 from pipeline.ground.georeference import pixel_rows_m2, pixel_side_m
 from pipeline.ground.map_grid import GroundGrid
-from pipeline.ground.view import GroundView, pixel_places
+from pipeline.ground.view import ROWS_AT_ONCE, GroundView, pixel_places
 from pipeline.lazy import deferred
 
 if TYPE_CHECKING:
@@ -57,6 +58,25 @@ class FieldPlace(Protocol):
 
     def scale(self, ifov_rad: float) -> FieldScale:
         """Tell how large the field is and how finely it is seen."""
+
+
+def areas_by_number(place: FieldPlace, numbers: NDArray[np.integer], count: int) -> Floats | None:
+    """Sum the ground under a field's pixels by their (y, x) numbers, (count,) [m2]; None where nobody knows it.
+
+    Pixels with a number below 0 or from ``count`` on are left out, and those that show no ground. Raises ShapeError:
+    there is not one number a pixel.
+    """
+    if numbers.shape != place.shape:
+        raise ShapeError(f"expected the numbers of a field of {place.shape} px (y, x), got {numbers.shape}")
+    areas = np.zeros(count)
+    for first in range(0, len(numbers), ROWS_AT_ONCE):
+        rows = slice(first, min(first + ROWS_AT_ONCE, len(numbers)))
+        ground = place.pixel_areas_m2(rows, slice(0, numbers.shape[1]))
+        if ground is None:
+            return None
+        counted = (numbers[rows] >= 0) & (numbers[rows] < count) & np.isfinite(ground)
+        areas += np.bincount(numbers[rows][counted], ground[counted], count)
+    return areas
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,6 +30,7 @@ else:
     pyproj = deferred("pyproj")
 
 Floats = NDArray[np.float64]
+Pixel = TypeVar("Pixel", bound=np.generic)
 
 WGS84 = 4326
 UTM_LATITUDES = (-80.0, 84.0)
@@ -308,12 +309,15 @@ def map_blocks(shape: tuple[int, int], block: tuple[int, int]) -> Iterator[tuple
             yield slice(top, min(top + block[0], shape[0])), slice(left, min(left + block[1], shape[1]))
 
 
-def classes_at(classes: NDArray[np.uint8], pixels: Floats) -> NDArray[np.uint8]:
-    """Read a class map (y, x) at image places (row, column, 2): the nearest pixel's class, 255 where NaN."""
+def nearest_at(image: NDArray[Pixel], pixels: Floats, nothing: float, *, factor: int = 1) -> NDArray[Pixel]:
+    """Read an image (y, x) of pixels ``factor`` scene px wide at scene places (row, column, 2): the pixel there.
+
+    ``nothing`` where the place is NaN.
+    """
     known: NDArray[np.bool_] = np.all(np.isfinite(pixels), axis=-1)
-    last = np.array(classes.shape) - 1
-    index = np.clip(np.floor(np.where(known[..., None], pixels, 0) + 0.5).astype(np.intp), 0, last)
-    return np.where(known, classes[index[..., 0], index[..., 1]], np.uint8(UNLABELLED))
+    last = np.array(image.shape) - 1
+    index = np.clip(np.floor((np.where(known[..., None], pixels, 0) + 0.5) / factor).astype(np.intp), 0, last)
+    return np.where(known, image[index[..., 0], index[..., 1]], image.dtype.type(nothing))
 
 
 def image_at(image: NDArray[np.float32], pixels: Floats, *, factor: int = 1) -> NDArray[np.float32]:

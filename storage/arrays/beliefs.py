@@ -14,7 +14,8 @@ import zarr
 from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
-from storage.arrays.class_maps import ClassNames, legend_of
+from pipeline.geometry.grid import UNLABELLED
+from storage.arrays.class_maps import ClassNames, class_flags, legend_of
 from storage.arrays.georeference import create_placed_group
 from storage.arrays.layout import (
     SHARD_ROWS,
@@ -34,11 +35,18 @@ DAY_STEP, NEVER = 0.125, 65535
 OCTAVE_STEP, DARKEST, DARK = 0.0625, -10.0, 255  # log2 of reference exposures; 255 where there was no light
 # what the images of a pixel hold of which nothing is known
 UNKNOWN = {"log_probability": NOTHING, "age": NEVER, "log2_light": DARK}
+OLD_CLASS = "changed_from"
+CHANGED = {"long_name": "share of the patch's pixels with another class than remembered", "units": "1"}
 Floats = NDArray[np.float32]
 
 
-def create_belief(path: Path, shape: tuple[int, int], legend: ClassNames, *, grid: AngularGrid | None = None) -> None:
-    """Begin a store for a field of (y, x) ``shape`` of which nothing is known yet."""
+def create_belief(
+    path: Path, shape: tuple[int, int], legend: ClassNames, *, grid: AngularGrid | None = None, goes_on: bool = False
+) -> None:
+    """Begin a store for a field of (y, x) ``shape`` of which nothing is known yet.
+
+    Where it ``goes_on`` from an earlier one there is also what its pixels were, where they changed: `OLD_CLASS`.
+    """
     names = {"class_names": list(legend.names), "class_colours": np.asarray(legend.colours).tolist()}
     group, place = create_placed_group(path, "belief", grid, shape, names)
     write_counts(group, **{"class": len(legend.names)})
@@ -57,6 +65,14 @@ def create_belief(path: Path, shape: tuple[int, int], legend: ClassNames, *, gri
     about = {"long_name": "log2 of the reference exposures that it rests on", "units": "1", "_FillValue": DARK, **place}
     packing = {"scale_factor": OCTAVE_STEP, "add_offset": DARKEST}
     create_array(group, "log2_light", image_spec(("y", "x"), shape, "|u1"), {**about, **packing})
+    if goes_on:
+        create_array(group, OLD_CLASS, image_spec(("y", "x"), shape, "|u1"), {**old_class_flags(legend), **place})
+
+
+def old_class_flags(legend: ClassNames) -> dict[str, Any]:
+    """CF's flag attributes of an image of the classes that pixels had before."""
+    words = f"class remembered, where the map is sure of another one; {UNLABELLED} everywhere else"
+    return {**class_flags(legend.names, legend.colours), "long_name": words}
 
 
 def write_belief_tile(
@@ -88,16 +104,35 @@ def write_belief_tile(
     arrays[2][place] = np.where(light > 0, packed, DARK).astype(np.uint8)
 
 
+def write_changes_tile(path: Path, origin: tuple[int, int], old_class: NDArray[np.uint8]) -> None:
+    """Store (y, x) classes that pixels had, 255 where they have them still, of whole shards from ``origin`` on.
+
+    Raises ChunkError: the tile splits a shard; IncompleteStoreError: the store goes on from none, or is not there.
+    """
+    with damage_named(f"{path}/{OLD_CLASS}"):
+        array = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)[OLD_CLASS]
+        assert isinstance(array, zarr.Array)
+    place = tuple(slice(first, first + size) for first, size in zip(origin, old_class.shape, strict=True))
+    whole_shards("the belief", place, array.shape, array.shards or ())
+    array[place] = old_class
+
+
+def drop_changes(path: Path) -> None:
+    """Take out of a belief what its pixels were: it goes on from none after all."""
+    with damage_named(str(path)):
+        del zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)[OLD_CLASS]
+
+
 def write_changes(path: Path, changed: Floats, patch_px: int) -> None:
     """Add (seat_y, seat_x) shares of pixels that changed to a stored belief; a seat has ``patch_px`` a side."""
     with damage_named(str(path)):
         group = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
-    about: dict[str, Any] = {
-        "long_name": "share of the patch's pixels with another class than remembered",
-        "units": "1",
-    }
-    about["patch_px"] = patch_px
-    write_image(group, "changed", ("seat_y", "seat_x"), changed, about)
+    write_image(group, "changed", ("seat_y", "seat_x"), changed, {**CHANGED, "patch_px": patch_px})
+
+
+def unpacked_days(packed: NDArray[np.uint16]) -> Floats:
+    """Days of stored ages; NaN where nothing is known."""
+    return np.where(packed == NEVER, np.float32(np.nan), packed * np.float32(DAY_STEP)).astype(np.float32)
 
 
 class BeliefStore:
@@ -122,11 +157,18 @@ class BeliefStore:
         values = (packed * np.float32(STEP) + np.float32(FAINTEST)).astype(np.float32)
         values -= np.log(np.exp(values).sum(axis=-1, keepdims=True))
         values[packed == NOTHING] = np.nan
-        age = read_array(self._group, "age", np.s_[rows, columns])
-        days: Floats = np.where(age == NEVER, np.nan, age * np.float32(DAY_STEP)).astype(np.float32)
+        days = self.age(rows, columns)
         packed_light = read_array(self._group, "log2_light", np.s_[rows, columns])
         light = np.exp2(packed_light * np.float32(OCTAVE_STEP) + np.float32(DARKEST))
         return values, days, np.where(packed_light == DARK, 0, light).astype(np.float32)
+
+    def age(self, rows: slice = slice(None), columns: slice = slice(None)) -> Floats:
+        """(y, x) days since a pixel was looked at; NaN where nothing is known."""
+        return unpacked_days(read_array(self._group, "age", np.s_[rows, columns]))
+
+    def old_class(self) -> NDArray[np.uint8] | None:
+        """(y, x) class that a pixel had where it has another now, else 255; None of a first look."""
+        return read_array(self._group, OLD_CLASS) if OLD_CLASS in self._group else None
 
     @property
     def patch_px(self) -> int:

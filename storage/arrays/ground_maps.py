@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import IncompleteStoreError, ShapeError
 from pipeline.ground.field_scale import M2_PER_HECTARE
+from storage.arrays.beliefs import CHANGED, OLD_CLASS, old_class_flags
 from storage.arrays.class_maps import CONFIDENCE, ClassNames, check_named, class_flags, legend_of
 from storage.arrays.georeference import ON_THE_MAP, geobox_of_group, load_geobox, map_attributes, write_map_coordinates
 from storage.arrays.layout import (
@@ -34,6 +35,8 @@ from storage.arrays.layout import (
 if TYPE_CHECKING:
     from odc.geo.geobox import GeoBox
 
+PICTURE = "picture"
+NUMBERED = {"classes", OLD_CLASS}
 BLOCK = (4 * SHARD_ROWS, 2 * SHARD_COLUMNS)  # (y, x) px to write at a time: whole shards
 
 
@@ -90,50 +93,48 @@ class GroundMap:
     legend: ClassNames
     geobox: GeoBox
     areas: dict[str, dict[str, float]]  # of each class: m2, ha, share of the classified area
+    age_days: NDArray[np.float32]  # (y, x) since a pixel was looked at, NaN where not seen
+    changed: NDArray[np.float32] | None  # (y, x) share of its patch that changed, NaN where not seen; None at first
+    old_class: NDArray[np.uint8] | None  # (y, x) class remembered where it is another now, else 255; None at first
 
 
 class GroundMapWriter:
     """Write a map block by block, so that it never has to be in memory as a whole."""
 
-    def __init__(self, path: Path, geobox: GeoBox, legend: ClassNames, *, about: Mapping[str, Any]) -> None:
+    def __init__(
+        self, path: Path, geobox: GeoBox, legend: ClassNames, *, about: Mapping[str, Any], goes_on: bool = False
+    ) -> None:
+        """Begin a map; one of a survey that ``goes_on`` from an earlier one has images of what changed as well."""
         place = map_attributes(geobox)
         names = {"class_names": list(legend.names), "class_colours": np.asarray(legend.colours).tolist()}
         self._group = create_group(path, "class map on the ground", {**place, **names, **about})
         write_map_coordinates(self._group, geobox)
         self._shape, self._legend = tuple(geobox.shape), legend
-        dims, shape = ("y", "x"), self._shape
-        about_classes = {**class_flags(legend.names, legend.colours), **place, **ON_THE_MAP}
-        self._classes = create_array(self._group, "classes", image_spec(dims, shape, "|u1"), about_classes)
-        words = {**CONFIDENCE, **place, **ON_THE_MAP}
-        self._confidence = create_array(self._group, "confidence", image_spec(dims, shape, "<f4"), words)
-        words = {"long_name": "picture for viewers, red green blue; 0 not seen", **place, **ON_THE_MAP}
-        spec = image_spec((*dims, "rgb"), (*shape, 3), "|u1")
-        self._picture = create_array(self._group, "picture", spec, words)
+        self._images = {
+            name: self._begin(name, kind, {**words, **place, **ON_THE_MAP})
+            for name, (kind, words) in _images_of(legend, goes_on=goes_on).items()
+        }
 
-    def write_block(
-        self,
-        rows: slice,
-        columns: slice,
-        classes: NDArray[np.uint8],
-        confidence: NDArray[np.float32],
-        picture: NDArray[np.uint8],
-    ) -> None:
-        """Store one block.
+    def _begin(self, name: str, dtype: str, about: Mapping[str, Any]) -> zarr.Array[Any]:
+        rest = {"rgb": 3} if name == PICTURE else {}
+        spec = image_spec(("y", "x", *rest), (*self._shape, *rest.values()), dtype)
+        return create_array(self._group, name, spec, about)
 
-        Raises ShapeError: the block's arrays do not fit its place, or a class has no name. ChunkError: the block splits
-        a shard.
+    def write_block(self, rows: slice, columns: slice, images: Mapping[str, NDArray[np.generic]]) -> None:
+        """Store one block of all images, by name.
+
+        Raises ShapeError: an image lacks or does not fit its place, or a class has no name. ChunkError: the block
+        splits a shard.
         """
         size = (rows.stop - rows.start, columns.stop - columns.start)
-        if not (classes.shape == confidence.shape == picture.shape[:2] == size):
-            raise ShapeError(
-                f"block {size} (y, x) got classes {classes.shape}, confidence {confidence.shape} and picture "
-                f"{picture.shape}; give one value a pixel"
-            )
+        if set(images) != set(self._images) or any(image.shape[:2] != size for image in images.values()):
+            came = ", ".join(f"{name} {image.shape}" for name, image in images.items())
+            raise ShapeError(f"block {size} (y, x) got {came}; give {', '.join(self._images)}, one value a pixel")
         whole_shards("the map", (rows, columns), self._shape, (SHARD_ROWS, SHARD_COLUMNS))
-        check_named(classes, len(self._legend.names))
-        self._classes[rows, columns] = classes
-        self._confidence[rows, columns] = confidence
-        self._picture[rows, columns] = picture
+        for name in NUMBERED & set(images):
+            check_named(np.asarray(images[name], np.uint8), len(self._legend.names))
+        for name, image in images.items():
+            self._images[name][rows, columns] = image
 
     def finish(self, areas_m2: NDArray[np.float64]) -> None:
         """Store the area of each class (class,) beside the map: m2, ha and share of the classified area."""
@@ -142,6 +143,18 @@ class GroundMapWriter:
             name: {"m2": m2, "ha": m2 / M2_PER_HECTARE, "share": m2 / total}
             for name, m2 in zip(self._legend.names, areas_m2.tolist(), strict=True)
         }
+
+
+def _images_of(legend: ClassNames, *, goes_on: bool) -> dict[str, tuple[str, Mapping[str, Any]]]:
+    """Type and attributes of every image of a map, by name."""
+    images: dict[str, tuple[str, Mapping[str, Any]]] = {
+        "classes": ("|u1", class_flags(legend.names, legend.colours)),
+        "confidence": ("<f4", CONFIDENCE),
+        PICTURE: ("|u1", {"long_name": "picture for viewers, red green blue; 0 not seen"}),
+        "age": ("<f4", {"long_name": "time since the pixel was looked at", "units": "days"}),
+    }
+    changes = {"changed": ("<f4", CHANGED), OLD_CLASS: ("|u1", old_class_flags(legend))}
+    return images | changes if goes_on else images
 
 
 def load_ground_map(path: Path) -> GroundMap:
@@ -158,4 +171,7 @@ def load_ground_map(path: Path) -> GroundMap:
         legend=legend_of(group),
         geobox=geobox,
         areas=areas,
+        age_days=read_array(group, "age"),
+        changed=read_array(group, "changed") if "changed" in group else None,
+        old_class=read_array(group, OLD_CLASS) if OLD_CLASS in group else None,
     )

@@ -9,10 +9,12 @@ and looked for three days later. Farms that no training saw, each with noise of 
 `python tests/benchmarks/bench_memory.py season` draws the season alone, `days` the visits after a few days, `changes`
 what was planted, `light` fields that did not change under another sun, `wrong` memories that are none of the field,
 `parts` visits that look at a part: fields as wide as four strips of a narrower camera, `strips` a season of them.
+`storage --size 128x96 --visits 3` says what so many visits to so small a farm store; alone it takes 640x512 px, ten.
 """
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -21,6 +23,7 @@ from itertools import combinations, product
 from pathlib import Path
 
 import numpy as np
+from beside.stored_season import stored_rows
 from measure import Row
 from numpy.typing import NDArray
 from scipy.ndimage import rotate
@@ -39,6 +42,7 @@ from models.reading.remembered import (
     Looked,
     Remembered,
     carried,
+    changed_from,
     changed_shares,
     compare,
     first_belief,
@@ -74,6 +78,7 @@ STRIPS = LineCamera(samples=160)  # of which a field is four strips wide
 PART_DAYS, PART_SHARES = (3, 7), (0.35, 0.6)  # days without a look; seconds of a visit, of those of a whole quick look
 SEASON_SHARES = (0.15, 0.25)  # seconds of a visit of a season, of those of a full scan
 WRONG_SEEDS = (7, 8, 9)  # lands whose memories are of others, moved, turned or old: nothing was settled on them
+VISITS = 10  # of which it is measured what they store
 WORSE = 0.5  # points that a map may lose by a memory that is wrong
 Classes = NDArray[np.uint8]
 
@@ -149,6 +154,7 @@ def rows() -> list[Row]:
         *wrong_memories(),
         *parts(),
         *season_of_parts(),
+        *storage(),
     ]
 
 
@@ -346,7 +352,7 @@ def planted_changes() -> Iterator[Row]:
         now = _seen(changed, seed, QUICK)
         first = first_belief(before.looked)
         after = _later(before, first, now, 3.0)
-        told = changed_shares(Remembered(first, None, 3.0), after, patch) >= CHANGED_SHARE
+        told = changed_shares(changed_from(Remembered(first, None, 3.0), after), patch) >= CHANGED_SHARE
         for kind, place in places:
             covered = _shares(place, patch) >= 0.5
             hits.setdefault(kind, []).append(bool((told & covered).any()))
@@ -368,7 +374,7 @@ def other_light() -> Iterator[Row]:
             before, now = look_at_farm(seed, FIRST_DAY, early, ANEW), look_at_farm(seed, FIRST_DAY, late, QUICK, 1)
             first = first_belief(before.looked)
             after = _later(before, first, now, abs(late - early) / 24)
-            told = changed_shares(Remembered(first, None, 0.3), after, patch) >= CHANGED_SHARE
+            told = changed_shares(changed_from(Remembered(first, None, 0.3), after), patch) >= CHANGED_SHARE
             same = _shares(before.labels != now.labels, patch) == 0
             false, all_seats = false + int((told & same).sum()), all_seats + int(same.sum())
         share = false / all_seats
@@ -477,7 +483,12 @@ def plant(
     return replace(scene, key=f"{scene.key}/planted", raster=SceneRaster.of(planes, labels)), places
 
 
-PARTS = {
+def storage(size_px: tuple[int, int] = SHAPE, visits: int = VISITS) -> Iterator[Row]:
+    """What the first visits of a season store, beside as many full scans."""
+    return stored_rows(size_px, SEASON[:visits], QUICK, REFERENCE)
+
+
+PARTS: dict[str, Callable[[], Iterator[Row]]] = {
     "days": after_days,
     "season": season,
     "changes": planted_changes,
@@ -485,13 +496,23 @@ PARTS = {
     "wrong": wrong_memories,
     "parts": parts,
     "strips": season_of_parts,
+    "storage": storage,
 }
 
 
 def main(arguments: Sequence[str]) -> int:
     """Print the rows of some parts."""
-    for name in arguments or PARTS:
-        for row in PARTS[name]():
+    parser = argparse.ArgumentParser(description="What a field's memory is worth, and what it stores.")
+    parser.add_argument("parts", nargs="*", metavar="part", help=f"some of {', '.join(PARTS)}; all where none is given")
+    parser.add_argument("--size", default=f"{SHAPE[1]}x{SHAPE[0]}", help="of the farm of the part storage [px]")
+    parser.add_argument("--visits", type=int, default=VISITS, help="of the part storage")
+    asked = parser.parse_args(arguments)
+    if unknown := set(asked.parts) - set(PARTS):
+        parser.error(f"no part {', '.join(sorted(unknown))}; there are {', '.join(PARTS)}")
+    columns, rows = map(int, asked.size.split("x"))
+    parts = PARTS | {"storage": partial(storage, (rows, columns), asked.visits)}
+    for name in asked.parts or parts:
+        for row in parts[name]():
             goal = "" if row.met is None else f", goal {row.goal}: {'met' if row.met else 'MISSED'}"
             print(f"{row.what}: {row.figure}{goal}", flush=True)
     return 0

@@ -24,6 +24,7 @@ from flows.schedule.field_schedule import FieldSchedule, read_moment
 from flows.schedule.times import parse_timetable
 from storage.archive.archive import Archive
 from storage.archive.ledger import Ledger, ledgers
+from storage.archive.records import read_run
 from tests.faults.fault_table import Clock, Row
 from tests.faults.nursery import ROOT
 from tests.flows.schedule.schedule_days import HandClock
@@ -75,7 +76,8 @@ def rows(quick: bool) -> list[Row]:
         left = sorted(filter(None, (words_of(pid) for pid in watched.others if is_alive(pid))))
         archive = Archive.open(folder / "archive")
         served = account_of(archive.root, watched.back)
-        return judged(watched, served, (left, problems_of(archive)), clock.seconds, quick=quick)
+        found = judged(watched, served, (left, problems_of(archive)), clock.seconds, quick=quick)
+        return [*found, remembered(archive)]
 
 
 def free_port() -> int:
@@ -247,6 +249,23 @@ def judged(
             0.0,
         ),
     ]
+
+
+def remembered(archive: Archive) -> Row:
+    """How many runs went on from an earlier one of their field, which served surveys do unless they are told not to."""
+    runs = [read_run(folder, {}) for folder in archive.runs()]
+    memories = [memory for run in runs if (memory := run.receipt.get("memory")) is not None]
+    aside = sum(memory["put_aside"] is not None for memory in memories)
+    first = len({run.receipt.get("survey") for run in runs})
+    return Row(
+        "memories",
+        "published runs that go on from an earlier one",
+        len(runs),
+        "all but the first of each field, none put aside",
+        f"{len(memories)} do, {first} are first looks, {aside} put theirs aside",
+        len(memories) == len(runs) - first > 0 and not aside,
+        0.0,
+    )
 
 
 def _at(values: dict[float, int], moment: float) -> int:

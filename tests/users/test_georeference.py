@@ -21,6 +21,7 @@ from odc.geo.xr import xr_coords
 from rasterio.enums import ColorInterp
 from rich.console import Console
 
+import models.reading.remembered as remembered
 from flows.archive.export_command import run_export
 from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
@@ -181,6 +182,27 @@ def test_transparent_pixels_are_no_data_to_the_end(tmp_path: Path, weights: Path
     assert sum(ground["areas_ha"].values()) * 1e4 == pytest.approx(whole * (~gap).mean(), rel=1e-6)
     with opened(run, "attention") as attention:
         assert (attention["score"].values[:2, :3] == 0).all()  # seats of 8 px without a pixel of the scene
+
+
+def test_pixels_that_became_transparent_did_not_change(
+    tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To a second visit they are as old as nothing, whatever was put in their place to look at; others did change."""
+    for name in ("CERTAIN", "SURE"):  # untrained weights are sure of nothing: what they say is taken for sure
+        monkeypatch.setattr(remembered, name, 1e-6)
+    for name in ("first", "later"):
+        (tmp_path / name).mkdir()
+    scenes = [write_geotiff(tmp_path / name / "a.tif", NORTH_UP, gap=name == "later") for name in ("first", "later")]
+    flags = {"name": "north", "prior": "latest", "scan_step": 2, "budget": None}
+    for day, scene in enumerate(scenes, 1):
+        run = survey(scene, weights, tmp_path / "archive", **flags, visit=f"2026-06-0{day}T10:00:00Z", seed=day)
+    with opened(run, "belief") as belief:
+        old, age, shares = (belief[name].values for name in ("changed_from", "age", "changed"))
+    assert (old != 255).any()
+    assert (shares[:2, :3] == 0).all()  # patches of 8 px
+    assert (old[GAP] == 255).all()
+    assert np.isnan(age[GAP]).all()
+    assert np.isnan(age).sum() == age[GAP].size
 
 
 def test_a_place_is_in_the_keys_of_what_carries_it(tmp_path: Path, weights: Path) -> None:

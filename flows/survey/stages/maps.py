@@ -1,4 +1,4 @@
-"""The stages that draw maps: classes from coarse and fine patches, and a posed survey on the ground, with hectares."""
+"""The stage that draws the class map, from coarse and fine patches and from what is remembered of the field."""
 
 from __future__ import annotations
 
@@ -17,20 +17,16 @@ from flows.survey.run import SurveyRun
 from flows.survey.stage import Product, Wanted, stage
 from models.reading.inference import CoarseLook, Glance, read_glance
 from models.reading.regions import whole_field
-from models.reading.remembered import MemoryAgreement
-from pipeline.ground.map_grid import GroundGrid, classes_at, ground_grid, image_at, map_blocks
-from pipeline.ground.view import GroundView
+from models.reading.remembered import MemoryAgreement, changed_shares
+from pipeline.geometry.grid import UNLABELLED
 from pipeline.rectify.registration.field_shift import FieldShift
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS
 from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table, write_table
-from storage.arrays.beliefs import UNKNOWN, create_belief, write_changes
+from storage.arrays.beliefs import OLD_CLASS, UNKNOWN, BeliefStore, create_belief, drop_changes, write_changes
 from storage.arrays.blank_pixels import NO_CLASS, blank_pixels
-from storage.arrays.class_maps import ClassNames, create_class_map, load_class_map, with_unknown
-from storage.arrays.ground_maps import BLOCK, GroundMapWriter
-from storage.arrays.layout import SHARD_ROWS, open_group, read_array, read_bands
+from storage.arrays.class_maps import ClassNames, create_class_map, with_unknown
 from storage.arrays.mosaics import open_patches
-from storage.arrays.quicklooks import choose_bands, develop, stretch
 
 CLASS_MAP = Product("segment", version=8, files=("class_map.zarr", "belief.zarr"), by_weights=True)
 STRANGE = "strange.json"  # beside a map, where values were no readings
@@ -53,16 +49,18 @@ def draw_map(run: SurveyRun, mosaic: StageRef, patches: StageRef) -> Wanted:
             told = _memory_told(run, lies, drawn.comparison)
             write_table(path / MEMORY, told)
             if told["put_aside"] is not None and drawn.comparison is not None:
+                drop_changes(path / "belief.zarr")
                 drawn = draw_field(work, replace(drawing, memory=None), run.report)
-        if drawn.changed is not None:
-            write_changes(path / "belief.zarr", drawn.changed, run.grid.patch)
         if any(drawn.strange):
             write_table(path / STRANGE, dict(zip(("coarse_px", "fine_px"), drawn.strange, strict=True)))
         if run.scene.missing is not None:
             blank_pixels(out, run.scene.missing, NO_CLASS)
-            blank_pixels(path / "belief.zarr", run.scene.missing, UNKNOWN)
+            changes = {} if drawn.comparison is None else {OLD_CLASS: UNLABELLED}
+            blank_pixels(path / "belief.zarr", run.scene.missing, UNKNOWN | changes)
         if run.zones.left_out is not None:
             blank_pixels(out, run.zones.left_out, NO_CLASS)
+        if (old_class := BeliefStore(path / "belief.zarr").old_class()) is not None:
+            write_changes(path / "belief.zarr", changed_shares(old_class, run.grid.patch), run.grid.patch)
         (path / LEFT_OUT).unlink(missing_ok=True)
 
     prior, unknown = run.prior, _unknown_rule(run)
@@ -102,12 +100,12 @@ def _drawing(
     unknown = _unknown_rule(run)
     shown = legend if unknown is None else with_unknown(legend)
     create_class_map(path / "class_map.zarr", shape, shown, grid=run.angular_grid())
-    create_belief(path / "belief.zarr", shape, legend, grid=run.angular_grid())
     prior = run.prior
     memory = None
     if prior is not None and not _is_turned(run, lies):
         belief, coarse = (prior.belief.path / "belief.zarr").resolve(), (prior.mosaic.path / "mosaic.zarr").resolve()
         memory = FieldMemory(belief, coarse, prior.days, prior.classes, whole_pixels(lies))
+    create_belief(path / "belief.zarr", shape, legend, grid=run.angular_grid(), goes_on=memory is not None)
     seen = (mosaic.path / "mosaic.zarr").resolve(), (patches.path / "patches.zarr").resolve()
     made = (path / "class_map.zarr").resolve(), (path / "belief.zarr").resolve()
     light, step = _light(run)
@@ -171,63 +169,3 @@ def patch_columns(run: SurveyRun, patches: StageRef, seen: CoarseLook) -> tuple[
     """Seats of the whole field and their normalised spectral columns, (seat, p, p, column); see ``seat_columns``."""
     store = open_patches(patches.path / "patches.zarr")
     return seat_columns(run.weights, store, run.scene.wavelength_nm, seen, whole_field(run.grid))
-
-
-STORE = "ground_map.zarr"
-GROUND = Product("ground", version=3, files=(STORE,))
-
-
-@stage("ground", "map on the ground", GROUND, of=("draw_map", "rectify"), after=("compare_turned",), unit="pixels")
-def ground(run: SurveyRun, class_map: StageRef, mosaic: StageRef) -> Wanted | None:
-    """Draw the class map and the coarse picture on the ground; nothing where the settings have no pose."""
-    grid = survey_grid(run)
-    if grid is None:
-        return None
-    pose, choice = run.settings.pose, run.settings.map
-
-    def build(path: Path) -> None:
-        found = load_class_map(class_map.path / "class_map.zarr")
-        unsure, colours = np.isnan(found.confidence).astype(np.uint8), coarse_colours(mosaic)
-        about = {"rig_pose": asdict(grid.frame.view.pose), "scene_pixels": grid.counts()}
-        writer = GroundMapWriter(path / STORE, grid.geobox, ClassNames(found.names, found.colours), about=about)
-        for rows, columns in map_blocks(grid.shape, BLOCK):  # what is not seen is 255, NaN and 0
-            pixels = grid.scene_pixels(rows, columns)
-            classes, confidence = (
-                classes_at(found.classes, pixels),
-                image_at(found.confidence[..., None], pixels)[..., 0],
-            )
-            confidence[classes_at(unsure, pixels) == 1] = np.nan  # of the class unknown, whatever lies beside it
-            picture = np.nan_to_num(np.rint(image_at(colours, pixels, factor=run.grid.factor))).astype(np.uint8)
-            writer.write_block(rows, columns, classes, confidence, picture)
-            run.report(rows.stop / grid.shape[0])
-        writer.finish(grid.class_areas_m2(found.classes, len(found.names)))
-
-    params = {
-        "pose": None if pose is None else asdict(pose),
-        "map": asdict(choice),
-        "ifov_rad": run.camera.ifov_rad,
-        "scene_shape": run.scene.shape,
-        "factor": run.grid.factor,
-    }
-    return Wanted(build, params, [class_map, mosaic])
-
-
-def survey_grid(run: SurveyRun) -> GroundGrid | None:
-    """The map's grid that the settings ask for, None without a pose. Raises PoseError where there can be none."""
-    pose, choice = run.settings.pose, run.settings.map
-    if pose is None:
-        return None
-    view = GroundView(pose, run.camera.ifov_rad)
-    return ground_grid(view, run.scene.shape, epsg=choice.epsg, resolution_m=choice.resolution_m)
-
-
-def coarse_colours(mosaic: StageRef) -> NDArray[np.float32]:
-    """Three bands of the coarse mosaic in a photograph's tones, (y, x, 3) in 1..255; NaN where nothing was captured."""
-    group = open_group(mosaic.path / "mosaic.zarr")
-    bands, words = choose_bands(read_bands(group)[0])
-    height = len(read_array(group, "coverage"))
-    rows = (slice(first, min(first + SHARD_ROWS, height)) for first in range(0, height, SHARD_ROWS))
-    values = np.concatenate([read_array(group, "values", block)[..., list(bands)] for block in rows])
-    tones = develop(values, values) if words.startswith("true colour") else stretch(values)
-    picture: NDArray[np.float32] = np.where(np.isfinite(values), 1 + 254 * tones, np.nan).astype(np.float32)
-    return picture

@@ -13,21 +13,23 @@ import xarray as xr
 
 from flows.settings.survey_settings import MapChoice, Settings
 from flows.survey.run import SurveyRun
-from flows.survey.stages.maps import STORE, coarse_colours, ground, survey_grid
+from flows.survey.stages.on_ground import STORE, coarse_colours, ground, survey_grid
 from pipeline.errors import PoseError
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.ground.map_grid import GroundGrid
 from pipeline.ground.view import RigPose, pixel_places
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
-from storage.arrays.class_maps import ClassMap, write_class_map
-from storage.arrays.ground_maps import load_ground_map
+from storage.arrays.beliefs import create_belief, write_belief_tile, write_changes, write_changes_tile
+from storage.arrays.class_maps import ClassMap, ClassNames, load_class_map, write_class_map
+from storage.arrays.ground_maps import GroundMap, load_ground_map
 from storage.arrays.layout import AngularGrid
 from storage.arrays.mosaics import MosaicWriter
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 POSE = RigPose(lon_deg=9.5, lat_deg=52.1, heading_deg=25.0, tilt_deg=50.0, height_m=14.0)
 SHAPE = (120, 160)
+LEGEND = ClassNames(("weed", "crop"), np.array([[255, 0, 0], [0, 255, 0]], np.uint8))
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,25 @@ class Run:
         return self.settings.camera
 
 
+def believe(folder: Path, age_days: np.ndarray, old_class: np.ndarray | None = None) -> None:
+    """A belief of these ages (y, x), NaN where nothing is known; one that goes on from another with what changed."""
+    values = np.where(np.isnan(age_days)[..., None], np.nan, np.log([0.5, 0.5])).astype(np.float32)
+    path = folder / "belief.zarr"
+    create_belief(path, SHAPE, LEGEND, goes_on=old_class is not None)
+    for top in range(0, SHAPE[0], 64):
+        rows = slice(top, top + 64)
+        write_belief_tile(path, (top, 0), values[rows], age_days[rows], np.ones(SHAPE, np.float32)[rows])
+        if old_class is not None:
+            write_changes_tile(path, (top, 0), old_class[rows])
+    if old_class is not None:
+        write_changes(path, seat_shares(old_class), 8)
+
+
+def seat_shares(old_class: np.ndarray) -> np.ndarray:
+    """(15, 20) shares of pixels that changed, of seats of 8 px."""
+    return (old_class != UNLABELLED).reshape(15, 8, 20, 8).mean(axis=(1, 3), dtype=np.float32)
+
+
 @pytest.fixture
 def run(tmp_path: Path) -> Run:
     """A posed survey of a small field."""
@@ -66,8 +87,9 @@ def stores(tmp_path: Path) -> tuple[StageRef, StageRef]:
     classes[:, 80:] = 1
     classes[:30, 80:] = UNLABELLED
     confidence = np.where(classes == UNLABELLED, np.nan, 0.25 + 0.5 * (classes == 1)).astype(np.float32)
-    legend = (("weed", "crop"), np.array([[255, 0, 0], [0, 255, 0]], np.uint8))
-    write_class_map(tmp_path / "map" / "class_map.zarr", ClassMap(classes, confidence, *legend))
+    found = ClassMap(classes, confidence, LEGEND.names, LEGEND.colours)
+    write_class_map(tmp_path / "map" / "class_map.zarr", found)
+    believe(tmp_path / "map", np.zeros(SHAPE, np.float32))
     rows, columns = SHAPE[0] // 4, SHAPE[1] // 4
     writer = MosaicWriter(
         tmp_path / "mosaic" / "mosaic.zarr",
@@ -102,9 +124,11 @@ def test_what_is_unknown_has_no_confidence_on_the_map_either(
     confidence = np.where(classes == 1, np.nan, 0.9).astype(np.float32)
     legend = (("crop", "unknown"), np.array([[0, 255, 0], [255, 0, 255]], np.uint8))
     write_class_map(tmp_path / "strange" / "class_map.zarr", ClassMap(classes, confidence, *legend))
+    believe(tmp_path / "strange", np.where(classes == 1, np.nan, 0).astype(np.float32))
     found = load_ground_map(draw(run, (StageRef("segment", "s", tmp_path / "strange"), stores[1])).path / STORE)
     assert (found.classes == 1).sum() > 50
     np.testing.assert_array_equal(np.isnan(found.confidence), found.classes != 0)
+    np.testing.assert_array_equal(np.isnan(found.age_days), found.classes != 0)
 
 
 def test_without_ground_nothing_is_written(run: Run, stores: tuple[StageRef, StageRef]) -> None:
@@ -142,6 +166,48 @@ def test_map_and_picture_lie_where_the_rays_end(run: Run, stores: tuple[StageRef
     row, column = np.nonzero(seen)
     along = row * np.cos(np.deg2rad(25)) - column * np.sin(np.deg2rad(25))  # towards the rig on a north-up map
     assert np.corrcoef(along, found.picture[row, column, 0])[0, 1] > 0.95
+
+
+def field_pixels(run: Run, found: GroundMap) -> tuple[np.ndarray, np.ndarray]:
+    """Whether each pixel of a map is in the field, and the row and column of the field's pixel that it shows."""
+    places = grid_of(run).scene_pixels(*(slice(0, size) for size in found.classes.shape))
+    seen = np.isfinite(places[..., 0])
+    return seen, np.floor(places[seen] + 0.5).astype(int).T
+
+
+def test_age_and_changes_are_those_of_the_pixel_that_is_shown(
+    run: Run, stores: tuple[StageRef, StageRef], tmp_path: Path
+) -> None:
+    """Of a second visit: days, share of the patch and old class are no blend of neighbours; what is unknown is NaN."""
+    rng = np.random.default_rng(3)
+    age = 0.125 * rng.integers(0, 400, SHAPE).astype(np.float32)
+    age[rng.random(SHAPE) < 0.1] = np.nan
+    old = np.where(rng.random(SHAPE) < rng.random((1, SHAPE[1])), UNLABELLED, rng.integers(0, 2, SHAPE))
+    write_class_map(tmp_path / "later" / "class_map.zarr", load_class_map(stores[0].path / "class_map.zarr"))
+    believe(tmp_path / "later", age, old.astype(np.uint8))
+    ref = draw(run, (StageRef("segment", "l", tmp_path / "later"), stores[1]))
+    found = load_ground_map(ref.path / STORE)
+    seen, (row, column) = field_pixels(run, found)
+    assert found.changed is not None
+    assert found.old_class is not None
+    np.testing.assert_array_equal(found.age_days[seen], age[row, column])
+    np.testing.assert_array_equal(found.old_class[seen], old[row, column])
+    np.testing.assert_array_equal(found.changed[seen], seat_shares(old)[row // 8, column // 8])
+    for image in (found.age_days, found.changed):
+        assert np.isnan(image[~seen]).all()
+    assert (found.old_class[~seen] == UNLABELLED).all()
+
+
+def test_a_first_look_has_ages_and_no_changes(run: Run, stores: tuple[StageRef, StageRef]) -> None:
+    """All that is seen was looked at today; to plain xarray there is nothing about a change."""
+    ref = draw(run, stores)
+    found = load_ground_map(ref.path / STORE)
+    seen, _ = field_pixels(run, found)
+    assert (found.age_days[seen] == 0).all()
+    assert np.isnan(found.age_days[~seen]).all()
+    with xr.open_zarr(ref.path / STORE, consolidated=False) as content:
+        assert not {"changed", "changed_from"} & set(content)
+        assert content["age"].attrs["units"] == "days"
 
 
 def test_the_store_has_hectares_and_where_it_was_seen_from(run: Run, stores: tuple[StageRef, StageRef]) -> None:

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rasterio
 import torch
 import xarray as xr
 from PIL import Image
@@ -95,7 +94,10 @@ def test_a_later_look_goes_on_from_the_one_before(twice: tuple[Path, Any, Any]) 
     store = out / later.receipt["products"]["belief"]
     manifest = json.loads((store.parent / "manifest.json").read_text())
     assert Path(first.receipt["products"]["belief"]).parent.name in manifest["inputs"]
-    assert xr.open_zarr(store, consolidated=False).changed.shape == (12, 16)
+    belief = xr.open_zarr(store, consolidated=False)
+    assert belief.changed.shape == (12, 16)
+    there = (belief.changed_from.values != 255).reshape(12, 8, 16, 8).mean(axis=(1, 3), dtype=np.float32)
+    np.testing.assert_array_equal(belief.changed.values, there)
 
 
 def test_two_looks_know_more_than_one(twice: tuple[Path, Any, Any], survey_png: Survey, tmp_path: Path) -> None:
@@ -156,6 +158,7 @@ def test_another_field_under_the_same_name_is_put_aside(visited: Path, survey_pn
     np.testing.assert_array_equal(class_map(visited, wrong), class_map(tmp_path / "alone", alone))
     belief = xr.open_zarr(visited / wrong.receipt["products"]["belief"], consolidated=False)
     assert float(belief.age.max()) == 0.0
+    assert not {"changed", "changed_from"} & set(belief)
 
 
 def test_what_was_cleared_is_gone_on_without(visited: Path, twice: Any, survey_png: Survey) -> None:
@@ -281,20 +284,6 @@ def test_a_rig_that_was_turned_is_noticed(survey_png: Survey, tmp_path: Path) ->
     assert "was put aside: the rig was turned since, by 4.0 degrees" in words.replace("3.9", "4.0").replace(
         "4.1", "4.0"
     )
-
-
-def test_what_changed_is_exported(twice: tuple[Path, Any, Any], tmp_path: Path, command_line: Any) -> None:
-    """On its seats, beside the class map, of a run that goes on from another; a first look has no such file."""
-    out, first, later = twice
-    ended = command_line("export", out, later.folder.name, "-o", tmp_path / "maps")
-    assert ended.code == 0, ended.err
-    (file,) = (tmp_path / "maps").rglob("*changed*.tif")
-    with rasterio.open(file) as opened:
-        found = opened.read(1)
-    stored = xr.open_zarr(out / later.receipt["products"]["belief"], consolidated=False).changed.values
-    np.testing.assert_array_equal(found, stored)
-    command_line("export", out, first.folder.name, "-o", tmp_path / "first")
-    assert list((tmp_path / "first").rglob("*changed*")) == []
 
 
 def test_a_thousand_visits_cost_as_much_as_sixty(visited: Path, twice: Any, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 import shutil
@@ -217,3 +218,20 @@ def test_a_pixel_of_another_size_is_told(weights: Path) -> None:
     other = TrainedOn(3, SEEN.wavelength_nm, SEEN.exposure_ms, 2, CLASSES, None, None, 0.01)
     (note,) = beyond_training(load_settings(None, {}), scene, describe_weights(weights), other, weights)
     assert "pixels of 12 cm of the ground (it saw 1 cm)" in note
+
+
+def test_areas_without_labels_count_unknown_pixels_for_sure(
+    survey_png: Survey, judging: Maker, tmp_path: Path, command_line: Any
+) -> None:
+    """An export's table estimates known classes by what is believed of their pixels; all shares add up to one."""
+    path = str(judging(0.5))
+    published = survey_png(tmp_path / "archive", weights=path, effects="none", accuracy=False)
+    ended = command_line("export", tmp_path / "archive", "-o", tmp_path / "maps")
+    assert ended.code == 0, ended.err
+    (found,) = (tmp_path / "maps").rglob("areas.csv")
+    with found.open() as text:
+        table = {row["class"]: row for row in csv.DictReader(text)}
+    unknown = table["unknown"]
+    assert float(unknown["estimated_share"]) == pytest.approx(published.receipt["unknown"]["share"], abs=1e-5)
+    assert float(unknown["standard_error_share"]) == 0
+    assert sum(float(row["estimated_share"]) for row in table.values()) == pytest.approx(1, abs=1e-4)

@@ -21,6 +21,7 @@ from models.reading.remembered import (
     Looked,
     Remembered,
     carried,
+    changed_from,
     changed_shares,
     compare,
     faded,
@@ -252,7 +253,7 @@ def test_a_harvest_overnight_is_seen() -> None:
     found = compare(memory, today, after, np.s_[:, :])
     assert not found.is_of_another_field  # soil between the rows is as it was
     assert found.changed[1, 0] == np.count_nonzero(rows) == found.changed.sum() - np.trace(found.changed)
-    np.testing.assert_array_equal(changed_shares(memory, after, 5)[:4], np.full((4, 4), 0.4, np.float32))
+    np.testing.assert_array_equal(changed_shares(changed_from(memory, after), 5)[:4], np.full((4, 4), 0.4, np.float32))
 
 
 def test_a_field_under_snow_is_no_field_that_is_remembered() -> None:
@@ -285,8 +286,9 @@ def test_a_seat_counts_its_pixels_of_another_class() -> None:
     now = before.copy()
     now[0, :8], now[0, 8:] = other, doubt
     memory = Remembered(Belief(before, *np.zeros((2, 8, 16), np.float32)), None, 1.0)
-    shares = changed_shares(memory, Belief(now, *np.zeros((2, 8, 16), np.float32)), 8)
-    np.testing.assert_array_equal(shares, [[0.125, 0.0]])
+    old = changed_from(memory, Belief(now, *np.zeros((2, 8, 16), np.float32)))
+    np.testing.assert_array_equal(old, np.where(now.argmax(axis=-1) == 1, np.where(np.arange(16) < 8, 0, 255), 255))
+    np.testing.assert_array_equal(changed_shares(old, 8), [[0.125, 0.0]])
 
 
 @READERS

@@ -12,12 +12,12 @@ from pipeline.errors import PoseError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.map_grid import (
     GroundGrid,
-    classes_at,
     ground_grid,
     image_at,
     map_blocks,
     median_footprint_m,
     median_sink,
+    nearest_at,
     round_step,
 )
 from pipeline.ground.view import pixel_places
@@ -151,11 +151,25 @@ def test_blocks_cover_the_map_once():
     assert (seen == 1).all()
 
 
-def test_classes_are_the_nearest_pixels():
+def test_the_nearest_pixel_is_read_and_no_other():
     """Halves of pixels belong to them up to the border; NaN has no class."""
     classes = np.arange(12, dtype=np.uint8).reshape(3, 4)
     places = np.array([[[-0.5, -0.5], [0.49, 0.51], [2.5, 3.5], [np.nan, 1.0]]])
-    assert classes_at(classes, places).tolist() == [[0, 1, 11, UNLABELLED]]
+    assert nearest_at(classes, places, UNLABELLED).tolist() == [[0, 1, 11, UNLABELLED]]
+
+
+@given(seed=st.integers(0, 2**16), factor=st.integers(1, 9), rows=st.integers(1, 20), columns=st.integers(1, 20))
+def test_a_seat_is_read_at_every_pixel_of_it(seed: int, factor: int, rows: int, columns: int):
+    """As if each seat were so many pixels, also where the last ones reach beyond the scene."""
+    rng = np.random.default_rng(seed)
+    seats = rng.random((-(-rows // factor), -(-columns // factor))).astype(np.float32)
+    places = rng.uniform(-0.5, [rows - 0.5, columns - 0.5], (5, 4, 2))
+    places[0, 0] = np.nan
+    fine = seats.repeat(factor, axis=0).repeat(factor, axis=1)[:rows, :columns]
+    found = nearest_at(seats, places, np.nan, factor=factor)
+    np.testing.assert_array_equal(found, nearest_at(fine, places, np.nan))
+    assert found.dtype == np.float32
+    assert np.isnan(found[0, 0])
 
 
 def test_images_are_read_between_their_own_pixels():

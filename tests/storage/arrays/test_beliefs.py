@@ -19,8 +19,10 @@ from storage.arrays.beliefs import (
     STEP,
     BeliefStore,
     create_belief,
+    drop_changes,
     write_belief_tile,
     write_changes,
+    write_changes_tile,
 )
 from storage.arrays.class_maps import ClassNames
 
@@ -105,6 +107,45 @@ def test_changes_are_there_once_written(tmp_path: Path) -> None:
     found = BeliefStore(path).changed()
     assert found is not None
     assert found.tolist() == [[0.0, 0.5]]
+
+
+def gone_on(path: Path) -> tuple[Path, np.ndarray]:
+    """A belief that goes on from an earlier one, and what some of its pixels were."""
+    old = np.random.default_rng(1).choice(np.array([0, 2, 255], np.uint8), SHAPE)
+    create_belief(path, SHAPE, LEGEND, goes_on=True)
+    for top, bottom in ((0, 64), (64, 70)):
+        write_changes_tile(path, (top, 0), old[top:bottom])
+    return path, old
+
+
+def test_what_pixels_were_is_kept_with_its_names(tmp_path: Path) -> None:
+    """Written in tiles; plain xarray reads whole numbers and CF flags, 255 where nothing changed."""
+    path, old = gone_on(tmp_path / "belief.zarr")
+    np.testing.assert_array_equal(BeliefStore(path).old_class(), old)
+    with xr.open_zarr(path, consolidated=False) as opened:
+        found = opened["changed_from"]
+        np.testing.assert_array_equal(found.values, old)
+        assert found.dtype == np.uint8
+        assert found.attrs["flag_meanings"].split() == list(LEGEND.names)
+        assert found.attrs["nodata"] == 255
+
+
+def test_a_first_belief_has_nothing_that_pixels_were(tmp_path: Path) -> None:
+    """Nor has one that goes on from none after all; tiles of either are refused."""
+    first, (dropped, old) = stored(tmp_path / "first.zarr"), gone_on(tmp_path / "dropped.zarr")
+    drop_changes(dropped)
+    for path in (first, dropped):
+        assert BeliefStore(path).old_class() is None
+        with pytest.raises(IncompleteStoreError, match="changed_from"):
+            write_changes_tile(path, (0, 0), old[:64])
+    assert not list(dropped.rglob("*changed_from*"))
+
+
+def test_tiles_of_changes_that_split_a_shard_are_refused(tmp_path: Path) -> None:
+    """As those of probabilities."""
+    path, old = gone_on(tmp_path / "belief.zarr")
+    with pytest.raises(ChunkError, match="split the belief's shards"):
+        write_changes_tile(path, (8, 0), old[:8])
 
 
 def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:

@@ -31,31 +31,37 @@ pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecatio
 LEGEND = ClassNames(("sugar beet", "bare soil"), np.array([[10, 200, 30], [120, 90, 60]], np.uint8))
 
 
-def begin(path: Path, shape: tuple[int, int] = (100, 90)) -> GroundMapWriter:
+def begin(path: Path, shape: tuple[int, int] = (100, 90), *, goes_on: bool = False) -> GroundMapWriter:
     """A writer of a map of the shape."""
     geobox = GeoBox.from_bbox((0, 0, shape[1] * 0.5, shape[0] * 0.5), crs="EPSG:32632", shape=shape, tight=True)
-    return GroundMapWriter(path, geobox, LEGEND, about={"rig_pose": {"tilt_deg": 40}})
+    return GroundMapWriter(path, geobox, LEGEND, about={"rig_pose": {"tilt_deg": 40}}, goes_on=goes_on)
 
 
-def block(shape: tuple[int, int], seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Classes with unseen pixels, confidence and picture."""
-    rng = np.random.default_rng(seed)
-    classes = rng.choice(np.array([0, 1, UNLABELLED], np.uint8), shape)
-    confidence = np.where(classes == UNLABELLED, np.nan, rng.random(shape)).astype(np.float32)
-    return classes, confidence, rng.integers(0, 256, (*shape, 3), dtype=np.uint8)
+def block(shape: tuple[int, int], *, goes_on: bool = False) -> dict[str, np.ndarray]:
+    """Images with unseen pixels: classes, confidence, picture, age, and of a later look what changed."""
+    rng = np.random.default_rng(0)
+    classes, old = rng.choice(np.array([0, 1, UNLABELLED], np.uint8), (2, *shape))
+    confidence, age, changed = (
+        np.where(classes == UNLABELLED, np.nan, most * rng.random(shape)).astype(np.float32) for most in (1, 90, 1)
+    )
+    picture = rng.integers(0, 256, (*shape, 3), dtype=np.uint8)
+    images = {"classes": classes, "confidence": confidence, "picture": picture, "age": age}
+    return images | {"changed": changed, "changed_from": old} if goes_on else images
 
 
-def test_a_map_written_in_blocks_comes_back(tmp_path: Path) -> None:
-    """All arrays, the legend and the grid are as written, through this project's reader."""
-    writer = begin(tmp_path / "a.zarr", (150, 700))
-    whole = block((150, 700))
+@pytest.mark.parametrize("goes_on", [False, True])
+def test_a_map_written_in_blocks_comes_back(tmp_path: Path, goes_on: bool) -> None:
+    """All arrays, the legend and the grid are as written, through this project's reader; at first nothing changed."""
+    writer = begin(tmp_path / "a.zarr", (150, 700), goes_on=goes_on)
+    whole = block((150, 700), goes_on=goes_on)
     for rows in (slice(0, 64), slice(64, 150)):
         for columns in (slice(0, SHARD_COLUMNS), slice(SHARD_COLUMNS, 700)):
-            writer.write_block(rows, columns, *(part[rows, columns] for part in whole))
+            writer.write_block(rows, columns, {name: image[rows, columns] for name, image in whole.items()})
     writer.finish(np.zeros(2))
     found = load_ground_map(tmp_path / "a.zarr")
-    for stored, written in zip((found.classes, found.confidence, found.picture), whole, strict=True):
-        np.testing.assert_array_equal(stored, written)
+    names = {"age_days": "age", "old_class": "changed_from"}
+    for name in ("classes", "confidence", "picture", "age_days", "changed", "old_class"):
+        np.testing.assert_array_equal(getattr(found, name), whole.get(names.get(name, name)))
     assert found.legend.names == LEGEND.names
     np.testing.assert_array_equal(found.legend.colours, LEGEND.colours)
     assert tuple(found.geobox.shape) == (150, 700)
@@ -72,8 +78,8 @@ def test_areas_are_kept_in_hectares(tmp_path: Path, areas_m2: tuple[float, ...],
 
 def test_plain_xarray_opens_it_with_flags_and_areas(tmp_path: Path) -> None:
     """Flags, hectares, pose and grid mapping are there without this project's code; unseen pixels have no class."""
-    writer = begin(tmp_path / "a.zarr")
-    writer.write_block(slice(0, 64), slice(0, 90), *block((64, 90)))
+    writer, images = begin(tmp_path / "a.zarr", goes_on=True), block((64, 90), goes_on=True)
+    writer.write_block(slice(0, 64), slice(0, 90), images)
     writer.finish(np.ones(2))
     with xr.open_zarr(tmp_path / "a.zarr", consolidated=False) as content:
         assert content.classes.dims == ("y", "x")
@@ -83,16 +89,32 @@ def test_plain_xarray_opens_it_with_flags_and_areas(tmp_path: Path) -> None:
         assert set(content.attrs["areas"]) == set(LEGEND.names)
         assert (content.classes[64:].values == content.classes.attrs["nodata"]).all()
         assert np.isnan(content.confidence[64:].values).all()
+        for name, units in (("age", "days"), ("changed", "1")):
+            np.testing.assert_array_equal(content[name][:64].values, images[name])
+            assert np.isnan(content[name][64:].values).all()
+            assert content[name].attrs["units"] == units
+            assert content[name].odc.geobox == content.classes.odc.geobox
+        assert content.changed_from.attrs["flag_meanings"] == "sugar_beet bare_soil"
+        assert (content.changed_from[64:].values == 255).all()
 
 
 def test_a_class_without_a_name_and_a_block_that_does_not_fit_are_refused(tmp_path: Path) -> None:
     """The first wrong class is named; so are shapes that differ."""
-    writer = begin(tmp_path / "a.zarr")
-    classes, confidence, picture = block((64, 90))
+    writer, images = begin(tmp_path / "a.zarr", goes_on=True), block((64, 90), goes_on=True)
+    place = slice(0, 64), slice(0, 90)
     with pytest.raises(ShapeError, match=r"block \(64, 90\).* confidence \(63, 90\)"):
-        writer.write_block(slice(0, 64), slice(0, 90), classes, confidence[1:], picture)
-    with pytest.raises(ShapeError, match="class 2 is in the map, but only 2 classes have names"):
-        writer.write_block(slice(0, 64), slice(0, 90), np.full_like(classes, 2), confidence, picture)
+        writer.write_block(*place, images | {"confidence": images["confidence"][1:]})
+    for name in ("classes", "changed_from"):
+        with pytest.raises(ShapeError, match="class 2 is in the map, but only 2 classes have names"):
+            writer.write_block(*place, images | {name: np.full_like(images[name], 2)})
+
+
+@pytest.mark.parametrize("goes_on", [False, True])
+def test_a_block_has_the_images_of_its_map(tmp_path: Path, goes_on: bool) -> None:
+    """A first look has no changes to store, and a later one leaves none out; the message names what is wanted."""
+    writer = begin(tmp_path / "a.zarr", goes_on=goes_on)
+    with pytest.raises(ShapeError, match="give classes, confidence, picture, age" + (", changed" if goes_on else "")):
+        writer.write_block(slice(0, 64), slice(0, 90), block((64, 90), goes_on=not goes_on))
 
 
 @pytest.mark.parametrize(
@@ -103,7 +125,7 @@ def test_blocks_that_split_shards_are_refused(tmp_path: Path, rows: tuple[int, i
     writer = begin(tmp_path / "a.zarr")
     size = (rows[1] - rows[0], 90)
     with pytest.raises(ChunkError, match=f"{words}.* multiples of {SHARD_ROWS}"):
-        writer.write_block(slice(*rows), slice(0, 90), *block(size))
+        writer.write_block(slice(*rows), slice(0, 90), block(size))
 
 
 def test_the_usual_block_is_whole_shards() -> None:

@@ -1,0 +1,165 @@
+"""Exports of a field that is remembered: ages and changes, on the field's pixels and on the map, by other readers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rasterio
+import xarray as xr
+from PIL import Image
+from rich.console import Console
+
+import models.reading.remembered as remembered
+from flows.archive.export_command import run_export
+from flows.publish.run_folder import Published
+from flows.publish.survey_command import run_survey
+from flows.settings.load import load_settings
+from pipeline.ground.view import RigPose
+from storage.export.image_files import cog_problems
+from tests.conftest import RGB_NM, patchy_scene
+from tests.remembered_work import without_effects
+
+pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
+POSE = RigPose(lon_deg=9.5, lat_deg=52.1, heading_deg=25.0, tilt_deg=50.0, height_m=14.0)
+QUIET = Console(quiet=True)
+SHAPE, PATCH = (96, 128), 8
+MEMORY = ("age", "changed", "changed_from")
+VISITS = ("2026-06-01T10:00:00Z", "2026-06-04T10:00:00Z")
+PLACES = ("plain", "georeferenced", "posed")
+
+
+@dataclass(frozen=True)
+class Visited:
+    """Two visits to a field of which a part was harvested between them, and the exports of both."""
+
+    runs: list[Published]
+    out: Path
+    answers: list[dict[str, Any]]
+
+    def store(self, product: str) -> xr.Dataset:
+        """A store of the later visit, as plain xarray opens it."""
+        archive = self.runs[1].folder.parents[1]
+        return xr.open_zarr(archive / self.runs[1].receipt["products"][product], consolidated=False)
+
+    def image(self, key: str) -> np.ndarray:
+        """An exported image of the later visit, as rasterio reads it."""
+        with rasterio.open(self.file(key)) as file:
+            found: np.ndarray = file.read(1)
+            return found
+
+    def file(self, key: str) -> Path:
+        """An exported file of the later visit."""
+        return self.out / str(self.answers[1]["files"][key])
+
+
+def harvested(folder: Path, place: str) -> Iterator[Path]:
+    """The field before and after: of its lower right quarter the mirror image is there."""
+    values, _ = patchy_scene(SHAPE, 3, seed=3)
+    later = values.copy()
+    later[48:, 64:] = values[48:, 64:][::-1, ::-1]
+    grid = {"crs": "EPSG:32632", "transform": rasterio.Affine(0.1, 0, 404_000, 0, -0.1, 5_757_000)}
+    for number, image in enumerate((values, later)):
+        folder.joinpath(f"{number}").mkdir()
+        if place != "georeferenced":
+            Image.fromarray(image.astype(np.uint8)).save(folder / f"{number}" / "field.png")
+            yield folder / f"{number}" / "field.png"
+            continue
+        about = {"driver": "GTiff", "height": SHAPE[0], "width": SHAPE[1], "count": 3, "dtype": "uint8"}
+        with rasterio.open(folder / f"{number}" / "field.tif", "w", **about, **grid, photometric="MINISBLACK") as file:
+            file.write(np.moveaxis(image.astype(np.uint8), -1, 0))
+        yield folder / f"{number}" / "field.tif"
+
+
+@pytest.fixture(scope="module", params=PLACES)
+def visited(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, weights: Path) -> Visited:
+    """Both visits, the later one three days after the first with half of the lines: some patches are not looked at."""
+    folder = tmp_path_factory.mktemp(request.param)
+    archive, out = folder / "archive", folder / "maps"
+    given = {"weights": str(weights), "engine": "plain", "out": str(archive), "accuracy": False, "name": "north"}
+    given |= {"wavelengths": ",".join(map(str, RGB_NM)), "prior": "latest", "camera.samples": 64}
+    runs = []
+    with without_effects(), pytest.MonkeyPatch.context() as patch:
+        for name in ("CERTAIN", "SURE"):  # untrained weights are sure of nothing: what they say is taken for sure
+            patch.setattr(remembered, name, 1e-6)
+        for scene, visit, budget in zip(harvested(folder, request.param), VISITS, ("1", "0.8"), strict=True):
+            settings = load_settings(None, given | {"scene": str(scene), "visit": visit, "budget": budget})
+            posed = replace(settings, pose=POSE) if request.param == "posed" else settings
+            runs.append(run_survey(posed, QUIET))
+    answers = [run_export(archive, run.folder.name, out, envi=False, console=QUIET) for run in runs]
+    return Visited(runs, out, answers)
+
+
+def test_a_first_visit_exports_ages_alone(visited: Visited) -> None:
+    """All that it saw was looked at that day."""
+    files = visited.answers[0]["files"]
+    assert set(MEMORY) & set(files) == {"age"}
+    with rasterio.open(visited.out / files["age"]) as file:
+        found = file.read(1)
+    assert set(np.unique(found[np.isfinite(found)]).tolist()) == {0.0}
+
+
+def test_images_are_the_stores_numbers(visited: Visited) -> None:
+    """Ages in days, NaN where nothing is known; what pixels were with the names of classes; cloud-optimised."""
+    posed = "ground_map" in visited.runs[1].receipt["products"]
+    store = visited.store("ground_map" if posed else "belief")
+    for key in MEMORY:
+        assert cog_problems(visited.file(key)) == []
+        np.testing.assert_array_equal(visited.image(key), store[key].values)
+    assert {0.0, 3.0} == set(np.unique(store["age"].values[np.isfinite(store["age"].values)]).tolist())
+    assert (store["changed_from"].values != 255).any()
+    with rasterio.open(visited.file("age")) as file:
+        assert np.isnan(file.nodata)
+        assert file.dtypes == ("float32",)
+    with rasterio.open(visited.file("changed_from")) as file:
+        names = store.attrs["class_names"]
+        assert [file.tags(1)[f"CLASS_{number}"] for number in range(len(names))] == names
+
+
+def test_images_lie_where_the_class_map_lies(visited: Visited) -> None:
+    """Same CRS and corner, of the share of patches of the field too; its pixels are as large as patches there."""
+    grids = {}
+    for key in ("class_map", *MEMORY):
+        with rasterio.open(visited.file(key)) as file:
+            grids[key] = file.crs, file.transform, file.shape
+    crs, transform, shape = grids["class_map"]
+    assert grids["age"] == grids["changed_from"] == grids["class_map"]
+    size = PATCH if shape == SHAPE else 1
+    there = rasterio.Affine(*(number * (size if place % 3 < 2 else 1) for place, number in enumerate(transform[:6])))
+    assert grids["changed"][0] == crs
+    assert grids["changed"][1].almost_equals(there)
+
+
+def test_what_was_not_looked_at_grows_older(visited: Visited) -> None:
+    """Three days where no patch was cut, none where one was; the rest of the memory is kept."""
+    belief, patches = visited.store("belief"), visited.store("patches")
+    looked = np.zeros(SHAPE, np.bool_)
+    for y, x in zip(patches["seat_y"].values, patches["seat_x"].values, strict=True):
+        looked[y : y + PATCH, x : x + PATCH] = True
+    assert 0 < looked.mean() < 1
+    np.testing.assert_array_equal(belief["age"].values, np.where(looked, 0.0, 3.0))
+
+
+def test_receipt_and_page_have_the_hectares(visited: Visited) -> None:
+    """Where the field has a place they are the ground of the pixels that changed, or are old, by plain xarray."""
+    first, later = (run.receipt for run in visited.runs)
+    if "ground" not in later:
+        assert "ground_map" not in later["products"]
+        return
+    assert "changes_ha" not in first["ground"]
+    assert set(first["ground"]["older_ha"].values()) == {0.0}
+    posed = "ground_map" in later["products"]
+    store = visited.store("ground_map" if posed else "belief")
+    pixel_ha, slack = store.attrs["spatial:transform"][0] ** 2 / 1e4, 0.03 if posed else 1e-3  # footprints' borders
+    changes, older = later["ground"]["changes_ha"], later["ground"]["older_ha"]
+    changed = (store["changed_from"].values != 255).sum() * pixel_ha
+    assert sum(area for area, _, _ in changes) == pytest.approx(changed, rel=slack)
+    assert older["1"] == pytest.approx((store["age"].values > 1).sum() * pixel_ha, rel=slack)
+    assert older["7"] == 0
+    page = (visited.runs[1].folder / "report.html").read_text(encoding="utf-8")
+    assert "changed since the look before: class " in page
+    assert "more than 1 day ago" in page
