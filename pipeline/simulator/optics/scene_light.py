@@ -6,22 +6,15 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.lazy import deferred
-from pipeline.rectify.kernels import tensor_rows
 from pipeline.simulator.optics.kernel_fit import Footprint
 from pipeline.simulator.optics.rays import RayViews
 from pipeline.simulator.optics.tap_sums import Gatherer, ScenePixels
 from pipeline.simulator.scenes.scene import THINNED_MARGIN, RasterScene
-
-if TYPE_CHECKING:
-    import torch
-else:
-    torch = deferred("torch")
 
 Floats = NDArray[np.float64]
 Light = NDArray[np.float32]
@@ -30,42 +23,58 @@ MOST_PARTS = 1_500_000  # components of samples through kernels, at once: few ca
 LEAST_COLUMNS = 16  # of a product whose rows come out the same wherever they stand: with 5 or 9 they do not
 
 
+class _BandProduct(NamedTuple):
+    """Bands that one product makes, the columns of a table of nodes that it takes, and how they are mixed."""
+
+    bands: slice
+    taken: slice
+    mixing: Light  # (node * component, band), with bands of nothing where there are few
+
+
 @dataclass(frozen=True)
-class _Bands:
+class _Mixing:
     """From components through every kernel to bands: kernels are summed to nodes, of which each band is between two.
 
     Products are always of the same shape, so that a sample's light does not depend on the others.
     """
 
     shares: Light  # (node, kernel)
-    mixing: Light  # (node * component, band), or (kernel, band) where every band has a plane of its own
-    own_planes: bool
+    products: tuple[_BandProduct, ...]
 
     @staticmethod
-    def of(shares: Light, between: Floats, spectra: Light) -> _Bands:
-        """Those of spectra (component, band), or (band,)."""
-        if spectra.ndim == 1:
-            return _Bands(shares, ((shares.T @ between) * spectra).astype(np.float32), own_planes=True)
-        mixing = (between[:, None] * spectra).reshape(-1, spectra.shape[1]).astype(np.float32)
-        wide = np.pad(mixing, ((0, 0), (0, max(LEAST_COLUMNS - mixing.shape[1], 0))))
-        return _Bands(shares, wide, own_planes=False)
+    def of(shares: Light, between: Floats, spectra: Light) -> _Mixing:
+        """That of spectra (component, band): bands that follow each other between the same nodes are made at once."""
+        bands, components = spectra.shape[1], spectra.shape[0]
+        lower, cuts = (between > 0).argmax(axis=0), [0]
+        for cut in (np.flatnonzero(np.diff(lower)) + 1).tolist():
+            if min(cut - cuts[-1], bands - cut) >= LEAST_COLUMNS:
+                cuts.append(cut)
+        products = []
+        for some in map(slice, cuts, [*cuts[1:], bands]):
+            nodes = np.flatnonzero(between[:, some].any(axis=1))
+            near = slice(int(nodes[0]), int(nodes[-1]) + 1)
+            mixing = (between[near, None, some] * spectra[:, some]).reshape(-1, some.stop - some.start)
+            wide = np.pad(mixing.astype(np.float32), ((0, 0), (0, max(LEAST_COLUMNS - mixing.shape[1], 0))))
+            products.append(_BandProduct(some, slice(near.start * components, near.stop * components), wide))
+        return _Mixing(shares, tuple(products))
 
     def write(self, parts: Light, light: Light) -> None:
         """Write light (n, band) of the first samples of components (kernel, some times `MIXED`, component)."""
-        if self.own_planes:
-            np.einsum("knb,kb->nb", parts[:, : len(light)], self.mixing, out=light)
-            return
-        nodes, kernels = self.shares.shape
-        mixing, shares = torch.from_numpy(self.mixing), torch.from_numpy(self.shares)
-        columns, wide = torch.from_numpy(parts).view(kernels, -1), parts.shape[2] * MIXED
-        for number, first in enumerate(range(0, len(light), MIXED)):
-            summed = torch.mm(shares, columns[:, number * wide : (number + 1) * wide]).view(nodes, MIXED, -1)
-            table = summed.permute(1, 0, 2).reshape(MIXED, -1)
-            into = torch.from_numpy(light[first : first + MIXED])
-            if into.shape == (MIXED, mixing.shape[1]):
-                torch.mm(table, mixing, out=into)
-            else:
-                into.copy_(torch.mm(table, mixing)[: into.shape[0], : into.shape[1]])
+        for first in range(0, len(light), MIXED):
+            table, into = self._table(parts[:, first : first + MIXED]), light[first : first + MIXED]
+            for bands, taken, mixing in self.products:
+                if len(into) == MIXED and mixing.shape[1] == bands.stop - bands.start:
+                    np.matmul(table[:, taken], mixing, out=into[:, bands])
+                else:
+                    into[:, bands] = (table[:, taken] @ mixing)[: len(into), : bands.stop - bands.start]
+
+    def _table(self, parts: Light) -> Light:
+        """Components of `MIXED` samples at every node, (n, node * component)."""
+        (kernels, count, components), nodes = parts.shape, len(self.shares)
+        if kernels == nodes == 1:
+            return np.asarray(parts[0] * self.shares[0, 0])
+        summed: Light = self.shares @ parts.reshape(kernels, -1)
+        return summed.reshape(nodes, count, components).transpose(1, 0, 2).reshape(count, -1)
 
 
 class Looker:
@@ -92,26 +101,36 @@ class Looker:
         pixels = {level: _pixels(scene, along_y, level) for level in levels}
         sums = np.where(self.footprint.level == 1, math.prod(self.footprint.parts), 1)
         shares = (self.footprint.shares / np.reshape(len(steps) * sums, (-1, 1))).T.astype(np.float32)
-        count, components = len(steps[0].along), spectra.shape[0]
+        count, components, kernels = len(steps[0].along), spectra.shape[0], self.footprint.kernels
         light = np.empty((count, spectra.shape[-1]), np.float32)
-        kernels = self.footprint.kernels
+        if spectra.ndim == 1:
+            gains = ((shares.T @ self.footprint.between) * spectra).astype(np.float32)
+            light[:] = 0
+            self._gather(pixels, steps, light[None], np.zeros(kernels, np.intp), gains)
+            return light
         at_once = MIXED * int(np.clip(MOST_PARTS // (MIXED * kernels * components), 1, -(-count // MIXED)))
-        parts, more = (np.zeros((kernels, at_once, components), np.float32) for _ in range(2))
-        bands = _Bands.of(shares, self.footprint.between, spectra)
+        parts, gains = np.empty((kernels, at_once, components), np.float32), np.ones((kernels, components), np.float32)
+        mixing = _Mixing.of(shares, self.footprint.between, spectra)
         for first in range(0, count, at_once):
             chunk = slice(first, min(first + at_once, count))
-            rows = chunk.stop - first
-            for number, views in enumerate(steps):
-                into = more if number else parts
-                for level, some, gatherer in self.gatherers:
-                    gatherer.gather(pixels[level], views[chunk].thinned(level, THINNED_MARGIN), into[:, :rows], some)
-                if number:
-                    parts[:, :rows] += more[:, :rows]
-            bands.write(parts, light[chunk])
+            parts[:] = 0
+            self._gather(pixels, [views[chunk] for views in steps], parts, np.arange(kernels), gains)
+            mixing.write(parts, light[chunk])
         return light
+
+    def _gather(
+        self,
+        pixels: dict[int, ScenePixels],
+        steps: Sequence[RayViews],
+        out: Light,
+        numbers: NDArray[np.intp],
+        gains: Light,
+    ) -> None:
+        for views in steps:
+            for level, some, gatherer in self.gatherers:
+                seen = views.thinned(level, THINNED_MARGIN)
+                gatherer.gather(pixels[level], seen, out, numbers[some], gains[some])
 
 
 def _pixels(scene: RasterScene, along_y: bool, level: int) -> ScenePixels:
-    planes = np.ascontiguousarray(scene.raster.thinned(level), np.float32)
-    rows, columns, components = planes.shape
-    return ScenePixels(tensor_rows(planes.reshape(-1, components)), (rows, columns), along_y)
+    return ScenePixels(np.ascontiguousarray(scene.raster.thinned(level), np.float32), along_y)
