@@ -6,75 +6,67 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.lazy import deferred
 from pipeline.simulator.optics.kernel_fit import Footprint
 from pipeline.simulator.optics.rays import RayViews
 from pipeline.simulator.optics.tap_sums import Gatherer, ScenePixels
 from pipeline.simulator.scenes.scene import THINNED_MARGIN, RasterScene
 
+if TYPE_CHECKING:
+    from pipeline.simulator.optics import band_sums
+else:
+    band_sums = deferred("pipeline.simulator.optics.band_sums")
+
 Floats = NDArray[np.float64]
 Light = NDArray[np.float32]
-MIXED = 1024  # samples in a product
 MOST_PARTS = 1_500_000  # components of samples through kernels, at once: few calls, and little memory
-LEAST_COLUMNS = 16  # of a product whose rows come out the same wherever they stand: with 5 or 9 they do not
+LEAST_BANDS = 16  # that are mixed by themselves: fewer cost as much
 
 
 class _BandProduct(NamedTuple):
-    """Bands that one product makes, the columns of a table of nodes that it takes, and how they are mixed."""
+    """Bands that follow each other, the nodes that they lie between, and how these are mixed to them."""
 
     bands: slice
-    taken: slice
-    mixing: Light  # (node * component, band), with bands of nothing where there are few
+    nodes: slice
+    rows: Light  # as `band_sums.mixing_rows` has them
 
 
 @dataclass(frozen=True)
 class _Mixing:
-    """From components through every kernel to bands: kernels are summed to nodes, of which each band is between two.
-
-    Products are always of the same shape, so that a sample's light does not depend on the others.
-    """
+    """From components through every kernel to bands: kernels are summed to nodes, of which each band is between two."""
 
     shares: Light  # (node, kernel)
     products: tuple[_BandProduct, ...]
 
     @staticmethod
     def of(shares: Light, between: Floats, spectra: Light) -> _Mixing:
-        """That of spectra (component, band): bands that follow each other between the same nodes are made at once."""
-        bands, components = spectra.shape[1], spectra.shape[0]
-        lower, cuts = (between > 0).argmax(axis=0), [0]
-        for cut in (np.flatnonzero(np.diff(lower)) + 1).tolist():
-            if min(cut - cuts[-1], bands - cut) >= LEAST_COLUMNS:
+        """That of spectra (component, band): bands between the same nodes are made at once."""
+        bands, cuts = spectra.shape[1], [0]
+        for cut in (np.flatnonzero(np.diff((between > 0).argmax(axis=0))) + 1).tolist():
+            if min(cut - cuts[-1], bands - cut) >= LEAST_BANDS:
                 cuts.append(cut)
         products = []
         for some in map(slice, cuts, [*cuts[1:], bands]):
-            nodes = np.flatnonzero(between[:, some].any(axis=1))
-            near = slice(int(nodes[0]), int(nodes[-1]) + 1)
-            mixing = (between[near, None, some] * spectra[:, some]).reshape(-1, some.stop - some.start)
-            wide = np.pad(mixing.astype(np.float32), ((0, 0), (0, max(LEAST_COLUMNS - mixing.shape[1], 0))))
-            products.append(_BandProduct(some, slice(near.start * components, near.stop * components), wide))
-        return _Mixing(shares, tuple(products))
+            found = np.flatnonzero(between[:, some].any(axis=1))
+            nodes = slice(int(found[0]), int(found[-1]) + 1)
+            mixing = (between[nodes, None, some] * spectra[:, some]).reshape(-1, some.stop - some.start)
+            products.append(_BandProduct(some, nodes, band_sums.mixing_rows(mixing.astype(np.float32))))
+        return _Mixing(np.ascontiguousarray(shares), tuple(products))
 
     def write(self, parts: Light, light: Light) -> None:
-        """Write light (n, band) of the first samples of components (kernel, some times `MIXED`, component)."""
-        for first in range(0, len(light), MIXED):
-            table, into = self._table(parts[:, first : first + MIXED]), light[first : first + MIXED]
-            for bands, taken, mixing in self.products:
-                if len(into) == MIXED and mixing.shape[1] == bands.stop - bands.start:
-                    np.matmul(table[:, taken], mixing, out=into[:, bands])
-                else:
-                    into[:, bands] = (table[:, taken] @ mixing)[: len(into), : bands.stop - bands.start]
-
-    def _table(self, parts: Light) -> Light:
-        """Components of `MIXED` samples at every node, (n, node * component)."""
-        (kernels, count, components), nodes = parts.shape, len(self.shares)
-        if kernels == nodes == 1:
-            return np.asarray(parts[0] * self.shares[0, 0])
-        summed: Light = self.shares @ parts.reshape(kernels, -1)
-        return summed.reshape(nodes, count, components).transpose(1, 0, 2).reshape(count, -1)
+        """Write light (n, band) of components through kernels, (kernel, n, component)."""
+        nodes = np.empty((len(self.shares), *parts.shape[1:]), np.float32)
+        if self.shares.size == 1:
+            np.multiply(parts, self.shares[0, 0], out=nodes)
+        else:
+            band_sums.sum_nodes(parts.reshape(len(parts), -1), self.shares, nodes.reshape(len(nodes), -1))
+        for bands, some, rows in self.products:
+            band_sums.mix_bands(nodes, some.start, some.stop, rows, bands.start, bands.stop - bands.start, light)
 
 
 class Looker:
@@ -94,7 +86,7 @@ class Looker:
     def look(self, scene: RasterScene, steps: Sequence[RayViews], *, along_y: bool, exposures: float) -> Light:
         """Give the light (n, band) of samples that look so at each of the held positions. [e-]
 
-        A sample's light does not depend on the others: products of matrices are always of the same shape.
+        A sample's light does not depend on the others.
         """
         spectra = scene.electrons * np.float32(exposures)
         levels = np.unique(self.footprint.level).tolist()
@@ -108,12 +100,11 @@ class Looker:
             light[:] = 0
             self._gather(pixels, steps, light[None], np.zeros(kernels, np.intp), gains)
             return light
-        at_once = MIXED * int(np.clip(MOST_PARTS // (MIXED * kernels * components), 1, -(-count // MIXED)))
-        parts, gains = np.empty((kernels, at_once, components), np.float32), np.ones((kernels, components), np.float32)
-        mixing = _Mixing.of(shares, self.footprint.between, spectra)
+        gains, mixing = np.ones((kernels, components), np.float32), _Mixing.of(shares, self.footprint.between, spectra)
+        at_once = max(MOST_PARTS // (kernels * components), 1)
         for first in range(0, count, at_once):
             chunk = slice(first, min(first + at_once, count))
-            parts[:] = 0
+            parts = np.zeros((kernels, chunk.stop - first, components), np.float32)
             self._gather(pixels, [views[chunk] for views in steps], parts, np.arange(kernels), gains)
             mixing.write(parts, light[chunk])
         return light
