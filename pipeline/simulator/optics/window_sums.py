@@ -165,11 +165,15 @@ def _sum_taps(planes: Light, places: Places, weight: Light, taps: int, n: int, t
         return
     for one in range(components):
         total[one] = np.float32(0)
+    here = np.uint64(n)
     for tap in range(0, places.shape[1], TAPS_AT_ONCE):
-        w0, w1, w2, w3 = weight[tap, n], weight[tap + 1, n], weight[tap + 2, n], weight[tap + 3, n]
-        w4, w5, w6, w7 = weight[tap + 4, n], weight[tap + 5, n], weight[tap + 6, n], weight[tap + 7, n]
-        p0, p1, p2, p3 = places[n, tap], places[n, tap + 1], places[n, tap + 2], places[n, tap + 3]
-        p4, p5, p6, p7 = places[n, tap + 4], places[n, tap + 5], places[n, tap + 6], places[n, tap + 7]
+        t0 = np.uint64(tap)
+        t1, t2, t3, t4 = t0 + np.uint64(1), t0 + np.uint64(2), t0 + np.uint64(3), t0 + np.uint64(4)
+        t5, t6, t7 = t0 + np.uint64(5), t0 + np.uint64(6), t0 + np.uint64(7)
+        w0, w1, w2, w3 = weight[t0, here], weight[t1, here], weight[t2, here], weight[t3, here]
+        w4, w5, w6, w7 = weight[t4, here], weight[t5, here], weight[t6, here], weight[t7, here]
+        p0, p1, p2, p3 = places[here, t0], places[here, t1], places[here, t2], places[here, t3]
+        p4, p5, p6, p7 = places[here, t4], places[here, t5], places[here, t6], places[here, t7]
         p0, p1, p2, p3 = np.uint64(p0), np.uint64(p1), np.uint64(p2), np.uint64(p3)
         p4, p5, p6, p7 = np.uint64(p4), np.uint64(p5), np.uint64(p6), np.uint64(p7)
         for one in range(components):

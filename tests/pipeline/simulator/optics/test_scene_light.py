@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +18,8 @@ from pipeline.simulator.optics.scene_light import Looker, _Mixing
 from pipeline.simulator.scenes.scene import RasterScene
 from tests.pipeline.simulator.small_scenes import made_scene
 
+ROOT = Path(__file__).parents[4]
+BOTH = (False, True)
 SHAPE = (23, 37)
 COUNT = 150  # samples: some blocks, and a part of one
 KINDS = {"one": 1, "few": 3, "materials": 27, "own plane": 2, "own planes": 40}
@@ -23,6 +29,8 @@ def scene_of(kind: str, bands: int = 40) -> RasterScene:
     """Pixels that know nothing of their neighbours, mixed to bands or with a plane for each."""
     rng, components = np.random.default_rng(5), KINDS[kind]
     planes = rng.uniform(0, 1, (*SHAPE, components))
+    if kind == "materials":  # a pixel has few of many
+        planes *= rng.random((6, 7, components)).repeat(4, axis=0).repeat(6, axis=1)[: SHAPE[0], : SHAPE[1]] < 0.15
     if kind.startswith("own"):
         return made_scene(planes, rng.uniform(1e3, 9e3, components), np.linspace(400, 1000, components))
     return made_scene(planes, rng.uniform(1e3, 9e3, (components, bands)), np.linspace(400, 1000, bands))
@@ -48,7 +56,7 @@ def look(scene: RasterScene, views: RayViews, *, along_y: bool = False) -> np.nd
     return Looker(footprint_of(scene), views_of(COUNT)).look(scene, [views], along_y=along_y, exposures=1.0)
 
 
-@pytest.mark.parametrize("along_y", [False, True])
+@pytest.mark.parametrize("along_y", BOTH)
 @pytest.mark.parametrize("kind", KINDS)
 def test_light_of_a_sample_does_not_depend_on_the_others(kind: str, along_y: bool) -> None:
     """However samples are ordered and divided among calls and threads, each has the same bits."""
@@ -85,6 +93,28 @@ def test_the_last_pixels_are_seen_as_any(kind: str) -> None:
     np.testing.assert_array_equal(one, other)
 
 
+def far_and_near() -> np.ndarray:
+    """Light of samples in small scenes, far beside them and nowhere, of all kinds."""
+    views = replace(views_of(COUNT, 60.0), scan=np.where(np.arange(COUNT) % 5, 3.0, np.nan))
+    return np.concatenate([look(scene_of(kind), views, along_y=along_y).ravel() for kind in KINDS for along_y in BOTH])
+
+
+CHECKED = """
+import sys
+import numpy
+from tests.pipeline.simulator.optics.test_scene_light import far_and_near
+numpy.save(sys.argv[1], far_and_near())
+"""
+
+
+def test_no_index_leaves_its_array(tmp_path: Path) -> None:
+    """With every index checked loops end well, and give what they give without."""
+    place = {"PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": str(tmp_path / "numba"), "NUMBA_BOUNDSCHECK": "1"}
+    command = [sys.executable, "-c", CHECKED, str(tmp_path / "light.npy")]
+    subprocess.run(command, env={**os.environ, **place}, cwd=ROOT, check=True)
+    np.testing.assert_allclose(np.load(tmp_path / "light.npy"), far_and_near(), rtol=1e-5)
+
+
 @pytest.mark.parametrize("place", [-1e300, 1e300, np.inf, -np.inf])
 @pytest.mark.parametrize("kind", ["few", "materials", "own planes"])
 def test_places_far_out_read_the_scene_s_edge(kind: str, place: float) -> None:
@@ -92,8 +122,9 @@ def test_places_far_out_read_the_scene_s_edge(kind: str, place: float) -> None:
     scene, views = scene_of(kind), views_of(4)
     far = look(scene, replace(views, along=np.full(4, place), scan=np.full(4, 3.0)))
     near = look(scene, replace(views, along=np.full(4, np.copysign(1e6, place)), scan=np.full(4, 3.0)))
-    np.testing.assert_array_equal(np.isfinite(far), True) if np.isfinite(place) else None
-    np.testing.assert_allclose(far[np.isfinite(far)], near[np.isfinite(far)], rtol=1e-6)
+    seen = np.isfinite(far)  # how far a place that is not finite lies beside its pixel is no number
+    assert seen.all() or np.isinf(place)
+    np.testing.assert_allclose(far[seen], near[seen], rtol=1e-6)
 
 
 @pytest.mark.parametrize(("nodes", "bands"), [(1, 2), (1, 270), (3, 17), (5, 70), (5, 270), (9, 33)])
