@@ -66,19 +66,19 @@ class Gatherer:
         ``numbers`` (kernel,) where in ``out`` kernels belong. A sample's light does not depend on the others.
         """
         (rows, columns, components), along_y = pixels.planes.shape, pixels.along_y
-        raster = window_sums.Raster(columns, rows, components, along_y)
+        raster = window_sums.PixelTable(columns, rows, components, along_y)
         table = views.table()
         window_sums.gather_windows(
             pixels.planes.reshape(-1), raster, table, self._kernels, self._along, self._scan, numbers, gains, out
         )
 
 
-def kernels_of(footprint: Footprint) -> window_sums.Kernels:
+def kernels_of(footprint: Footprint) -> window_sums.PartedKernels:
     """Give a footprint's kernels and the parts of its box as the compiled loops take them."""
     (across, along), (slit, pixel) = footprint.parts, footprint.box
     variance = footprint.variance + np.array([[pixel / along], [slit / across]]) ** 2 / 12
     shift, variance = np.array(footprint.shift, np.float32, order="C"), np.array(variance, order="C")
-    return window_sums.Kernels(shift, variance, slit**2 / 12 * (1 - 1 / across**2), part_places(footprint))
+    return window_sums.PartedKernels(shift, variance, slit**2 / 12 * (1 - 1 / across**2), part_places(footprint))
 
 
 def place_parts(footprint: Footprint, views: RayViews) -> tuple[Floats, Light]:

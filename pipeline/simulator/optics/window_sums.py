@@ -24,8 +24,8 @@ FEW = 4  # components that are summed one by one
 LANES = 16  # components at a time: those of the next pixel are summed with them, and left
 
 
-class Kernels(NamedTuple):
-    """Kernels and their parts: shifts (2, kernel) [px], variances (2, kernel) [px^2], places (2, part) [px]."""
+class PartedKernels(NamedTuple):
+    """PartedKernels and their parts: shifts (2, kernel) [px], variances (2, kernel) [px^2], places (2, part) [px]."""
 
     shift: Light
     variance: Floats
@@ -33,7 +33,7 @@ class Kernels(NamedTuple):
     place: Light
 
 
-class Raster(NamedTuple):
+class PixelTable(NamedTuple):
     """How pixels lie in a table: how many along its inner and its outer axis, and whether lines lie along the outer."""
 
     inner: int
@@ -45,13 +45,13 @@ class Raster(NamedTuple):
 _PIXELS, _VIEWS = rows_of(FLOATS, 1, read_only=True), rows_of(DOUBLES, 2)
 _LIGHT2, _LIGHT3, _FLOATS2 = rows_of(FLOATS, 2), rows_of(FLOATS, 3), rows_of(DOUBLES, 2)
 _TABLE = record_of(TapTable, _LIGHT2, OFFSETS, DOUBLES, DOUBLES, OFFSETS, OFFSETS, OFFSETS, DOUBLES)
-_KERNELS = record_of(Kernels, _LIGHT2, _FLOATS2, DOUBLES, _LIGHT2)
-_RASTER = record_of(Raster, OFFSETS, OFFSETS, OFFSETS, types.boolean)
+_KERNELS = record_of(PartedKernels, _LIGHT2, _FLOATS2, DOUBLES, _LIGHT2)
+_RASTER = record_of(PixelTable, OFFSETS, OFFSETS, OFFSETS, types.boolean)
 _NUMBERS, _PLACES = rows_of(types.intp, 1), rows_of(OFFSETS, 2)
 
 
 @compiled(_VIEWS, _LIGHT2, OFFSETS, _KERNELS, _FLOATS2, _LIGHT3)
-def place_parts(views: Floats, beside: Light, kernel: int, kernels: Kernels, scale: Floats, off: Light) -> None:
+def place_parts(views: Floats, beside: Light, kernel: int, kernels: PartedKernels, scale: Floats, off: Light) -> None:
     """Write the scales (2, n) of a kernel and how far beside their pixel its parts lie, (2, part, n) [px].
 
     All along the line, then the scan. ``views`` (6, n) are `RayViews`, ``beside`` (2, n) how far from their pixel they
@@ -193,9 +193,9 @@ def _sum_taps(planes: Light, places: Places, weight: Light, taps: int, n: int, t
 @compiled(_PIXELS, _RASTER, _VIEWS, _KERNELS, _TABLE, _TABLE, _NUMBERS, _LIGHT2, _LIGHT3)
 def gather_windows(
     planes: Light,
-    raster: Raster,
+    raster: PixelTable,
     views: Floats,
-    kernels: Kernels,
+    kernels: PartedKernels,
     along: TapTable,
     scan: TapTable,
     numbers: NDArray[np.intp],
