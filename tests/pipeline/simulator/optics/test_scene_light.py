@@ -95,7 +95,8 @@ def test_the_last_pixels_are_seen_as_any(kind: str) -> None:
 
 def far_and_near() -> np.ndarray:
     """Light of samples in small scenes, far beside them and nowhere, of all kinds."""
-    views = replace(views_of(COUNT, 60.0), scan=np.where(np.arange(COUNT) % 5, 3.0, np.nan))
+    views = views_of(COUNT, 60.0)
+    views = replace(views, scan=np.where(np.arange(COUNT) % 5, views.scan, np.nan))
     return np.concatenate([look(scene_of(kind), views, along_y=along_y).ravel() for kind in KINDS for along_y in BOTH])
 
 
