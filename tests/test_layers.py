@@ -36,7 +36,8 @@ OWNERS = {
     "obstore": ("storage",),
     "serial": ("pipeline/rig",),
     "pyftpdlib": ("pipeline/rig",),
-    "torch": ("models", "pipeline/rectify", "pipeline/simulator"),
+    "torch": ("models", "pipeline/rectify"),
+    "numba": ("pipeline",),
 }
 DISTRIBUTIONS = {
     "PIL": "pillow",

@@ -18,7 +18,8 @@ from pipeline.simulator.effects.mirror_path import beside_plan, greatest_lag_px,
 from pipeline.simulator.effects.pointing import at_line_ends, end_gains
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.optics.rays import RayViews
-from pipeline.simulator.optics.tap_sums import BETWEEN_ROWS, SCALE_STEP, TABULATED, Parts, fewest_parts
+from pipeline.simulator.optics.tap_sums import TABULATED, Parts, fewest_parts
+from pipeline.simulator.optics.tap_tables import BETWEEN_ROWS, SCALE_STEP
 from pipeline.simulator.rig_model import Rig
 
 MARGIN = 1.5  # over what the probe measured at the roughest places found

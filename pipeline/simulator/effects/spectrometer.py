@@ -18,9 +18,9 @@ from pipeline.simulator.effects.probe import Probe, difference_rates, rising_gap
 from pipeline.simulator.rig_model import Rig
 
 if TYPE_CHECKING:
-    import torch
+    from pipeline.simulator.effects import neighbour_bands
 else:
-    torch = deferred("torch")
+    neighbour_bands = deferred("pipeline.simulator.effects.neighbour_bands")
 
 Floats = NDArray[np.float64]
 Light = NDArray[np.float32]
@@ -30,7 +30,6 @@ BANDS_AT_ONCE = 32  # bands that one product makes
 LEAST_WEIGHT = 1e-8
 REACH_SD = 6.0  # the kernel's weight beyond it is below 1e-8
 CUBIC, LINEAR = "cubic", "linear"
-SAMPLES_AT_ONCE = 32  # samples at a time: they stay in the processor's cache
 
 
 class BandGroup(NamedTuple):
@@ -185,10 +184,8 @@ class Smile(LightChange):
             return light
         bands = tuple(map(float, block.wavelength_nm))
         first, weights = _tap_weights(bands, float(smile), camera.samples, variant)
-        out = np.empty_like(light)
-        for start in range(0, light.shape[1], SAMPLES_AT_ONCE):
-            some = slice(start, start + SAMPLES_AT_ONCE)
-            _mix_bands(light[:, some], out[:, some], first, weights[:, some])
+        out = np.empty(light.shape, np.float32)
+        neighbour_bands.mix_neighbours(np.ascontiguousarray(light, np.float32), weights, first, out)
         return out
 
 
@@ -198,15 +195,6 @@ def wavelength_shift(samples: int, smile_nm: float) -> Floats:
     if half == 0:
         return np.zeros(samples)
     return np.asarray(smile_nm * ((np.arange(samples) - half) / half) ** 2, np.float64)
-
-
-def _mix_bands(light: Light, made: Light, first: int, weights: Light) -> None:
-    bands, (from_light, into, shares) = light.shape[-1], map(torch.from_numpy, (light, made, weights))
-    torch.mul(from_light, shares[-first], out=into)
-    for tap, share in enumerate(shares, start=first):
-        if tap != 0:  # one pass over the light, not a product and a sum
-            low, high = max(0, -tap), bands - max(0, tap)
-            into[..., low:high].addcmul_(from_light[..., low + tap : high + tap], share[:, low:high])
 
 
 @lru_cache(maxsize=4)

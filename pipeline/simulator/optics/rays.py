@@ -46,6 +46,10 @@ class RayViews:
             return self
         return replace(self, along=self.along / level + before, scan=self.scan / level + before)
 
+    def table(self) -> Floats:
+        """All of them as rows, (6, n), in the order in which they stand here."""
+        return np.stack([np.asarray(getattr(self, one.name), np.float64) for one in fields(self)])
+
     def flat(self) -> RayViews:
         return RayViews(*(np.ravel(getattr(self, one.name)) for one in fields(self)))
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import io
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -155,6 +158,28 @@ def test_unusual_files_are_scanned_or_refused(command_line: Any, tmp_path: Path)
     (message,) = ended.errors
     assert "has no finite value at row 3, column 4, band 2 (pixels without: 2)" in message
     assert not (tmp_path / "none").exists()
+
+
+WITHOUT = """
+import sys
+from flows.cli.main import main
+try:
+    main(sys.argv[1:])
+except SystemExit as ended:
+    assert ended.code == 0
+assert "numba" in sys.modules
+assert "torch" not in sys.modules
+"""
+
+
+def test_no_scan_waits_for_torch(tmp_path: Path) -> None:
+    """It takes seconds to load, and with all effects on nothing of a scan is computed by it."""
+    np.save(tmp_path / "some.npy", np.random.default_rng(0).uniform(0.1, 1, (20, 30, 3)).astype(np.float32))
+    flags = ["-o", str(tmp_path / "scan"), "--coarse", "--effects", "all", "--wavelengths", "460,550,650"]
+    command = [sys.executable, "-c", WITHOUT, "simulate", str(tmp_path / "some.npy"), *narrow(tmp_path), *flags]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
 
 
 ROW = {"name": "smile", "state": "on", "variant": "cubic", "bound": 0.0, "measured": None, "cost_s": 0.004, "why": ""}

@@ -18,7 +18,8 @@ from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
 from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.optics.rays import exact_views, middle_normal
-from pipeline.simulator.optics.tap_sums import TapTable, blurred_weight, box_weight
+from pipeline.simulator.optics.tap_tables import TapTable, blurred_weight, box_weight
+from pipeline.simulator.optics.window_sums import read_weights
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Optics, Rig
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
@@ -149,8 +150,10 @@ def test_table_is_the_kernel_at_any_place_and_scale(width: float, blur: float, s
     """Weights out of the table sum to 1 and are those of the kernel, by place and by scale right to a thousandth."""
     variance = np.array([0.0, blur**2])
     table = TapTable.of(width, variance, 1, (0.99, 1.04), 0.5)
-    place = np.array([off], np.float32)[None, None]
-    weight = table.read(np.repeat(place, 2, axis=0), table.scale_rows(np.full((2, 1), scale)))[..., 0, 0]
+    weight, places = np.empty((2, table.taps, 1), np.float32), np.full((2, 1, 1), off, np.float32)
+    for kernel in range(2):
+        read_weights(table, kernel, np.full((2, 1), scale), places, 0, 0, weight[kernel])
+    weight = weight[..., 0].T
     apart = table.left + off - np.arange(table.taps)
     distance, kernels = blurred_weight(width * scale, variance * scale**2)
     wanted = np.stack([np.interp(apart, distance, kernel, 0.0, 0.0) for kernel in kernels], axis=1)
