@@ -75,7 +75,7 @@ class Case:
 def random_case(number: int) -> Case:
     """Give the case of a number, always the same."""
     rng = np.random.default_rng([6, number])
-    rig = _rig(rng)
+    rig = random_rig(rng)
     upright = bool(rng.random() < 0.3)
     scene = _scene(rng, rig.camera, upright=upright, long_px=LONG_PX)
     far = float(rng.choice([0.0, rng.uniform(-LONG_PX / 2 + 40, LONG_PX / 2 - 40)]))
@@ -145,7 +145,8 @@ def _spectrum(rng: np.random.Generator, nm: Floats) -> Floats:
     return spectrum
 
 
-def _rig(rng: np.random.Generator) -> Rig:
+def random_rig(rng: np.random.Generator) -> Rig:
+    """Give a rig of random numbers within sensible ranges; it has about half of what a rig may have."""
     camera = LineCamera(
         samples=int(rng.choice(SAMPLES)),
         exposure_ms=float(np.exp(rng.uniform(np.log(3), np.log(100)))),
