@@ -58,8 +58,7 @@ def _seen_through(probe: Probe, beside_px: float, sd_px: float) -> Detail:
     found = []
     for reach in (0.0, *(one.reach_px for one in probe.beside)):
         near = probe.within(max(beside_px, min(beside_px + reach, last)))
-        beyond = 4 * scipy.special.ndtr(-reach / sd_px) if sd_px else 0.0
-        far = beyond * probe.anywhere
+        far = 4 * scipy.special.ndtr(-reach / sd_px if sd_px else -np.inf) * probe.anywhere
         found.append((near.slope + far, near.curvature + 4 * far, near.span + far))
     if probe.afar is not None and sd_px > WIDE_PX:
         found.append((probe.afar.slope, probe.afar.curvature, probe.afar.span))
@@ -69,7 +68,8 @@ def _seen_through(probe: Probe, beside_px: float, sd_px: float) -> Detail:
 
 def _turned(probe: Probe, turn: float) -> Probe:
     """The probe of an image that shifts turn a little, so that what rises along one axis rises along the other."""
-    return replace(probe, slope=probe.slope + turn * probe.slope[::-1])
+    beside = tuple(replace(one, slope=one.slope + turn * one.slope[::-1]) for one in probe.beside)
+    return replace(probe, slope=probe.slope + turn * probe.slope[::-1], beside=beside)
 
 
 def greatest_way_px(probe: Probe, rig: Rig, effects: Sequence[Effect]) -> float:

@@ -97,9 +97,8 @@ def probe_scene(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Uni
     most = (room - room // 3) // (patch_views(binning) * len({sweep.along for sweep in taken}))
     most = max(most, 1 if binning == 1 else _LEAST_PLACES)
     cells = reached_cells(scene.shape, camera, taken)
-    places = telling_places(
-        scene, camera, taken, cells, REACHES, (most, *(max(most // 4, 1) for _ in REACHES), _FAR_PLACES)
-    )
+    counts = (most, *(max(most // 4, 1) for _ in REACHES), _FAR_PLACES)
+    places = telling_places(scene, camera, taken, cells, REACHES, counts)
     own = joined([lines, views_of_places(places.seen, scene, camera, taken)])
     beside = _views_beside(scene, camera, taken, places)
     views = joined([own, *beside])
@@ -111,10 +110,14 @@ def probe_scene(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Uni
     found = replace(summed, usual_e=usual, places=places.seen)
     if beside:
         found = replace(found, **looks.beside(scene, cells.covers))
-        way = greatest_way_px(found, rig, EFFECTS)
-        own = joined([own, *(one for one, nearer in zip(beside, (0.0, *REACHES), strict=True) if nearer < way)])
-    found = replace(found, slit_errors=_slit_errors(scene, rig, own, taken, unit))
+    moved_to = _within(beside, greatest_way_px(found, rig, EFFECTS)) if beside else []
+    found = replace(found, slit_errors=_slit_errors(scene, rig, joined([own, *moved_to]), taken, unit))
     return worst_of_groups(found) if scene.electrons.ndim == 1 and bands > TELLING_BANDS else found
+
+
+def _within(beside: Sequence[SampleViews], way_px: float) -> list[SampleViews]:
+    """Those of the views beside the sweeps to which shifts of the image may bring its samples."""
+    return [one for one, nearer in zip(beside, (0.0, *REACHES), strict=True) if nearer < way_px]
 
 
 def _views_beside(
