@@ -143,17 +143,23 @@ def kernel_error(block: SweepBlock, chosen: Mapping[Any, str] | Choice) -> float
     return _footprint(block, choice, folded_positions(block.sweep, choice.variant("smear"))).error
 
 
-def tails_apart(block: SweepBlock, chosen: Mapping[Any, str] | Choice, reach_px: float) -> Floats:
-    """Give the share of light, by size, that folding the held positions puts elsewhere beyond a reach, (band,).
+def tails_apart(
+    block: SweepBlock, one: Mapping[Any, str] | Choice, other: Mapping[Any, str] | Choice, reach_px: float
+) -> Floats:
+    """Give the share of light, by size, that the kernels of two choices put elsewhere beyond a reach, (band,).
 
-    Other kernels are fitted then to the same patterns, and where these have tails, so has what they are wrong by.
+    Where their blurs or held positions differ, other kernels are fitted to the same patterns; where these have tails,
+    so has what the kernels are wrong by.
     """
-    choice, held = Choice.of(chosen), block.sweep.step
-    alone, folded = (replace(_footprint(block, choice, count), held=held) for count in (1, held))
+    held, found = block.sweep.step, []
+    for choice in map(Choice.of, (one, other)):
+        found.append(
+            replace(_footprint(block, choice, folded_positions(block.sweep, choice.variant("smear"))), held=held)
+        )
     log_px, turn = np.linspace(math.log(reach_px), math.log(_BEYOND_PX), _RINGS), 2 * np.pi / _TURNS
     radius, angle = np.repeat(np.exp(log_px), _TURNS), np.tile(np.arange(_TURNS) * turn, _RINGS)
     along, scan = radius * np.cos(angle), radius * np.sin(angle)
-    apart = np.abs(alone.afar(along, scan) - folded.afar(along, scan))
+    apart = np.abs(found[0].afar(along, scan) - found[1].afar(along, scan))
     area = radius**2 * (log_px[1] - log_px[0]) * turn
     return np.asarray(area @ apart)
 

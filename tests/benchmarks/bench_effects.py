@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 import time
 from collections import defaultdict
@@ -25,9 +26,13 @@ from pipeline.simulator.selection.choice import Decision, decide
 from pipeline.simulator.selection.survey_probe import probe_scene
 from pipeline.simulator.selection.verification import candidate_blocks, verify, worst_blocks
 from tests.pipeline.simulator.bound_trials import DRAWN, Trial, trials
-from tests.pipeline.simulator.random_cases import random_case
+from tests.pipeline.simulator.pupil_reference import distances, random_tile
+from tests.pipeline.simulator.random_cases import Case, random_case
+from tests.pipeline.simulator.sparse_cases import sparse_case
 
 CASES = 200
+SPARSE_CASES = 70
+TILES = 40
 MOST_LOOSE = 6.0  # median of bound over measured change
 MOST_BINNING = 8  # every case is stored as samples, and in sums of 2 to so many
 TOLERANCE = 0.1
@@ -39,23 +44,40 @@ RIGS = {"rig at rest": Rig(), "rig 30 m away": Rig(air=Air(distance_m=30.0))}
 
 def rows() -> list[Row]:
     """Bounds by effect and variant, then tolerance and processor time of the farm."""
-    return [*_bounds(range(CASES)), *_farm()]
+    sparse = _bounds([sparse_case(number) for number in range(SPARSE_CASES)], "scenes of which looks see little")
+    return [
+        *_bounds([random_case(number) for number in range(CASES)], "random scenes and rigs"),
+        *sparse,
+        *_pupil(),
+        *_farm(),
+    ]
 
 
-def _bounds(numbers: Sequence[int]) -> list[Row]:
+def _pupil() -> list[Row]:
+    """How far everything on is from the pupil's own integral."""
+    found = []
+    for what, focus_m in (("sharp", None), ("40 m away, focused at infinity", math.inf)):
+        far = np.sort(np.concatenate([distances(random_tile(number, focus_m)) for number in range(TILES)]))
+        median, worst = float(np.median(far)), float(far[-1])
+        said = f"median {median:.2g}, 9 of 10 within {far[int(0.9 * len(far))]:.2g}, worst {worst:.2g} sigma"
+        found.append(Row(f"everything on beside the pupil's integral, {TILES} random tiles, {what}", said))
+    return found
+
+
+def _bounds(cases: Sequence[Case], what: str) -> list[Row]:
     found: dict[tuple[str, str], list[tuple[int, Trial]]] = defaultdict(list)
     began = time.process_time()
-    for number in numbers:
-        for trial in trials(random_case(number), (1, 2 + number % (MOST_BINNING - 1))):
+    for number, case in enumerate(cases):
+        for trial in trials(case, (1, 2 + number % (MOST_BINNING - 1))):
             found[trial.effect, trial.variant].append((number, trial))
     spent = time.process_time() - began
-    kept = [_of_effect(*key, cases) for key, cases in found.items()]
-    broken = sum(trial.is_broken for cases in found.values() for _, trial in cases)
+    kept = [_of_effect(*key, tried, what) for key, tried in found.items()]
+    broken = sum(trial.is_broken for tried in found.values() for _, trial in tried)
     count = sum(map(len, found.values()))
     return [
         *kept,
         Row(
-            f"bounds over {len(numbers)} random scenes and rigs, each as samples and in sums of 2 to {MOST_BINNING}",
+            f"bounds over {len(cases)} {what}, each as samples and in sums of 2 to {MOST_BINNING}",
             f"{broken} of {count} broken",
             "0",
             broken == 0,
@@ -64,7 +86,7 @@ def _bounds(numbers: Sequence[int]) -> list[Row]:
     ]
 
 
-def _of_effect(name: str, variant: str, cases: list[tuple[int, Trial]]) -> Row:
+def _of_effect(name: str, variant: str, cases: list[tuple[int, Trial]], what: str) -> Row:
     loose = {(number, trial.binning): trial.looseness for number, trial in cases if np.isfinite(trial.looseness)}
     broken = [(number, trial.binning) for number, trial in cases if trial.is_broken]
     said = "nothing seen"
@@ -74,7 +96,7 @@ def _of_effect(name: str, variant: str, cases: list[tuple[int, Trial]]) -> Row:
         said += f" (case {worst[0]}, sums of {worst[1]})"
     chance = "; 1 survey of 1000 may" if name in DRAWN else ""
     return Row(
-        f"bound / measured: {name}, {variant}",
+        f"bound / measured, {what}: {name}, {variant}",
         f"{len(broken)} of {len(cases)} broken; {said}",
         f"0 broken{chance}; median <= {MOST_LOOSE:g}",
         not broken and (not loose or statistics.median(loose.values()) <= MOST_LOOSE),

@@ -46,8 +46,9 @@ class Turbulence(Aim):
         if not sigma:
             return Bound(0.0, "no distance or no turbulence")
         farthest = sigma * math.sqrt(2 * math.log(max(probe.lines, 1) / RISK))
-        steep = np.hypot(*probe.slope)
-        change = float(np.minimum(steep * farthest, probe.span).max(initial=0.0))
+        near = probe.within(farthest)
+        steep = np.hypot(*near.slope)
+        change = float(np.minimum(steep * farthest, near.span).max(initial=0.0))
         strength = rytov_variance(rig, float(np.min(probe.wavelength_nm, initial=np.inf)))
         beyond = f"; a guess, beyond weak turbulence (Rytov variance {strength:.2g})" if strength > 1 else ""
         return Bound(
@@ -115,11 +116,12 @@ class Wind(Displacement):
         sway = sway_px(rig)
         if sway == 0:
             return Bound(0.0, "the air is calm")
-        steep = sway * np.hypot(probe.slope[0], probe.slope[1])
+        near = probe.within(sway)
+        steep = sway * np.hypot(*near.slope)
         aliased = ", too fast for the lines to follow" if sways_per_line(rig) > 0.5 else ""
         smeared = f"up to {within_exposure_px(rig):.2g} px of smear within an exposure are not modelled"
         return Bound(
-            float(np.minimum(steep, probe.span).max(initial=0.0)),
+            float(np.minimum(steep, near.span).max(initial=0.0)),
             f"the crop sways by {sway:.2g} px, {line_to_line_px(rig):.2g} px from line to line{aliased}; {smeared}",
         )
 

@@ -211,14 +211,15 @@ class Keystone(Blur):
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by the slope along the line times each band's shift, never more than the span."""
         shift = np.abs(keystone_shift(rig, probe.wavelength_nm))
-        change = np.minimum(probe.slope[0] * shift, probe.span)
+        near = probe.within(float(shift.max(initial=0.0)))
+        change = np.minimum(near.slope[0] * shift, near.span)
         if not shift.any():
             return Bound(0.0, "no shift along the line")
         band = int(np.argmax(change))
         return Bound(
             float(change[band]),
             f"{shift[band]:.2g} px along the line at {probe.wavelength_nm[band]:.0f} nm,"
-            f" on edges of at most {probe.slope[0, band]:.3g} {UNITS[probe.unit]}/px",
+            f" on edges of at most {near.slope[0, band]:.3g} {UNITS[probe.unit]}/px",
         )
 
 

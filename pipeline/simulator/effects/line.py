@@ -156,12 +156,13 @@ class Smear(Effect):
             along, scan = _beside(probe.sweeps, rig)
             along, scan = along + sway_gradient(rig), scan + sway_gradient(rig) + greatest_share(rig.air)
             way, area = np.abs(np.arange(most) - (most - 1) / 2).mean(), 2 * variance
-            by_scan = np.minimum(probe.slope[1] * way, probe.curvature[1] * area) * scan
+            near = probe.within(most / 2)
+            by_scan = np.minimum(near.slope[1] * way, near.curvature[1] * area) * scan
             beside = (ways - ways.mean(axis=1, keepdims=True) for ways in _courses(probe.sweeps, rig))
             uneven = max((float(np.abs(one).mean(axis=1).max()) for one in beside), default=0.0)
             course = at_line_ends(probe.sweeps, rig.camera, 0.0, uneven)
-            by_course = probe.slope[0] * course[0] + probe.slope[1] * course[1]
-            change = np.minimum(probe.slope[0] * way * along + by_scan + by_course, probe.span)
+            by_course = near.slope[0] * course[0] + near.slope[1] * course[1]
+            change = np.minimum(near.slope[0] * way * along + by_scan + by_course, near.span)
             # at a step of the relief up to half of the positions see the other depth, at most twice as far off
             step = PARALLAX.bound(probe, rig).value if rig.air.relief == "step" else 0.0
             return Bound(float(change.max(initial=0.0)) + step, f"lines of an exposure lie as one, {most} px")

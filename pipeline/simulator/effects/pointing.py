@@ -94,8 +94,9 @@ class Jitter(Aim):
                 worst = np.maximum(worst, [size[..., 0].max(), size[..., 1].max(), common.max()])
         along, scan, common = float(worst[0]), float(worst[1]), float(worst[2])
         most = math.sqrt(2 * math.log(lines / EXCEEDED))
-        g, h = probe.slope[0] * along, probe.slope[1] * scan
-        value = np.minimum(most * sigma * np.sqrt(g * g + h * h + 2 * common * g * h), probe.span).max(initial=0.0)
+        near = probe.within(most * sigma * max(along, scan))
+        g, h = near.slope[0] * along, near.slope[1] * scan
+        value = np.minimum(most * sigma * np.sqrt(g * g + h * h + 2 * common * g * h), near.span).max(initial=0.0)
         why = f"lines jump by {sigma * scan:.2f} px rms along the scan and {sigma * along:.2f} along the line"
         return Bound(float(value), f"{why}, one of {lines} by {most:.1f} times that")
 

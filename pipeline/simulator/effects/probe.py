@@ -8,11 +8,12 @@ stored number in its own sigmas, whatever the binning.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Literal, TypeVar
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from pipeline.geometry.scan import Sweep
@@ -23,6 +24,25 @@ Unit = Literal["sigma", "dn"]
 UNITS = {"sigma": "sigma", "dn": "DN"}
 Light = NDArray[np.float32]
 Real = TypeVar("Real", np.float32, np.float64)
+
+
+WIDE_PX = 16 / 3  # sd of a blur from which on only means of several pixels count that lie far from a sample
+_FAR_SDS = (
+    3.0  # of a blur, within which derivatives are taken; beyond, its share of the light times the greatest change
+)
+
+
+@dataclass(frozen=True)
+class Detail:
+    """Greatest changes of light within a reach of the samples of all sweeps, theirs among it, band by band.
+
+    They are as those of the probe, over the least unit that a sample has.
+    """
+
+    reach_px: float
+    span: Floats  # (band,) greatest difference of a sample's signal and anything there
+    slope: Floats  # (2, band) [1/px]
+    curvature: Floats  # (2, band) [1/px^2]
 
 
 @dataclass(frozen=True)
@@ -56,11 +76,34 @@ class Probe:
     usual_e: Floats | None = None  # evenly spaced quantiles of the light along the lines; None where not known
     places: Floats = field(default_factory=lambda: np.zeros((0, 2)))  # the telling ones, rows and columns, worst first
     binning: int = 1  # samples that a stored number sums, the same in all of the sweeps
+    beside: tuple[Detail, ...] = ()  # what lies beside the sweeps, the nearest first; none where they see all there is
+    afar: Detail | None = None  # all of the scene, as what is `WIDE_PX` wide and more sees it: means of several pixels
+    anywhere: Floats | None = None  # (band,) greatest difference of a sample's signal and any of the scene
+    ends_e: Floats | None = None  # (2, band) least and greatest light of all the scene, None as `anywhere` [e-]
+
+    def within(self, reach_px: float) -> Probe:
+        """Give the probe of what lies no farther from the samples: it has the greatest slope, curvature and span there.
+
+        Farther than has been looked, light changes by no more than the greatest difference in a px.
+        """
+        if self.anywhere is None or reach_px == 0:
+            return self
+        for one in self.beside:
+            if reach_px <= one.reach_px:
+                return self._with(one)
+        both = np.stack([self.anywhere] * 2)
+        return replace(self, span=self.anywhere, slope=both, curvature=4 * both)
+
+    def blurred_by(self, sd_px: float) -> Probe:
+        """Give the probe of what a Gaussian of this size sees of the scene, its derivatives among it."""
+        wide = self.afar is not None and sd_px > WIDE_PX
+        return self._with(self.afar) if wide and self.afar else self.within(_FAR_SDS * sd_px)
 
     def moved(self, along_px: float, scan_px: float) -> float:
         """Bound what a shift of the image by at most so much changes: slope times way, never more than the span."""
-        steep = _times(self.slope[0], abs(along_px)) + _times(self.slope[1], abs(scan_px))
-        return float(np.minimum(steep, self.span).max(initial=0.0))
+        near = self.within(max(abs(along_px), abs(scan_px)))
+        steep = _times(near.slope[0], abs(along_px)) + _times(near.slope[1], abs(scan_px))
+        return float(np.minimum(steep, near.span).max(initial=0.0))
 
     def blurred(self, variance_px2: Floats) -> float:
         """Bound what a kernel of mean 0 and (2, band) variance changes in any band."""
@@ -69,8 +112,29 @@ class Probe:
     def change_blurred(self, variance_px2: Floats) -> Floats:
         """Bound what it changes in each band, (band,): C s^2 / 2, or G E|x| where that is less, or the span.
 
-        E|x| is at most s; the smaller bound takes over where the image is a step or a point.
+        E|x| is at most s; the smaller bound takes over where the image is a step or a point. What lies beside the
+        sweeps counts as far as the kernel reaches, and beyond by the share of it that does; a wide Gaussian is a
+        narrow one, and one of the rest of its variance that sees means of several pixels.
         """
+        widest = float(np.sqrt(np.max(variance_px2, initial=0.0)))
+        if self.anywhere is None or widest == 0:
+            return self._changed(variance_px2)
+        if self.afar is None or widest <= WIDE_PX:
+            near = [one for one in self.beside if one.reach_px >= _FAR_SDS * widest]
+            beyond = [4 * scipy.special.ndtr(-one.reach_px / widest) for one in near]
+            ways = [
+                self._with(one)._changed(variance_px2) + more * self.anywhere
+                for one, more in zip(near, beyond, strict=True)
+            ]
+            return np.asarray(np.min([*ways, self.anywhere], axis=0))
+        narrow = np.minimum(variance_px2, WIDE_PX**2)
+        both = self.change_blurred(narrow) + self._with(self.afar)._changed(variance_px2 - narrow)
+        return np.asarray(np.minimum(both, self.anywhere))
+
+    def _with(self, detail: Detail) -> Probe:
+        return replace(self, span=detail.span, slope=detail.slope, curvature=detail.curvature)
+
+    def _changed(self, variance_px2: Floats) -> Floats:
         by_curvature = _times(self.curvature, variance_px2 / 2)
         by_slope = _times(self.slope, np.sqrt(variance_px2))
         return np.asarray(np.minimum(np.minimum(by_curvature, by_slope).sum(axis=0), self.span))

@@ -37,6 +37,7 @@ from pipeline.simulator.effects.probe import (
 from pipeline.simulator.optics.kernel_fit import Moments
 from pipeline.simulator.optics.rays import normals_met
 from pipeline.simulator.rig_model import Rig
+from pipeline.simulator.selection.brought_light import blended_surroundings, light_brought
 
 SAFETY = 1.2  # maxima are read off a sample of the scene, derivatives off differences
 LEAST_COST_NS = 1e-3  # nothing that is computed is free: of two that bound alike, the one without cost stays on longer
@@ -129,9 +130,11 @@ def _worst_of(menus: Sequence[Menu]) -> Menu:
 def _options_of(probe: Probe, rig: Rig, effects: Sequence[Effect]) -> tuple[Menu, ...]:
     present = [_is_present(effect, probe, rig) for effect in effects]
     ranges = [_gain_range(one, probe, rig) if there else None for one, there in zip(effects, present, strict=True)]
+    moving = [one for one, there in zip(effects, present, strict=True) if there and _moves_light(one)]
+    probe = blended_surroundings(probe, rig, moving)
     growth = Growth(probe, rig)
     blurs = [effect for effect, there in zip(effects, present, strict=True) if there and hasattr(effect, "moments")]
-    through = light_through(probe, rig, blurs)
+    through = light_brought(light_through(probe, rig, blurs), rig, moving)
     menus = []
     for place, effect in enumerate(effects):
         arriving = probe
@@ -140,6 +143,12 @@ def _options_of(probe: Probe, rig: Rig, effects: Sequence[Effect]) -> tuple[Menu
         gain = _gain_beside(effect, ranges, place, growth)
         menus.append(_menu(effect, arriving, rig, present[place], gain))
     return tuple(menus)
+
+
+def _moves_light(effect: Effect) -> bool:
+    """Whether light comes from elsewhere by it; the slit's is in the probe already."""
+    acts = any(hasattr(effect, action) for action in ("aim", "displaced", "moments"))
+    return acts or effect.name in LIGHT_EFFECTS - {"slit"}
 
 
 def _menu(effect: Effect, probe: Probe, rig: Rig, present: bool, gain: float) -> Menu:
@@ -176,7 +185,8 @@ def _is_present(effect: Effect, probe: Probe, rig: Rig) -> bool:
 def _even_probe(probe: Probe, derivatives: float) -> Probe:
     """The probe of a scene of level 1 and the same derivatives in every band."""
     ones, both = np.ones(len(probe.wavelength_nm)), np.full((2, len(probe.wavelength_nm)), derivatives)
-    seen = replace(probe, level=ones, spread=ones, span=ones, slope=both, curvature=both)
+    alone = replace(probe, beside=(), afar=None, anywhere=None, ends_e=None)
+    seen = replace(alone, level=ones, spread=ones, span=ones, slope=both, curvature=both)
     return replace(seen, spectral_slope=both[0], spectral_curvature=both[1])
 
 
@@ -320,6 +330,7 @@ def _by_gaussian(probe: Probe, nm: Floats, shift: Floats, variance: Floats, widt
     """
     moved, spread, wider = (steepest_difference(values, nm) for values in (shift, variance, np.sqrt(variance)))
     shift_bend, spread_bend = (np.abs(second_difference(values, nm)) for values in (shift, variance))
+    probe = probe.blurred_by(float(np.sqrt(variance.max(initial=0.0))))
     steep = probe.slope * moved + np.minimum(probe.curvature * spread / 2, probe.slope * wider)
     turned = spread_bend / 2 + (moved + spread * FINEST_PER_PX / 2) ** 2
     bend = probe.slope * shift_bend + probe.curvature * turned

@@ -9,27 +9,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError
+from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import CostModel, Sweep, exposing
 from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE
 from pipeline.simulator.effects.effect import OFF
 from pipeline.simulator.effects.line import SLIT, UPRIGHT, box_of, box_parts
-from pipeline.simulator.effects.probe import Probe, Unit, second_difference, steepest_difference, stored_mean, unit_at
+from pipeline.simulator.effects.probe import Probe, Unit, stored_mean, unit_at
+from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.optics.kernel_fit import Footprint, Moments, fold
 from pipeline.simulator.optics.rays import middle_normal
 from pipeline.simulator.optics.tap_sums import LADDER
 from pipeline.simulator.render import views_all_over
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene
-from pipeline.simulator.selection.survey_looks import (
+from pipeline.simulator.scenes.scene import RasterScene
+from pipeline.simulator.selection.brought_light import greatest_way_px
+from pipeline.simulator.selection.light_maxima import SHIFTS, Looks, sum_up_looks, worst_of_groups
+from pipeline.simulator.selection.line_means import line_means
+from pipeline.simulator.selection.reached_cells import reached_cells
+from pipeline.simulator.selection.sample_views import (
     SampleViews,
     joined,
     light_seen,
-    line_sums,
     patch_views,
-    telling_places,
+    places_beyond,
     views_of_lines,
     views_of_places,
 )
+from pipeline.simulator.selection.surroundings import REACHES
+from pipeline.simulator.selection.telling_places import TELLING_BANDS, TellingPlaces, telling_places
 
 Floats = NDArray[np.float64]
 Light = NDArray[np.float32]
@@ -43,7 +50,8 @@ _LOOK, _CLOSE = (2, 1), (3, 1)  # boxes that are looked through, and that tell w
 _ROUNDING = 2e-6  # of the level: less is rounding of float32
 _ALIKE = 0.02  # share by which blurs may differ and count as one
 _OPTICS = (DIFFRACTION, DEFOCUS, ABERRATION, KEYSTONE)
-_NEAR, _FAR = 0.25, 0.5  # px by which the footprint is shifted
+_LINES_BESIDE = tuple(sign * reach for reach in (0.0, REACHES[-1]) for sign in (-1.0, 1.0))  # whose light may come
+_FAR_PLACES = 8  # the brightest and the darkest of what lies beyond
 _PHASES = tuple(((along, scan), (0.0, 0.0)) for along in (0.0, 0.5) for scan in (0.0, 0.5))  # at which boxes differ
 
 
@@ -87,19 +95,41 @@ def probe_scene(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Uni
     room = max(min(MOST_VALUES // bands, MOST_SAMPLES), 64)
     lines = views_of_lines(taken, camera, room // 3)
     most = (room - room // 3) // (patch_views(binning) * len({sweep.along for sweep in taken}))
-    places = telling_places(scene, camera, taken, max(most, 1 if binning == 1 else _LEAST_PLACES))
-    views = joined([lines, views_of_places(places, scene, camera, taken)])
-    none = (0.0, 0.0)
-    found = [(none, none)]
-    for axis in (0, 1):
-        both = [(way, 0.0) if axis == 0 else (0.0, way) for way in (-_FAR, -_NEAR, _NEAR, _FAR)]
-        found += [(way, none) for way in both] + [(none, way) for way in (both[0], both[3])]
-    seen = light_seen(scene, camera, views, _footprint(SLIT.variants[0], rig, _LOOK, None, scene), found)
-    means = seen[0, : len(lines.slope)].reshape(-1, line_sums(camera, binning) * binning * bands).mean(axis=1)
-    errors = _slit_errors(scene, rig, views, taken, unit)
+    most = max(most, 1 if binning == 1 else _LEAST_PLACES)
+    cells = reached_cells(scene.shape, camera, taken)
+    counts = (most, *(max(most // 4, 1) for _ in REACHES), _FAR_PLACES)
+    places = telling_places(scene, camera, taken, cells, REACHES, counts)
+    own = joined([lines, views_of_places(places.seen, scene, camera, taken)])
+    beside = _views_beside(scene, camera, taken, places)
+    views = joined([own, *beside])
+    seen = light_seen(scene, camera, views, _footprint(SLIT.variants[0], rig, _LOOK, None, scene), SHIFTS)
+    ends = np.cumsum([len(one.slope) for one in (own, *beside)])
+    looks = Looks.of(np.split(seen, ends[:-1], axis=1), binning, rig, unit)
+    summed = sum_up_looks(looks, scene, taken, line_means(scene, camera, taken, _LINES_BESIDE if beside else (0.0,)))
     usual = np.quantile(seen[0, : len(lines.slope)], np.linspace(0, 1, USUAL_LIGHTS)).astype(np.float64)
-    summed = _summed_up(scene, rig, taken, unit, seen, means)
-    return replace(summed, slit_errors=errors, usual_e=usual, places=places)
+    found = replace(summed, usual_e=usual, places=places.seen)
+    if beside:
+        found = replace(found, **looks.beside(scene, cells.covers))
+    moved_to = _within(beside, greatest_way_px(found, rig, EFFECTS)) if beside else []
+    found = replace(found, slit_errors=_slit_errors(scene, rig, joined([own, *moved_to]), taken, unit))
+    return worst_of_groups(found) if scene.electrons.ndim == 1 and bands > TELLING_BANDS else found
+
+
+def _within(beside: Sequence[SampleViews], way_px: float) -> list[SampleViews]:
+    """Those of the views beside the sweeps to which shifts of the image may bring its samples."""
+    return [one for one, nearer in zip(beside, (0.0, *REACHES), strict=True) if nearer < way_px]
+
+
+def _views_beside(
+    scene: RasterScene, camera: LineCamera, sweeps: tuple[Sweep, ...], places: TellingPlaces
+) -> list[SampleViews]:
+    """Patches beside the sweeps, within each reach of them and farther; none where nothing is."""
+    beyond = places.seen[places_beyond(places.seen, scene, camera, sweeps)]
+    near = [np.concatenate([beyond, places.beside[0]]), *places.beside[1:]]
+    if not any(map(len, (*near, places.far))):
+        return []
+    anywhere = float(10 * max(scene.shape))
+    return [views_of_places(some, scene, camera, sweeps, anywhere) for some in (*near, places.far)]
 
 
 def _taken(sweeps: Sequence[Sweep]) -> tuple[Sweep, ...]:
@@ -189,75 +219,3 @@ def _moments(rig: Rig, wavelength_nm: Floats, normal: Floats) -> Moments:
 def _stored(values: Light, views: SampleViews) -> Light:
     """Means over the samples of each stored number, (..., number, band)."""
     return np.asarray(stored_mean(values, views.binning), np.float32)
-
-
-def _summed_up(scene: RasterScene, rig: Rig, sweeps: tuple[Sweep, ...], unit: Unit, seen: Light, means: Light) -> Probe:
-    """Turn light (shift, view, band) and means of lines (line,) into the probe's maxima."""
-    camera, binning, least, most = rig.camera, sweeps[0].binning, seen.min(axis=0), seen.max(axis=0)
-    darkest, brightest = stored_mean(least, binning), stored_mean(most, binning)
-    scale = unit_at(darkest, rig, unit, binning)
-    slope, curvature = _derivatives(seen, scale, binning)
-    spectral = _spectral_derivatives(seen[0], scene.wavelength_nm, scale, binning)
-    low, high = least.min(axis=0), most.max(axis=0)
-    level = np.maximum(np.abs(brightest) / unit_at(brightest, rig, unit, binning), np.abs(darkest) / scale)
-    off_mean = np.maximum(most - means.min(), means.max() - least)
-    off_other = np.maximum(most - low, high - least)
-    return Probe(
-        unit=unit,
-        sweeps=sweeps,
-        wavelength_nm=scene.wavelength_nm,
-        fwhm_nm=scene.fwhm_nm,
-        level=_greatest(level),
-        spread=_greatest(stored_mean(_above(off_mean, high), binning) / scale),
-        span=_greatest(stored_mean(_above(off_other, high), binning) / scale),
-        slope=slope,
-        curvature=curvature,
-        spectral_slope=spectral[0],
-        spectral_curvature=spectral[1],
-        brightest_e=float(most.max()),
-        darkest_e=float(least.min()),
-        unit_least_dn=float(scale.min()) / camera.electrons_per_dn,
-        lines=sum(sweep.lines for sweep in sweeps),
-        seconds=CostModel().seconds(list(sweeps), camera),
-        white_e=scene.panel_electrons.astype(np.float64) * (camera.exposure_ms / DEFAULT_EXPOSURE_MS),
-        binning=binning,
-    )
-
-
-def _derivatives(seen: Light, scale: Light, binning: int) -> tuple[Floats, Floats]:
-    """Greatest first and second derivatives, (2, band) each over the unit, by differences within half a px.
-
-    Of a stored number the mean size over its samples: they may be moved one way or the other.
-    """
-    level, high = seen[0], np.abs(seen[0]).max(axis=0)
-
-    def size(difference: Light) -> Floats:
-        return _greatest(stored_mean(_above(np.abs(difference), high), binning) / scale)
-
-    slope, curvature = [], []
-    for axis in (0, 1):
-        behind, back, ahead, front, before, after = seen[1 + 6 * axis : 7 + 6 * axis]
-        near, far = [(behind, back), (back, level), (level, ahead), (ahead, front)], [(before, level), (level, after)]
-        triples = [(back, ahead, _NEAR), (behind, front, _FAR), (before, after, _FAR)]
-        steps = [size(b - a) / _NEAR for a, b in near] + [size(b - a) / _FAR for a, b in far]
-        slope.append(np.max(steps, axis=0))
-        curvature.append(np.max([size(a + b - 2 * level) / way**2 for a, b, way in triples], axis=0))
-    return np.array(slope), np.array(curvature)
-
-
-def _spectral_derivatives(level: Light, wavelength_nm: Floats, scale: Light, binning: int) -> tuple[Floats, Floats]:
-    """Greatest divided differences over wavelength at each band, (band,) each over the unit; 0 where there is none."""
-    nm = np.asarray(wavelength_nm, np.float64)
-    if len(nm) < 2:
-        return np.zeros(len(nm)), np.zeros(len(nm))
-    steep, bend = steepest_difference(level, nm), np.abs(second_difference(level, nm))
-    return _greatest(stored_mean(steep, binning) / scale), _greatest(stored_mean(bend, binning) / scale)
-
-
-def _above(difference: Light, high: Light) -> Light:
-    """0 where a difference is no more than rounding."""
-    return np.where(difference > _ROUNDING * np.abs(high), difference, np.float32(0))
-
-
-def _greatest(values: NDArray[np.floating]) -> Floats:
-    return np.asarray(values.max(axis=0).astype(np.float64))

@@ -11,14 +11,16 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from pipeline.errors import BoundError, ShapeError
-from pipeline.geometry.scan import Sweep, scene_to_sweep
+from pipeline.errors import BoundError, PoseError, ShapeError
+from pipeline.geometry.scan import Sweep, line_positions, scene_to_sweep
+from pipeline.simulator.effects.blurs import DIFFRACTION
 from pipeline.simulator.effects.effect import OFF, Effect, Light, SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT, SMEAR, folded_positions
 from pipeline.simulator.effects.probe import stored_mean
 from pipeline.simulator.optics.kernel_fit import NEGLIGIBLE
 from pipeline.simulator.optics.tap_sums import TABULATED
 from pipeline.simulator.render import kernel_error, tails_apart
+from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.selection.choice import TOTAL, UNIT_WORDS, Decision
 from pipeline.simulator.selection.options import acts_on_light
 
@@ -221,17 +223,26 @@ def misplaced_in_tails(
 ) -> Floats:
     """Bound by how much the tails of kernels make two ways differ at each sample, (1, sample, band). [e-]
 
-    They do where one of the ways folds the held positions and the other does not. Light that is spread `REACH_PX` and
-    more counts by the range of the scene within `TAILS_PX`.
+    They do where blurs or held positions are folded otherwise and both ways have the pattern of the pupil. Light that
+    is spread `REACH_PX` and more counts by the range of the scene within `TAILS_PX`.
     """
-    held = {folded_positions(block.sweep, _smear(ways)) for ways in (exact, chosen)}
-    if len(held) == 1:
+    share = tails_share(block, exact, chosen)
+    if not share.any():
         return np.zeros((1, block.rig.camera.samples, len(block.wavelength_nm)))
-    return tails_apart(block, exact, REACH_PX) * contrast_about(block, render, TAILS_PX)
+    return share * contrast_about(block, render, TAILS_PX)
 
 
-def _smear(ways: Mapping[Effect, str]) -> str:
-    return next((way for one, way in ways.items() if one.name == SMEAR.name), OFF)
+def tails_share(block: SweepBlock, exact: Mapping[Effect, str], chosen: Mapping[Effect, str]) -> Floats:
+    """Give the share of light, by size, that two ways put elsewhere beyond `REACH_PX` by other kernels, (band,)."""
+    positions = (folded_positions(block.sweep, _way(ways, SMEAR)) for ways in (exact, chosen))
+    same = len(set(positions)) == 1 and _folded(exact) == _folded(chosen)
+    if same or _way(exact, DIFFRACTION) != _way(chosen, DIFFRACTION):
+        return np.zeros(len(block.wavelength_nm))
+    return tails_apart(block, exact, chosen, REACH_PX)
+
+
+def _way(ways: Mapping[Effect, str], effect: Effect) -> str:
+    return next((way for one, way in ways.items() if one.name == effect.name), OFF)
 
 
 def _folded(ways: Mapping[Effect, str]) -> dict[str, str]:
@@ -244,9 +255,9 @@ def contrast_about(block: SweepBlock, render: Render, reach_px: int = REACH_PX) 
 
     The scene is looked at by middle rays, a px and half a px apart: pixels may lie between those of one look.
     """
-    sweep = block.sweep
-    held = replace(sweep, step=1, lines=sweep.lines * sweep.step)
-    ends = block.lines.start * sweep.step - reach_px, block.lines.stop * sweep.step + reach_px
+    held = _beyond(block.sweep, block.rig, reach_px)
+    first = round(block.sweep.start_px - held.start_px) + block.lines.start * block.sweep.step
+    ends = first - reach_px, first + len(block.lines) * block.sweep.step + reach_px
     wide = replace(block, sweep=held, lines=range(max(ends[0], 0), min(ends[1], held.lines)))
     if not wide.lines:
         return np.zeros((1, block.rig.camera.samples, len(block.wavelength_nm)))
@@ -254,6 +265,17 @@ def contrast_about(block: SweepBlock, render: Render, reach_px: int = REACH_PX) 
     ends_e = np.max([(seen.max(axis=0), -seen.min(axis=0)) for seen in looks], axis=0)
     most, least = (scipy.ndimage.maximum_filter1d(one, 2 * reach_px + 1, axis=0, mode="nearest") for one in ends_e)
     return np.asarray((most + least).astype(np.float64)[None])
+
+
+def _beyond(sweep: Sweep, rig: Rig, reach_px: int) -> Sweep:
+    """All positions that a sweep holds, one by one, and those beyond its ends; none that the mirror does not reach."""
+    held = replace(sweep, step=1, lines=sweep.lines * sweep.step)
+    wide = replace(held, start_px=held.start_px - reach_px - 1, lines=held.lines + 2 * (reach_px + 1))
+    try:
+        line_positions(wide, rig.camera)
+    except PoseError:
+        return held
+    return wide
 
 
 def _beside(sweep: Sweep, along_px: float, scan_px: float) -> Sweep:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -13,7 +13,14 @@ from pipeline.simulator.effects.probe import noise_electrons
 from pipeline.simulator.effects.registry import EFFECTS, READOUT
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.selection.options import SAFETY, Menu, list_options
-from pipeline.simulator.selection.verification import ROUNDING, contrast_about, misplaced_electrons, misplaced_share
+from pipeline.simulator.selection.verification import (
+    ROUNDING,
+    TAILS_PX,
+    contrast_about,
+    misplaced_electrons,
+    misplaced_share,
+    tails_share,
+)
 from tests.pipeline.simulator.random_cases import Case
 
 DRAWN = frozenset({"jitter", "turbulence"})  # one survey of 1000 may go beyond their bounds
@@ -56,15 +63,33 @@ class _Stored:
     contrast: list[Light]  # of the scene about each sum (1, number, band) [e-]
     rounding: float
 
-    def change(self, light: list[Light], full: list[Light], share: float) -> tuple[float, float]:
+    def change(self, light: list[Light], full: list[Light], share: float, tails: list[Light]) -> tuple[float, float]:
         """Greatest change of a stored number in its own sigmas, and what of it arithmetic does not explain."""
         most, left = 0.0, 0.0
-        for one, other, noise, contrast in zip(light, full, self.noise, self.contrast, strict=True):
+        every = zip(light, full, self.noise, self.contrast, tails, strict=True)
+        for one, other, noise, contrast, tail in every:
             change = np.abs(_summed(one - other, self.binning))
             misplaced = misplaced_electrons(_summed(other, self.binning), contrast, share)
+            misplaced = misplaced + _summed(tail, self.binning)
             most = max(most, float((change / noise).max()))
             left = max(left, float(((change - misplaced) / noise).max()))
         return most, left
+
+
+@dataclass(frozen=True)
+class _Afar:
+    """What lies far about the samples of a block; only looked at where tails differ."""
+
+    block: SweepBlock
+    render: Callable[..., Light]
+
+    @cached_property
+    def contrast(self) -> Light:
+        return np.asarray(contrast_about(self.block, self.render, TAILS_PX))
+
+    def of(self, share: Light) -> Light:
+        """What tails misplace at each sample, (1, sample, band) [e-]."""
+        return share * self.contrast if share.any() else np.zeros((1, self.block.rig.camera.samples, len(share)))
 
 
 def trials(case: Case, binnings: Sequence[int] = (1,), only: str = "") -> Iterator[Trial]:
@@ -81,6 +106,7 @@ def trials(case: Case, binnings: Sequence[int] = (1,), only: str = "") -> Iterat
     full = [expected_light(case.scene, block, exact) for block in blocks]
     render = partial(expected_light, case.scene)
     contrast = [np.asarray(contrast_about(block, render)) for block in blocks]
+    afar = [_Afar(block, render) for block in blocks]
     stored = [_stored(full, contrast, case, binning, found) for binning, found in zip(binnings, menus, strict=True)]
     for menu in (one for one in present if only in ("", one.name)):
         for variant in (OFF, *(option.variant for option in menu.variants[1:])):
@@ -88,9 +114,12 @@ def trials(case: Case, binnings: Sequence[int] = (1,), only: str = "") -> Iterat
             light = [_light(case, block, chosen) for block in blocks]
             shown = {one: way for one, way in chosen.items() if way != OFF}
             share = max(misplaced_share(block, exact, shown) for block in blocks)
+            tails = [far.of(tails_share(block, exact, shown)) for block, far in zip(blocks, afar, strict=True)]
             for one in stored:
                 bound = _error(one.menus, menu.name, variant) / SAFETY
-                yield Trial(menu.name, variant, one.binning, bound, *one.change(light, full, share), one.rounding)
+                yield Trial(
+                    menu.name, variant, one.binning, bound, *one.change(light, full, share, tails), one.rounding
+                )
 
 
 def _stored(full: list[Light], contrast: list[Light], case: Case, binning: int, menus: tuple[Menu, ...]) -> _Stored:

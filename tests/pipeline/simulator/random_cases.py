@@ -41,6 +41,7 @@ class Case:
     sweeps: tuple[Sweep, ...]
     seconds: float | None  # from the first line to the last; None is that of the sweeps
     seed: int
+    looked: range | None = None  # lines of every sweep that are measured; None is all
 
     def stored_in_sums_of(self, binning: int) -> Case:
         """The same, with so many neighbouring samples summed to one number."""
@@ -52,7 +53,7 @@ class Case:
         return probe if self.seconds is None else replace(probe, seconds=max(self.seconds, probe.seconds))
 
     def blocks(self, probe: Probe) -> list[SweepBlock]:
-        """All lines of every sweep: the first as the survey starts, the others as it ends."""
+        """Those lines of every sweep that are measured: the first as the survey starts, the others as it ends."""
         scene, rig = self.scene, self.rig
         white = scene.panel_electrons.astype(np.float64) * (rig.camera.exposure_ms / DEFAULT_EXPOSURE_MS)
         ends = [0.0, *(probe.seconds - rig.camera.scan_seconds(sweep.lines) for sweep in self.sweeps[1:])]
@@ -60,7 +61,7 @@ class Case:
             SweepBlock(
                 rig,
                 sweep,
-                range(sweep.lines),
+                self.looked or range(sweep.lines),
                 scene.wavelength_nm,
                 scene.shape,
                 seed=self.seed,
@@ -75,7 +76,7 @@ class Case:
 def random_case(number: int) -> Case:
     """Give the case of a number, always the same."""
     rng = np.random.default_rng([6, number])
-    rig = _rig(rng)
+    rig = random_rig(rng)
     upright = bool(rng.random() < 0.3)
     scene = _scene(rng, rig.camera, upright=upright, long_px=LONG_PX)
     far = float(rng.choice([0.0, rng.uniform(-LONG_PX / 2 + 40, LONG_PX / 2 - 40)]))
@@ -145,7 +146,8 @@ def _spectrum(rng: np.random.Generator, nm: Floats) -> Floats:
     return spectrum
 
 
-def _rig(rng: np.random.Generator) -> Rig:
+def random_rig(rng: np.random.Generator) -> Rig:
+    """Give a rig of random numbers within sensible ranges; it has about half of what a rig may have."""
     camera = LineCamera(
         samples=int(rng.choice(SAMPLES)),
         exposure_ms=float(np.exp(rng.uniform(np.log(3), np.log(100)))),

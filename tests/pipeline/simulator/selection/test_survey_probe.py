@@ -20,7 +20,7 @@ from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Detector, Rig
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.selection.options import SAFETY, list_options
-from pipeline.simulator.selection.survey_looks import views_of_places
+from pipeline.simulator.selection.sample_views import views_of_places
 from pipeline.simulator.selection.survey_probe import probe_scene, probe_survey
 from tests.pipeline.simulator.small_scenes import image_scene, made_scene
 

@@ -273,10 +273,11 @@ def test_tails_are_alike_where_held_positions_are() -> None:
     block = sweep_block(image_scene(np.ones((48, 64, 1)), RIG.camera, [550.0]), RIG, SWEEP, range(2))
     without = {effect: way for effect, way in EXACT.items() if effect is not DIFFRACTION}
     assert misplaced_in_tails(block, EXACT, without, render).max() == 0
-    shares = [tails_apart(block, EXACT, reach_px) for reach_px in (8, 32, 128)]
+    folded = {**EXACT, SMEAR: "folded"}
+    shares = [tails_apart(block, EXACT, folded, reach_px) for reach_px in (8, 32, 128)]
     assert np.all(np.diff(np.concatenate(shares)) < 0)
     assert 1e-5 < shares[0][0] < 1e-3
-    assert tails_apart(block, without, 8).max() < 1e-6
+    assert tails_apart(block, without, {**without, SMEAR: "folded"}, 8).max() < 1e-6
 
 
 def test_even_light_differs_by_float32_alone() -> None:

@@ -1,0 +1,71 @@
+"""What lies beside the samples of sweeps and is brought to them by what blurs and shifts: its greatest changes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, to_bands
+
+Light = NDArray[np.float32]
+Floats = NDArray[np.float64]
+REACHES = (2.0, 6.0, 24.0)  # px beside the sweeps, within which is looked as closely as where they see
+BLOCK_PX = 4  # of the scene, averaged: a blur of `WIDE_PX` and more sees means of two by two of them
+_ROWS_AT_ONCE = 64
+
+
+@dataclass(frozen=True)
+class WideLight:
+    """Means of several pixels of a scene: their ends (band,) [e-] and derivatives (2, band) [e-/px, e-/px^2]."""
+
+    low: Light
+    high: Light
+    slope: Light
+    curvature: Light
+
+
+def seen_widely(scene: RasterScene, exposure_ms: float) -> WideLight:
+    """Give what is `WIDE_PX` wide and wider sees of all the scene: means of 2 x 2 blocks of `BLOCK_PX`.
+
+    Derivatives are the greatest along either axis.
+    """
+    spectra = scene.electrons * np.float32(exposure_ms / DEFAULT_EXPOSURE_MS)
+    bands = len(scene.wavelength_nm)
+    low, high = np.full(bands, np.inf, np.float32), np.full(bands, -np.inf, np.float32)
+    slope, curvature, window = np.zeros(bands, np.float32), np.zeros(bands, np.float32), 2 * BLOCK_PX
+    for means in _means(scene, spectra):
+        low, high = np.minimum(low, means.min(axis=(0, 1))), np.maximum(high, means.max(axis=(0, 1)))
+        for axis in (0, 1):
+            ahead, middle, behind = _thirds(means, axis)
+            bent = ahead + behind - 2 * middle
+            slope = np.maximum(slope, np.abs(ahead - middle).max(axis=(0, 1), initial=0.0))
+            curvature = np.maximum(curvature, np.abs(bent).max(axis=(0, 1), initial=0.0))
+    steep, bent = np.stack([slope] * 2) / np.float32(window), np.stack([curvature] * 2) / np.float32(window**2)
+    return WideLight(low, high, steep, bent)
+
+
+def _means(scene: RasterScene, spectra: Light) -> Iterator[Light]:
+    """Light of windows of two by two blocks, a block apart, in overlapping parts of the scene, (row, column, band)."""
+    planes = scene.planes
+    short = [-size % BLOCK_PX for size in scene.shape]
+    if any(short):
+        planes = np.pad(planes, ((0, short[0]), (0, short[1]), (0, 0)), mode="edge")
+    rows, columns = (size // BLOCK_PX for size in planes.shape[:2])
+    blocks = planes.reshape(rows, BLOCK_PX, columns, BLOCK_PX, -1).sum(axis=1).sum(axis=2) / np.float32(BLOCK_PX**2)
+    blocks = np.pad(blocks, ((4, 4), (4, 4), (0, 0)), mode="edge")
+    sums = blocks[1:] + blocks[:-1]
+    windows = (sums[:, 1:] + sums[:, :-1]) / np.float32(4)
+    for first in range(0, len(windows), _ROWS_AT_ONCE):
+        part = windows[first : first + _ROWS_AT_ONCE + 4]
+        if len(part) > 4 or not first:
+            yield to_bands(part, spectra)
+
+
+def _thirds(means: Light, axis: int) -> tuple[Light, Light, Light]:
+    """Windows ahead of, at and behind each place, side by side along an axis."""
+    size = means.shape[axis]
+    ahead, middle, behind = (means.take(range(at, size - 4 + at), axis=axis) for at in (4, 2, 0))
+    return ahead, middle, behind

@@ -1,0 +1,21 @@
+"""The reference of everything on: its pupil is the closed form's, its light that of the renderer's kernels."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pipeline.simulator.optics.rays import pupil_contrast
+from tests.pipeline.simulator.pupil_reference import autocorrelation, distances, random_tile
+
+
+def test_quadrature_over_chords_is_the_closed_form() -> None:
+    """What a round pupil passes of a wave, integrated, is Goodman's formula."""
+    u, passed = autocorrelation()
+    np.testing.assert_allclose(passed, pupil_contrast(u), atol=1e-6)
+
+
+@pytest.mark.parametrize("number", [0, 2])
+def test_kernels_show_what_the_pupil_does(number: int) -> None:
+    """Of noise and of points, held positions and keystone among it, light is within 0.1 sigma of the integral."""
+    assert distances(random_tile(number)).max() < 0.1
