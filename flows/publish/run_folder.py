@@ -56,7 +56,7 @@ from storage.arrays.ground_maps import load_ground_map
 from storage.arrays.mosaics import load_attention, open_patches
 from storage.arrays.quicklooks import choose_bands
 
-LIBRARIES = ("spectralzoom", "numpy", "torch", "zarr", "xarray", "prefect")
+LIBRARIES = ("spectralzoom", "numpy", "numba", "torch", "zarr", "xarray", "prefect")
 
 
 @dataclass(frozen=True)

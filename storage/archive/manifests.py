@@ -36,7 +36,7 @@ FORMAT = 2
 PACKED = "packed"  # what a store was before an earlier version of this program packed its numbers with pcodec
 EXTENDED = "extended"  # what a run was before something was added to it
 CURE = "restore it from a copy, or run verify --repair on the archive"
-_DISTRIBUTIONS = ("spectralzoom", "numpy", "torch", "xarray", "zarr", "numcodecs")
+_DISTRIBUTIONS = ("spectralzoom", "numpy", "numba", "torch", "xarray", "zarr", "numcodecs")
 
 
 @dataclass(frozen=True)
