@@ -35,10 +35,12 @@ from pipeline.geometry.grid import UNLABELLED
 from pipeline.rectify.registration.field_shift import FieldShift, field_shift
 from storage.arrays.beliefs import BeliefStore, write_belief_tile, write_changes_tile
 from storage.arrays.class_maps import write_class_tile
-from storage.arrays.mosaics import mosaic_brightness, open_patches
+from storage.arrays.layout import read_array
+from storage.arrays.mosaics import PatchStore, mosaic_brightness, open_patches
 from storage.arrays.tile_work import let_tiles_go
 from storage.parallel.crew import run_blocks
 
+ENOUGH_SEEN = 0.5  # of a seat at the edge of a look at a part, so that what it shows is read
 Strange = tuple[int, int]  # coarse pixels, and fine ones, with a value that is no reading
 
 
@@ -65,16 +67,16 @@ class Drawing:
         seen = look_at(weights, self.mosaic, region)
         strange = np.zeros(region.grid.seat_shape, np.int64)
         seats, columns = seat_columns(weights, store, store.wavelength_nm, seen, region, strange=strange.ravel())
-        drawn = segment(weights, seen, columns, seats, every_class=True)
+        drawn, shown = segment(weights, seen, columns, seats, every_class=True), self._shown(region, store, seats)
         assert drawn.log_probability is not None
         unknown = None
         if self.unknown is not None:
             familiar, bands = self.weights.load_familiar(), len(store.wavelength_nm)
             unknown = self.unknown.pixels(familiar, seen, columns, seats, bands) & (drawn.classes != UNLABELLED)
-            unknown &= ~self._away(region, seats)
+            unknown &= shown | (not self.part)
             drawn.log_probability[unknown] = np.nan  # of what these pixels show the classes say nothing
         del columns  # a memory takes their room
-        looked = self._looked(region, self._within_zones(region, drawn.log_probability), seats, seen)
+        looked = self._looked(self._within_zones(region, drawn.log_probability), shown, seen)
         classes, confidence = drawn.classes, drawn.confidence
         comparison, old = None, None
         if self.memory is None:
@@ -104,25 +106,28 @@ class Drawing:
         away = np.load(self.left_out, mmap_mode="r")[region.read.rows, region.read.columns]
         return np.where(away[..., None], np.float32(np.nan), log_probability)
 
-    def _looked(
-        self, region: Region, log_probability: NDArray[np.float32], seats: NDArray[np.int64], seen: CoarseLook
-    ) -> Looked:
-        away = self._away(region, seats)
-        if away.any():
-            log_probability = np.where(away[..., None], np.float32(np.nan), log_probability)
-        return Looked(log_probability, _pixels_of(region, seats), seen.seen_columns, self.light, self.step)
+    def _looked(self, log_probability: NDArray[np.float32], shown: NDArray[np.bool_], seen: CoarseLook) -> Looked:
+        if self.part:
+            log_probability = np.where(shown[..., None], log_probability, np.float32(np.nan))
+        return Looked(log_probability, shown, seen.seen_columns, self.light, self.step)
 
-    def _away(self, region: Region, seats: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """(y, x) pixels of a region that a look at a part of its field did not show."""
-        return ~_pixels_of(region, seats) if self.part else np.zeros((region.grid.height, region.grid.width), np.bool_)
+    def _shown(self, region: Region, store: PatchStore, seats: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """(y, x) pixels of a region that were looked at in detail.
 
-
-def _pixels_of(region: Region, seats: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """(y, x) pixels of some seats of a region."""
-    grid = region.grid
-    detailed = np.zeros(grid.seat_shape, np.bool_)
-    detailed.ravel()[seats] = True
-    return np.repeat(np.repeat(detailed, grid.patch, axis=0), grid.patch, axis=1)[: grid.height, : grid.width]
+        Of a look at a part only what lines reached, in seats of which they reached enough: what is filled in beside
+        the part is no look, and would stand where something better is remembered.
+        """
+        grid, p = region.grid, region.grid.patch
+        detailed = np.zeros((int(np.prod(grid.seat_shape)), p, p), np.bool_)
+        detailed[seats] = True
+        if self.part:
+            numbers = region.numbers_here(store.seats)
+            here = np.flatnonzero(numbers >= 0)
+            reached = read_array(store.group, "valid")[here]
+            detailed[numbers[here]] &= reached & (reached.mean(axis=(1, 2), keepdims=True) >= ENOUGH_SEEN)
+        rows, columns = grid.seat_shape
+        pixels = detailed.reshape(rows, columns, p, p).swapaxes(1, 2).reshape(rows * p, columns * p)
+        return np.ascontiguousarray(pixels[: grid.height, : grid.width])
 
 
 @dataclass(frozen=True)
