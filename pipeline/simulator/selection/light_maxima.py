@@ -44,7 +44,7 @@ SHIFTS = tuple(_shifts())  # of rays and of points, (along, scan) px each, that 
 
 
 @dataclass(frozen=True)
-class Looks:
+class LinesLooked:
     """Light (shift, view, band) of the sweeps' own samples, and of places within each reach of them and beyond. [e-]
 
     ``scale`` is the unit of the tolerance at each stored number of theirs, (number, band) [e-].
@@ -58,9 +58,9 @@ class Looks:
     unit: Unit
 
     @staticmethod
-    def of(parts: Sequence[Light], binning: int, rig: Rig, unit: Unit) -> Looks:
+    def of(parts: Sequence[Light], binning: int, rig: Rig, unit: Unit) -> LinesLooked:
         scale = unit_at(np.asarray(stored_mean(parts[0].min(axis=0), binning), np.float32), rig, unit, binning)
-        return Looks(parts[0], tuple(parts[1:]), scale, binning, rig, unit)
+        return LinesLooked(parts[0], tuple(parts[1:]), scale, binning, rig, unit)
 
     def span_to(self, low: Light, high: Light) -> Floats:
         """Greatest difference of a stored number and light between two ends, (band,), over its unit."""
@@ -92,7 +92,7 @@ class Looks:
         return {"beside": tuple(found), "afar": afar, "anywhere": self.span_to(low, high), "ends_e": ends}
 
 
-def sum_up_looks(looks: Looks, scene: RasterScene, sweeps: tuple[Sweep, ...], means: Light) -> Probe:
+def sum_up_looks(looks: LinesLooked, scene: RasterScene, sweeps: tuple[Sweep, ...], means: Light) -> Probe:
     """Turn what samples see, and the means of lines (line,), into the probe's maxima."""
     rig, seen, scale, binning = looks.rig, looks.own, looks.scale, looks.binning
     camera, least, most = rig.camera, seen.min(axis=0), seen.max(axis=0)

@@ -23,7 +23,7 @@ from pipeline.simulator.render import views_all_over
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.selection.brought_light import greatest_way_px
-from pipeline.simulator.selection.light_maxima import SHIFTS, Looks, sum_up_looks, worst_of_groups
+from pipeline.simulator.selection.light_maxima import SHIFTS, LinesLooked, sum_up_looks, worst_of_groups
 from pipeline.simulator.selection.line_means import line_means
 from pipeline.simulator.selection.reached_cells import reached_cells
 from pipeline.simulator.selection.sample_views import (
@@ -104,7 +104,7 @@ def probe_scene(scene: RasterScene, rig: Rig, sweeps: Sequence[Sweep], unit: Uni
     views = joined([own, *beside])
     seen = light_seen(scene, camera, views, _footprint(SLIT.variants[0], rig, _LOOK, None, scene), SHIFTS)
     ends = np.cumsum([len(one.slope) for one in (own, *beside)])
-    looks = Looks.of(np.split(seen, ends[:-1], axis=1), binning, rig, unit)
+    looks = LinesLooked.of(np.split(seen, ends[:-1], axis=1), binning, rig, unit)
     summed = sum_up_looks(looks, scene, taken, line_means(scene, camera, taken, _LINES_BESIDE if beside else (0.0,)))
     usual = np.quantile(seen[0, : len(lines.slope)], np.linspace(0, 1, USUAL_LIGHTS)).astype(np.float64)
     found = replace(summed, usual_e=usual, places=places.seen)
