@@ -224,10 +224,8 @@ def _look_words(look: Mapping[str, Any]) -> str:
     seen = format_percent(look["share"])
     text = f"Lines {look['lines']} were looked at, {seen} of the field; the rest is as remembered."
     if "expected_gain" in look:
-        text += (
-            f" There the look was expected to bring most, {100 * look['expected_gain']:.2g} points of mIoU, where about"
-            f" {format_percent(look['expected_wrong'])} of what is remembered would be wrong."
-        )
+        wrong = format_percent(look["expected_wrong"])
+        text += f" There most was to be mended: about {wrong} of what is remembered was expected to be wrong."
     if look.get("due_left"):
         text += f" {format_count(look['due_left'])} of {format_count(look['due'])} seats that were due had to wait."
     return text

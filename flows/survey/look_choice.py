@@ -44,7 +44,7 @@ class LookChoice:
 
     share: float  # of the field's seats
     seconds: float
-    expected_gain: float  # of mIoU, 0..1
+    expected_gain: float  # of mIoU, 0..1, by doubts of which rare classes have most: rather too much
     expected_wrong: float  # share of the remembered pixels, before the look
     due: int  # seats that had to be seen again
     due_left: int  # of these, those that the seconds did not pay for
@@ -59,8 +59,8 @@ class LookChoice:
         seen = self.due - self.due_left
         due = f"; {seen} of the {self.due} seats that were due are among them" if self.due else ""
         return (
-            f"looks at {self.share:.0%} of the field, in {self.seconds:.1f} s, for {100 * self.expected_gain:.2g}"
-            f" points of mIoU: about {self.expected_wrong:.1%} of what is remembered is expected to be wrong{due}"
+            f"looks at {self.share:.0%} of the field, in {self.seconds:.1f} s, where most is to be mended: about"
+            f" {self.expected_wrong:.1%} of what is remembered is expected to be wrong{due}"
         )
 
 
