@@ -222,7 +222,8 @@ def _unknown_words(unknown: Mapping[str, Any], accuracy: Mapping[str, Any] | Non
 def _look_words(look: Mapping[str, Any]) -> str:
     """Which part of a remembered field was looked at, and why."""
     seen = format_percent(look["share"])
-    text = f"Lines {look['lines']} were looked at, {seen} of the field; the rest is as remembered."
+    rest = "the rest is as remembered" if look["remembers"] else "of the rest nothing is known"
+    text = f"Lines {look['lines']} were looked at, {seen} of the field; {rest}."
     if "expected_gain" in look:
         wrong = format_percent(look["expected_wrong"])
         text += f" There most was to be mended: about {wrong} of what is remembered was expected to be wrong."

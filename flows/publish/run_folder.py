@@ -299,8 +299,11 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     if (memory := told_of_memory(products.of("draw_map").path)) is not None:
         found["memory"] = memory
     if run.settings.look != LOOK_WHOLE:
-        share = len(plan.seats) / len(run.grid.valid_seats())
-        found["look"] = {"lines": run.settings.look, "share": share, **({} if run.look is None else run.look.as_told())}
+        asked = run.grid.valid_share().ravel() > 0 if run.zones.shown is None else run.zones.shown
+        expected = {} if run.look is None else asdict(run.look)
+        remembers = memory is not None and memory["put_aside"] is None
+        share = len(plan.seats) / np.count_nonzero(asked)
+        found["look"] = {"lines": run.settings.look, "share": share, "remembers": remembers, **expected}
     passes = {"coarse": products.get("register_coarse"), "fine": products.get("register_fine")}
     pointing = {name: _pointing(ref) for name, ref in passes.items() if ref is not None}
     if "fine" in pointing:

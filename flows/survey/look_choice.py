@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,14 +19,8 @@ from models.weights.files import Description
 from models.weights.memory_files import ReaderFile, load_memory
 from pipeline.errors import BudgetError, SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
-from pipeline.planning.part_looks import (
-    PartLook,
-    SeatRows,
-    cheapest_row_seconds,
-    part_look,
-    seats_shown,
-    sweeps_of_runs,
-)
+from pipeline.planning.area_cover import seats_shown
+from pipeline.planning.part_looks import PartLook, SeatRows, cheapest_row_seconds, part_look, sweeps_of_runs
 from pipeline.planning.plain_scans import LOSS, MIOU, ScanRecord, exposures_between, scan_words
 from storage.arrays.beliefs import BeliefStore
 
@@ -42,16 +35,11 @@ DUE = 1e3  # times what looks at all of a field can gain: what is due comes firs
 class LookChoice:
     """The part of a field that a visit looks at, and why."""
 
-    share: float  # of the field's seats
     seconds: float
     expected_gain: float  # of mIoU, 0..1, by doubts of which rare classes have most: rather too much
     expected_wrong: float  # share of the remembered pixels, before the look
     due: int  # seats that had to be seen again
     due_left: int  # of these, those that the seconds did not pay for
-
-    def as_told(self) -> dict[str, Any]:
-        """The choice as receipts tell it."""
-        return asdict(self)
 
     @property
     def sentence(self) -> str:
@@ -59,8 +47,8 @@ class LookChoice:
         seen = self.due - self.due_left
         due = f"; {seen} of the {self.due} seats that were due are among them" if self.due else ""
         return (
-            f"looks at {self.share:.0%} of the field, in {self.seconds:.1f} s, where most is to be mended: about"
-            f" {self.expected_wrong:.1%} of what is remembered is expected to be wrong{due}"
+            f"looks, in {self.seconds:.1f} s, where most is to be mended: about {self.expected_wrong:.1%} of what is"
+            f" remembered is expected to be wrong{due}"
         )
 
 
@@ -124,7 +112,6 @@ def choose_look(
     sweeps = sweeps_of_runs(lay_out_sweeps(replace(chosen, look=LOOK_WHOLE), grid, shown)[1], look.runs)
     seen = seats_shown(sweeps, grid, settings.camera)
     choice = LookChoice(
-        share=float(np.count_nonzero(seen & there) / np.count_nonzero(there)),
         seconds=look.seconds,
         expected_gain=float(wanted.gains(step, exposure_ms)[seen].sum()),
         expected_wrong=doubts.expected_wrong(),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -31,7 +32,7 @@ def doubt_of(log_probability: NDArray[np.floating]) -> Floats:
 class SeatDoubts:
     """Pixels of each seat by their believed class and doubt, and how old the oldest look at a seat is."""
 
-    pixels: Floats  # (seat, class, step)
+    pixels: NDArray[np.float32]  # (seat, class, step) counts
     doubt: Floats  # (step,) of the pixels of a step, at most
     age_days: Floats  # (seat,) of its oldest pixel of which anything is known; inf where of none is
 
@@ -50,26 +51,29 @@ class SeatDoubts:
         """
         doubt = np.geomspace(LEAST_DOUBT, 1.0, STEPS)
         rows, columns = grid.seat_shape
-        pixels, ages = np.zeros((rows * columns, classes, STEPS)), np.full(rows * columns, -np.inf)
-        top, across = 0, np.arange(grid.width) // grid.patch
+        pixels, ages = np.zeros((rows, columns, classes, STEPS), np.float32), np.full((rows, columns), -np.inf)
+        top = 0
         for belief, age in strips:
             if belief.shape[1:] != (grid.width, classes) or top % grid.patch:
                 raise ShapeError(f"a strip of a belief is {belief.shape}, of a field {grid.width} px wide")
-            seat = (top + np.arange(len(belief)))[:, None] // grid.patch * columns + across
+            first, seat = top // grid.patch, _seats_of(len(belief), grid)
+            here = slice(first, first + math.ceil(len(belief) / grid.patch))
             wrong = come_true * doubt_of(belief)
             step = np.minimum(np.searchsorted(doubt, wrong), STEPS - 1)
             believed = np.where(np.isfinite(belief[..., 0]), np.nan_to_num(belief, nan=-np.inf).argmax(axis=-1), 0)
             place = (seat * classes + believed) * STEPS + step
-            pixels += np.bincount(place.ravel(), minlength=pixels.size).reshape(pixels.shape)
-            np.maximum.at(ages, seat.ravel(), np.where(np.isfinite(age), age, -np.inf).ravel())
+            counted = np.bincount(place.ravel(), minlength=pixels[here].size)
+            pixels[here] = counted.reshape(pixels[here].shape)
+            np.maximum.at(ages[here].reshape(-1), seat.ravel(), np.where(np.isfinite(age), age, -np.inf).ravel())
             top += len(belief)
         if top != grid.height:
             raise ShapeError(f"a belief has {top} rows, its field {grid.height}")
-        return SeatDoubts(pixels, doubt, np.where(ages < 0, np.inf, ages))
+        known = np.where(ages < 0, np.inf, ages).ravel()
+        return SeatDoubts(pixels.reshape(-1, classes, STEPS), doubt, known)
 
     def expected_wrong(self) -> float:
         """Give the share of the field's pixels that are expected to be wrong."""
-        return float((self.pixels.sum(axis=(0, 1)) @ self.doubt) / self.pixels.sum())
+        return float((self.pixels.sum(axis=(0, 1), dtype=np.float64) @ self.doubt) / self.pixels.sum(dtype=np.float64))
 
     def worth(self, wrong_after: Floats) -> Floats:
         """Give what a look at each seat (seat,) is expected to add to the mean over classes, 0..1.
@@ -77,9 +81,15 @@ class SeatDoubts:
         ``wrong_after`` (class,) is the share of a class's pixels that such a look calls otherwise. A pixel that is
         surer than that gains nothing, and each class counts as much as any other, whatever its area.
         """
-        count = self.pixels.sum(axis=(0, 2))
+        count = self.pixels.sum(axis=(0, 2), dtype=np.float64)
         there = count > 0
         weight = np.divide(1.0, count, out=np.zeros_like(count), where=there) / max(int(there.sum()), 1)
         gained = np.maximum(self.doubt - wrong_after[:, None], 0.0) * weight[:, None]
-        found: Floats = np.einsum("scd,cd->s", self.pixels, gained)
+        found: Floats = self.pixels.reshape(len(self.pixels), -1) @ gained.ravel()
         return found
+
+
+def _seats_of(rows: int, grid: SceneGrid) -> NDArray[np.intp]:
+    """(y, x) numbers of the seats of so many rows of pixels, counted from their first."""
+    down, across = (np.arange(size) // grid.patch for size in (rows, grid.width))
+    return down[:, None] * grid.seat_shape[1] + across

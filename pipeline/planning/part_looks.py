@@ -19,10 +19,10 @@ from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel, Sweep, exposing, scene_to_sweep
-from pipeline.planning.area_cover import lines_showing
+from pipeline.planning.area_cover import lines_showing, some_lines
 
-PRICES = 24  # tried from one at which nothing pays to one at which everything does
-HALVINGS = 12  # of what lies between two of them
+LEAST_PRICE, MOST_PRICE = 1e-9, 1e6  # of a second, in shares of all worth: at one all pays, at the other nothing
+HALVINGS = 48  # of the logarithm of what lies between them
 Floats = NDArray[np.float64]
 LineRun = tuple[int, int, int]  # number of the sweep, its first line, and the one after its last
 
@@ -114,28 +114,8 @@ def sweeps_of_runs(sweeps: Sequence[Sweep], runs: Sequence[LineRun]) -> list[Swe
             )
         if number in taken:
             raise SettingsError(f"the look names sweep {number} twice; one run of its lines is taken")
-        taken[number] = replace(sweep, start_px=sweep.start_px + first * sweep.step, lines=stop - first)
+        taken[number] = some_lines(sweep, first, stop)
     return [taken[number] for number in sorted(taken)]
-
-
-def seats_shown(sweeps: Sequence[Sweep], grid: SceneGrid, camera: LineCamera) -> NDArray[np.bool_]:
-    """(seat,) of which a line of some sweeps shows something."""
-    seats, shown = grid.valid_seats(), np.zeros(int(np.prod(grid.seat_shape)), np.bool_)
-    for sweep in sweeps:
-        shown[seats] |= lines_over(sweep, grid, camera, seats)
-    return shown
-
-
-def lines_over(sweep: Sweep, grid: SceneGrid, camera: LineCamera, seats: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """(n,) whether a sweep's own samples lie on each of some seats."""
-    origin, size = grid.seat_origin(seats), np.array([grid.height, grid.width])
-    low, high = origin - size / 2, np.minimum(origin + grid.patch, size) - size / 2
-    along, scan = (1, 0) if sweep.along == "x" else (0, 1)
-    across = np.stack([low, low, high, high])[..., along], np.stack([low, high, low, high])[..., scan]
-    at = scene_to_sweep(sweep, camera, *across)
-    ends = sweep.lines - 0.5, camera.samples // sweep.binning - 0.5
-    inside = [(at[..., axis].max(axis=0) > -0.5) & (at[..., axis].min(axis=0) < end) for axis, end in enumerate(ends)]
-    return np.asarray(inside[0] & inside[1])
 
 
 def part_look(
@@ -145,46 +125,37 @@ def part_look(
 
     ``worth`` is that of a look at each seat, (seat,); none is below 0.
     """
-    sweeps = [replace(sweep, exposure_ms=exposure_ms) for sweep in rows.sweeps]
+    exposed = replace(rows, sweeps=tuple(replace(sweep, exposure_ms=exposure_ms) for sweep in rows.sweeps))
     values = rows.sums(worth)
     total = float(values.sum())
     if not total > 0:
         return None
-    exposed = exposing(camera, sweeps[0])
-    line_s, setup_s = exposed.frame_ms * 1e-3, cost.setup_seconds(exposed)
-
-    def at_price(price: float) -> PartLook:
-        runs = [
-            (number, *run)
-            for number, (row, first, stop) in enumerate(zip(values, rows.first, rows.stop, strict=True))
-            if (run := _best_run(row, first, stop, price * line_s, price * setup_s)) is not None
-        ]
-        taken = sweeps_of_runs(sweeps, runs)
-        worth = sum(
-            float(values[number, (rows.first[number] >= first) & (rows.stop[number] <= stop)].sum())
-            for number, first, stop in runs
-        )
-        return PartLook(tuple(runs), cost.seconds(taken, camera) if taken else 0.0, worth)
-
-    least, most = 1e-6 * total / cost.seconds(sweeps, camera), 1e3 * total / line_s
-    prices = np.geomspace(most, least, PRICES)
-    best, dear, cheap = None, float(prices[0]), None
-    for price in prices.tolist():
-        look = at_price(price)
+    dear, cheap = MOST_PRICE * total / exposing(camera, exposed.sweeps[0]).frame_ms, LEAST_PRICE * total
+    everything = _look_at_price(exposed, values, camera, cost, cheap)
+    if everything.seconds <= seconds:
+        return everything
+    best: PartLook | None = None
+    for _ in range(HALVINGS):  # at a lower price no fewer lines are taken
+        price = math.sqrt(dear * cheap)
+        look = _look_at_price(exposed, values, camera, cost, price)
         if look.seconds > seconds:
             cheap = price
-            break
-        dear, best = price, look if best is None or look.worth > best.worth else best
-    for _ in range(HALVINGS if cheap is not None else 0):
-        assert cheap is not None
-        middle = math.sqrt(dear * cheap)
-        look = at_price(middle)
-        if look.seconds > seconds:
-            cheap = middle
         else:
-            dear, best = middle, look if best is None or look.worth > best.worth else best
-    found = _first_rows(rows, values, sweeps, camera, cost, seconds) if best is None or not best.runs else best
-    return found if found is not None and found.runs else None
+            dear, best = price, look
+    return best if best is not None and best.runs else _best_row(exposed, values, camera, cost, seconds)
+
+
+def _look_at_price(rows: SeatRows, values: Floats, camera: LineCamera, cost: CostModel, price: float) -> PartLook:
+    """The best run of each sweep, if it has one, where a second has a price in the unit of ``values`` (sweep, row)."""
+    exposed = exposing(camera, rows.sweeps[0])
+    line_price, setup_price = price * exposed.frame_ms * 1e-3, price * cost.setup_seconds(exposed)
+    runs, worth = [], 0.0
+    for number, (row, first, stop) in enumerate(zip(values, rows.first, rows.stop, strict=True)):
+        run = _best_run(row, first, stop, line_price, setup_price)
+        if run is not None:
+            runs.append((number, *run))
+            worth += float(row[(first >= run[0]) & (stop <= run[1])].sum())
+    return PartLook(tuple(runs), cost.seconds(sweeps_of_runs(rows.sweeps, runs), camera), worth)
 
 
 def _best_run(
@@ -206,15 +177,13 @@ def _best_run(
     return int(first[there[begin]]), int(stop[there[last]])
 
 
-def _first_rows(
-    rows: SeatRows, values: Floats, sweeps: Sequence[Sweep], camera: LineCamera, cost: CostModel, seconds: float
-) -> PartLook | None:
-    """Of looks at a single row the one worth most, where no price leaves one that ends in time."""
+def _best_row(rows: SeatRows, values: Floats, camera: LineCamera, cost: CostModel, seconds: float) -> PartLook | None:
+    """Of looks at a single row the one worth most, where at no price one ends in time; None where none does."""
     order = np.argsort(-values, axis=None, kind="stable")
     for place in order[values.ravel()[order] > 0].tolist():
         number, row = divmod(place, values.shape[1])
         run = (number, int(rows.first[number, row]), int(rows.stop[number, row]))
-        taken_s = cost.seconds(sweeps_of_runs(sweeps, [run]), camera)
+        taken_s = cost.seconds(sweeps_of_runs(rows.sweeps, [run]), camera)
         if taken_s <= seconds:
             return PartLook((run,), taken_s, float(values[number, row]))
     return None

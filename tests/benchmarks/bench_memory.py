@@ -54,8 +54,9 @@ from models.weights.memory_files import MemoryWeights, load_memory, memory_path
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel
+from pipeline.planning.area_cover import seats_shown
 from pipeline.planning.coverage import cheapest_full, plain_sweeps
-from pipeline.planning.part_looks import SeatRows, part_look, seats_shown, sweeps_of_runs
+from pipeline.planning.part_looks import SeatRows, part_look, sweeps_of_runs
 from pipeline.planning.plain_scans import ScanRecord
 from pipeline.rectify.registration.field_shift import field_shift
 from pipeline.simulator.rig_model import Rig

@@ -17,9 +17,9 @@ from models.policies.policies import IMAGE_POLICIES, SEEDED_POLICIES, SEEING_POL
 from models.reading.inference import Glance
 from pipeline.geometry.grid import seat_pixels
 from pipeline.geometry.scan import Sweep, exposing
+from pipeline.planning.area_cover import seats_shown
 from pipeline.planning.fine_pass import FinePlan, plan_fine
 from pipeline.planning.orientation import compare_orientations, find_rows
-from pipeline.planning.part_looks import seats_shown
 from pipeline.planning.plain_scans import scan_words
 from storage.archive.keys import StageRef, array_digest
 from storage.archive.manifests import read_table, write_table

@@ -27,9 +27,7 @@ Real = TypeVar("Real", np.float32, np.float64)
 
 
 WIDE_PX = 16 / 3  # sd of a blur from which on only means of several pixels count that lie far from a sample
-_FAR_SDS = (
-    3.0  # of a blur, within which derivatives are taken; beyond, its share of the light times the greatest change
-)
+_FAR_SDS = 3.0  # of a blur, within which derivatives are taken; beyond counts its share of the light and the span
 
 
 @dataclass(frozen=True)

@@ -83,7 +83,6 @@ def test_a_part_is_looked_at_and_the_rest_remembered(visits: tuple[Path, Any, An
         top, left = (valid.shape[0] * int(at) for at in divmod(seat, age.shape[1] // valid.shape[1]))
         reached[top : top + valid.shape[0], left : left + valid.shape[1]] = valid
     assert reached[age == 0].all()  # what is filled in at the edge of the part is no look
-    assert 0 < (age == 0).sum() < sum(patches.valid.shape[1] * patches.valid.shape[2] for _ in patches.seat)
     before, now = (product(out, one, "class_map").classes.values for one in (first, part))
     assert (now != 255).all()
     assert (now == before)[age > 0].mean() > 0.95  # what fades may tip where two classes were nearly as likely
@@ -100,7 +99,10 @@ def test_receipt_and_page_say_what_was_looked_at(visits: tuple[Path, Any, Any]) 
     assert f"Lines {look['lines']} were looked at" in page
     assert "a part of the field was scanned once: every" in part.receipt["plan"]["reason"]
     assert "such a scan scores about" not in page  # the record tells of scans of all, which remember nothing
-    assert any("looks at" in note and "is expected to be wrong" in note for note in part.receipt["settings"]["notes"])
+    assert any(
+        "where most is to be mended" in note and "is expected to be wrong" in note
+        for note in part.receipt["settings"]["notes"]
+    )
 
 
 def test_the_same_visit_finds_its_own_lines(visited: Path, visits: Any, survey_png: Survey, recorded: Path) -> None:
@@ -173,8 +175,8 @@ def test_what_is_beyond_another_fields_part_has_no_class(
     Image.fromarray(labels).save(tmp_path / "labels.png")
     scene = {"scene": str(tmp_path / "other.png"), "labels": str(tmp_path / "labels.png")}
     other = survey_png(visited, **PART, **scene, visit=LAST, weights=str(recorded))
-    if other.receipt["memory"]["put_aside"] is None:
-        pytest.skip("so small a part of the other field looks like this one to these weights")
+    assert other.receipt["memory"]["put_aside"] == "another field"
+    assert "of the rest nothing is known" in (other.folder / "report.html").read_text(encoding="utf-8")
     classes = product(visited, other, "class_map").classes.values
     assert 1 - other.receipt["look"]["share"] <= (classes == 255).mean() < 1
 
