@@ -15,7 +15,7 @@ from flows.archive.tables import show_clearance, show_contents, show_explanation
 from flows.cli.app import ArchiveName, AsJson, Switch, stderr
 from flows.settings.survey_settings import Settings
 from flows.survey.scores import score_of
-from flows.survey.stage import versions
+from flows.survey.stage import versions, versions_made_again
 from flows.terminal.figures import known_number
 from flows.terminal.processes import DONE, FAILED, PARTLY
 from flows.terminal.progress import StageProgress, put_out
@@ -74,6 +74,7 @@ def gc(
     *,
     keep_days: float = 1.0,
     raw_too: Switch = False,
+    patches_too: Switch = False,
     dry_run: Switch = False,
     as_json: AsJson = False,
 ) -> int:
@@ -85,6 +86,9 @@ def gc(
         Stores younger than this stay: a survey may be about to name them.
     raw_too
         Also raw lines of a rig, or ingested, that no run names; they cannot be had again.
+    patches_too
+        Also the fine patches that runs name, most of an archive: they are cut again from the raw lines when they are
+        asked for, such as by `reprocess` with other weights.
     dry_run
         Only say what would go, and how many bytes.
     """
@@ -94,6 +98,7 @@ def gc(
             opened,
             keep_days=keep_days,
             raw_too=raw_too,
+            made_again=versions_made_again() if patches_too else {},
             dry_run=dry_run,
             progress=lambda removal, share: bars.show("gc", share, removal.uri),
         )
@@ -175,6 +180,7 @@ def contents(archive: Archive, now: datetime | None = None) -> dict[str, Any]:
             "created": store.created,
             "age_s": _age_s(store.created, moment),
             "bytes": store.size,
+            "cleared": store.cleared,
             "runs": len(catalogue.named_by(store.ref.uri)),
             "problem": store.problem,
         }
@@ -254,6 +260,7 @@ def _tree(catalogue: Catalogue, uri: str, shown: set[str], path: tuple[str, ...]
         "stage": store.ref.stage,
         "key": store.ref.key,
         "version": store.version,
+        "cleared": store.cleared,
         "called": sorted(catalogue.roles(uri)),
         "created": store.created,
         "bytes": store.size,

@@ -19,7 +19,7 @@ from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.georeference import zoomed_out
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
-from storage.archive.records import RECEIPT, read_run
+from storage.archive.records import RECEIPT, read_run, read_store
 from storage.arrays.class_maps import ClassNames
 from storage.arrays.georeference import load_geobox
 from storage.arrays.ground_maps import StoredImage, open_image
@@ -45,12 +45,17 @@ class ExportedRun:
         return self.folder.name
 
     def store(self, product: str) -> StageRef | None:
-        """The store behind a product, None without one. IncompleteStoreError: the archive has lost it, or a part."""
+        """The store behind a product, None without one, or where its files were cleared away.
+
+        Raises IncompleteStoreError: the archive has lost it, or a part of it.
+        """
         uri = self.receipt["products"].get(product)
         if uri is None:
             return None
         _, stage, key = uri.split("/")[:3]
         ref = self.archive.find(stage, key)
+        if ref is None and read_store(self.archive.ref(stage, key)).cleared:
+            return None
         if ref is None:
             raise IncompleteStoreError(
                 f"the {product} of run {self.id} should lie in {uri} of {self.archive.name} and does not; run its "
@@ -172,7 +177,9 @@ def seat_layer(
     run: ExportedRun, product: str, array: str, bands: tuple[str, ...]
 ) -> tuple[CogImage, Callable[[], Rows]]:
     """A figure of each seat, on the grid of the scene that their size in pixels gives."""
-    stored, patch = open_image(run.path(product), array), open_image(run.path("patches"), "valid").shape[1]
+    stored, drawn = open_image(run.path(product), array), run.store("class_map")
+    assert drawn is not None
+    patch = int(run.archive.manifest(drawn)["params"]["grid"]["patch"])
     scene = grid_of(open_image(run.path("class_map"), "classes").about)
     if scene is None:
         raise IncompleteStoreError(f"the class map of run {run.id} does not say its grid; run its survey again")

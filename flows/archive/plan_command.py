@@ -194,6 +194,9 @@ class Planner:
 
     def _reason(self, stage: str, store: Store) -> tuple[str, tuple[Change, ...]]:
         """What differs from the newest store of the same stage of the same scene, in words and in full."""
+        there = self.catalogue.stores.get(store.ref.uri)
+        if there is not None and there.cleared:
+            return "its files were cleared away by gc", ()
         stored = self._costs.stored(stage)
         before = next((one for one in stored if self._costs.of_scene(one)), None)
         if before is None:

@@ -320,6 +320,10 @@ def run_judge(
             raise ArchiveError(f"{found.uri} is being judged by another process; it adds the accuracy")
         with draft:
             runner = StageRunner(run, progress.watch)
+            for name in {name for stage in STAGES.values() if stage.judges for name in stage.of}:
+                ref = products.get(name)
+                if ref is not None and catalogue.stores[ref.uri].cleared:
+                    products[name] = runner(name, *products.there(STAGES[name].of))
             judged = judge(runner, products)
             published = add_accuracy(run, draft, judged, runner.records["evaluate"])
     show_published(published, run.archive, console)

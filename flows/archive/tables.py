@@ -42,7 +42,8 @@ def show_contents(content: dict[str, Any], console: Console) -> None:
     stores = _table("Stores", "stage", "key", "version", "size", "age", "runs that name it")
     for stage, rows in content["stages"].items():
         for number, row in enumerate(rows[-MOST_ROWS:]):
-            size = "[bold red]damaged[/]" if row["problem"] else format_bytes(row["bytes"])
+            size = "cleared" if row["cleared"] else format_bytes(row["bytes"])
+            size = "[bold red]damaged[/]" if row["problem"] else size
             stores.add_row(
                 escape(stage) if number == 0 else "",
                 escape(row["key"]),
@@ -125,7 +126,8 @@ def _node_words(node: Mapping[str, Any]) -> str:
         return f"{name} [dim]{node['see']}[/]"
     took = "" if node["wall_s"] is None else f", took {format_seconds(node['wall_s'])}"
     when = escape(node["created"][:16].replace("T", " ")) or DASH
-    return f"{name} version {escape(node['version'])}, {when}, {format_bytes(node['bytes'])}{took}"
+    size = "cleared away, made again when it is asked for" if node["cleared"] else format_bytes(node["bytes"])
+    return f"{name} version {escape(node['version'])}, {when}, {size}{took}"
 
 
 def show_verdict(content: dict[str, Any], console: Console) -> None:

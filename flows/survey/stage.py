@@ -44,6 +44,7 @@ class Product:
     version: int
     files: tuple[str, ...] = ()  # in a store, that receipts name, by their stems
     by_weights: bool = False  # the weights are one of its parameters
+    made_again: bool = False  # large, and soon made of what stays: `gc` may clear its files away
 
 
 @dataclass(frozen=True)
@@ -145,3 +146,8 @@ def all_stages() -> dict[str, Stage]:
 def versions() -> dict[str, int]:
     """The present version of every product."""
     return {one.product.name: one.product.version for one in all_stages().values()}
+
+
+def versions_made_again() -> dict[str, int]:
+    """The present version of every product whose files may be cleared away, since they are soon made again."""
+    return {one.product.name: one.product.version for one in all_stages().values() if one.product.made_again}

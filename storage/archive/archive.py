@@ -24,7 +24,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import ArchiveError
+from pipeline.errors import ArchiveError, IncompleteStoreError
 from storage.archive.keys import (
     StageRef,
     in_text,
@@ -40,15 +40,17 @@ from storage.archive.lineage import rests_on
 from storage.archive.manifests import (
     Cost,
     check_files,
+    cleared_facts,
     clocks,
     cost_of,
     cost_since,
+    is_cleared,
     made_bytes,
     manifest_sha256,
     read_manifest,
     write_manifest,
 )
-from storage.archive.run_folders import RunDraft, date_of_store, finish_extensions
+from storage.archive.run_folders import RunDraft, date_of_store, finish_extensions, take_its_place
 from storage.archive.staging import (
     PART_SUFFIX,
     bytes_below,
@@ -113,24 +115,30 @@ class Archive:
     def locate(self, address: str) -> Path:
         """Where on this machine a product lies by its address relative to the archive, as a receipt gives it.
 
-        Raises IncompleteStoreError: its store is not there, or a file of it is missing, cut short, a link or no file at
-        all.
+        Raises IncompleteStoreError: its store is not there, its files were cleared away, or one of them is missing, cut
+        short, a link or no file at all.
         """
         uri = in_text(address)
         if uri is not None:
             check_files(self.root / uri, hashes=False)
+            if is_cleared(read_manifest(self.root / uri)):
+                raise IncompleteStoreError(
+                    f"{self.name}/{uri}: its files were cleared away by gc; run its survey again (explain tells the"
+                    " command): only what was cleared is made again"
+                )
         return self.root / address
 
     def find(self, stage: str, key: str) -> StageRef | None:
-        """The published store, or None. Sizes are compared with the manifest, content only by :meth:`verify`.
+        """The published store, or None, also where its files were cleared away.
 
-        Raises IncompleteStoreError: it is there, but its manifest or a file is missing, or has another size.
+        Sizes are compared with the manifest, content only by :meth:`verify`. Raises IncompleteStoreError: it is there,
+        but its manifest or a file is missing, or has another size.
         """
         ref = store_at(self.root, stage, key)
         if not os.path.lexists(ref.path):
             return None
         check_files(ref.path, hashes=False)
-        return ref
+        return None if is_cleared(read_manifest(ref.path)) else ref
 
     @contextmanager
     def publish(
@@ -170,7 +178,10 @@ class Archive:
                 remove_tree(part)
 
     def _put_in_place(self, part: Path, final: Path) -> None:
-        rename_into_place(part, final)
+        if final.exists():  # its files were cleared away
+            take_its_place(part, final)
+        else:
+            rename_into_place(part, final)
 
     def produce(
         self,
@@ -232,6 +243,29 @@ class Archive:
             try:
                 retire(ref.path)
             finally:
+                release()
+        return True
+
+    def clear(self, ref: StageRef, *, wait: bool = True) -> bool:
+        """Take a store's files away and keep what its manifest tells; asked for again, it is made again.
+
+        False where another process works on it and ``wait`` is false. Raises IncompleteStoreError: its manifest is
+        damaged.
+        """
+        with refusals(self.root, "clear up the archive"):
+            release = take_lock(self._lock_path(f"{ref.stage}-{ref.key}"), wait=wait)
+            if release is None:
+                return False
+            part = (self.root / ref.uri).with_name(ref.key + PART_SUFFIX)
+            try:
+                before = read_manifest(self.root / ref.uri)
+                if not is_cleared(before):
+                    remove_tree(part)
+                    part.mkdir()
+                    write_manifest(part, cleared_facts(before, manifest_sha256(self.root / ref.uri)))
+                    take_its_place(part, self.root / ref.uri)
+            finally:
+                remove_tree(part)
                 release()
         return True
 

@@ -34,6 +34,7 @@ from storage.archive.staging import (
 
 FORMAT = 2
 PACKED = "packed"  # what a store was before an earlier version of this program packed its numbers with pcodec
+CLEARED = "cleared"  # what a store was before its files were cleared away, as they can be made again
 EXTENDED = "extended"  # what a run was before something was added to it
 CURE = "restore it from a copy, or run verify --repair on the archive"
 _DISTRIBUTIONS = ("spectralzoom", "numpy", "numba", "torch", "xarray", "zarr", "numcodecs")
@@ -165,14 +166,36 @@ def listed_bytes(manifest: Mapping[str, Any]) -> int:
 
 
 def made_bytes(manifest: Mapping[str, Any]) -> int:
-    """Size of all files as they were first published: what packing saved later is no merit of the making."""
-    size = _table(manifest.get(PACKED)).get("bytes_before")
-    return size if isinstance(size, int) and not isinstance(size, bool) else listed_bytes(manifest)
+    """Size of all files as they were first published, before they were packed or cleared away."""
+    sizes = (_table(manifest.get(entry)).get("bytes_before") for entry in (PACKED, CLEARED))
+    told = [size for size in sizes if isinstance(size, int) and not isinstance(size, bool)]
+    return max((listed_bytes(manifest), *told))
 
 
 def packed_from(manifest: Mapping[str, Any]) -> list[str]:
     """SHA-256 of the manifests that a store had before it was packed, oldest first; none where it never was."""
     return _manifests_before(manifest.get(PACKED))
+
+
+def cleared_facts(before: Mapping[str, Any], sha256: str) -> dict[str, Any]:
+    """Facts for the manifest of a store whose files are cleared away: those of before, and what there was.
+
+    ``before`` and ``sha256`` are the manifest that it has until then, and the SHA-256 of its file.
+    """
+    kept = {name: value for name, value in before.items() if name not in ("files", "format", "seal")}
+    at = datetime.now(UTC).isoformat(timespec="milliseconds")
+    entry = {"at": at, "bytes_before": listed_bytes(before), "manifests": [*cleared_from(before), sha256]}
+    return kept | {CLEARED: entry}
+
+
+def is_cleared(manifest: Mapping[str, Any]) -> bool:
+    """Whether a store's files were cleared away: whoever asks for it has it made again."""
+    return CLEARED in manifest
+
+
+def cleared_from(manifest: Mapping[str, Any]) -> list[str]:
+    """SHA-256 of the manifests that a store had before its files were cleared away; none where they were not."""
+    return _manifests_before(manifest.get(CLEARED))
 
 
 def _manifests_before(entry: object) -> list[str]:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from storage.archive.keys import StageRef, in_text
-from storage.archive.manifests import Cost, cost_of, extended_at, listed_bytes, try_manifest
+from storage.archive.manifests import Cost, cost_of, extended_at, is_cleared, listed_bytes, try_manifest
 from storage.archive.staging import MANIFEST_NAME, file_hash, read_plain
 
 RECEIPT = "receipt.json"
@@ -70,6 +70,11 @@ class Store:
     def created(self) -> str:
         """When it was published, ISO 8601 in UTC; empty where that is not known."""
         return _text(self.facts.get("created"))
+
+    @property
+    def cleared(self) -> bool:
+        """Whether its files were cleared away, to be made again when they are asked for."""
+        return is_cleared(self.facts)
 
     @property
     def cost(self) -> Cost | None:

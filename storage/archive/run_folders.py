@@ -114,7 +114,7 @@ class RunDraft:
         with refusals(self._root, "write to the archive"):
             if self.extends:
                 write_manifest(self.folder, content | extended_facts(read_manifest(final), manifest_sha256(final)))
-                _take_its_place(self.folder, final)
+                take_its_place(self.folder, final)
             else:
                 write_manifest(self.folder, content)
                 rename_into_place(self.folder, final)
@@ -129,7 +129,7 @@ class RunDraft:
         self._release()
 
 
-def _take_its_place(part: Path, final: Path) -> None:
+def take_its_place(part: Path, final: Path) -> None:
     """Put a whole folder in the place of another, which goes.
 
     Where the file system cannot exchange two folders there is a moment in which only the unfinished name leads to the

@@ -24,6 +24,7 @@ from storage.archive.ledger import FOLDER
 from storage.archive.lineage import Catalogue
 from storage.archive.manifests import (
     broken_files,
+    cleared_from,
     extended_from,
     is_sealed,
     listed_bytes,
@@ -253,7 +254,8 @@ def _identity_problems(catalogue: Catalogue, uri: str) -> Iterator[str]:
     knowing = [run for run in catalogue.runs if uri in run.recorded]
     if not knowing:
         return
-    own = {manifest_sha256(store.ref.path), *packed_from(store.facts)}  # also those of before it was packed
+    before = *packed_from(store.facts), *cleared_from(store.facts)
+    own = {manifest_sha256(store.ref.path), *before}
     anew = is_sealed(store.facts) and all(store.created > run.sealed for run in knowing)
     if not anew and not any(run.recorded[uri] in own for run in knowing):
         yield f"its {MANIFEST_NAME} has changed since {knowing[-1].uri} was published (its SHA-256 differs)"

@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 from pipeline.errors import ArchiveError
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef, in_text, open_folder, store_at
-from storage.archive.manifests import check_files
+from storage.archive.manifests import check_files, is_cleared, read_manifest
 from storage.archive.run_folders import RunDraft
 from storage.archive.staging import refusals
 from storage.remote.object_checks import Lease, find_leftovers, find_lost_runs, take_lease
@@ -65,7 +65,9 @@ class ObjectArchive(Archive):
         return RemoteRef(stage, key, plain.path, self.copy.fetch)
 
     def find(self, stage: str, key: str) -> StageRef | None:
-        """The published store, or None: here, or in the bucket. What waits here for its upload is uploaded.
+        """The published store, or None: here, or in the bucket, unless its files were cleared away.
+
+        What waits here for its upload is uploaded.
 
         Raises IncompleteStoreError: it is there, but its manifest is damaged, or a file that is nowhere else.
         """
@@ -75,6 +77,8 @@ class ObjectArchive(Archive):
             if not folder.exists() or self.copy.is_known(ref.uri):  # cleared away there, or not to be had now
                 return None
             check_files(folder, hashes=False)
+        if is_cleared(read_manifest(folder)):
+            return None
         self._send(ref.uri)
         return ref
 
@@ -108,6 +112,14 @@ class ObjectArchive(Archive):
         if gone:
             self.copy.remove(ref.uri)
         return gone
+
+    def clear(self, ref: StageRef, *, wait: bool = True) -> bool:
+        """Take a store's files away, here and in the bucket; see `Archive.clear`."""
+        self.copy.ensure([ref.uri])
+        cleared = super().clear(store_at(self.root, ref.stage, ref.key), wait=wait)
+        if cleared:
+            self.copy.send(ref.uri)
+        return cleared
 
     @contextmanager
     def in_use(self, *, alone: bool = False) -> Iterator[bool]:

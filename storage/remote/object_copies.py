@@ -21,6 +21,7 @@ from storage.archive.keys import published_runs, published_stores
 from storage.archive.lineage import Catalogue
 from storage.archive.manifests import (
     extended_from,
+    is_cleared,
     manifest_sha256,
     parse_manifest,
     read_manifest,
@@ -64,8 +65,9 @@ class WorkingCopy:
     # --- one store ----------------------------------------------------------------------------------------------------
 
     def is_whole(self, uri: str) -> bool:
-        """Whether all of a store is here, by its manifest and the sizes of its files."""
-        return try_manifest(self.root / uri)[1] is None and is_here(self.root / uri)
+        """Whether all of a store is here, by its manifest and the sizes of its files; no, where those were cleared."""
+        manifest, problem = try_manifest(self.root / uri)
+        return problem is None and not is_cleared(manifest) and is_here(self.root / uri)
 
     def look_up(self, uri: str) -> bool:
         """Ask the bucket for a store that is not whole here; whether it stands there, and its manifest is here then.
@@ -81,7 +83,7 @@ class WorkingCopy:
         return True
 
     def send(self, uri: str) -> None:
-        """Upload a store; where another came first, take that one.
+        """Upload a store; where another came first, take that one, unless its files were cleared away.
 
         Raises IncompleteStoreError: a file of it is not as it was published.
         """
@@ -89,7 +91,11 @@ class WorkingCopy:
             if self.is_known(uri):
                 return
             ours = (self.root / uri / MANIFEST_NAME).read_bytes()
-            if send_folder(self.objects, uri, self.root / uri) == ours:
+            standing = send_folder(self.objects, uri, self.root / uri)
+            if standing != ours and (_was_cleared(standing) or _was_cleared(ours)):
+                send_extension(self.objects, uri, self.root / uri, standing)
+                standing = ours
+            if standing == ours:
                 self._note(uri)
             elif (dated := self.objects.read_dated(f"{uri}/{MANIFEST_NAME}")) is not None:
                 self._take(uri, *dated)
@@ -137,7 +143,7 @@ class WorkingCopy:
         wanted = list(uris)
         standing = some_at_a_time(lambda uri: self.objects.read_dated(f"{uri}/{MANIFEST_NAME}"), wanted)
         for uri, dated in zip(wanted, standing, strict=True):
-            if dated is not None:
+            if dated is not None and not (_was_cleared(dated[0]) and self.is_whole(uri)):
                 with self._alone(uri):
                     self._take(uri, *dated)
             elif self.is_whole(uri):
@@ -290,6 +296,11 @@ class WorkingCopy:
             finally:
                 if release is not None:
                     release()
+
+
+def _was_cleared(manifest: bytes) -> bool:
+    """Whether a manifest is of a store whose files were cleared away."""
+    return is_cleared(parse_manifest(manifest)[0])
 
 
 def _extends(later: bytes, earlier: bytes) -> bool:

@@ -159,7 +159,7 @@ def load_registration(registration: StageRef) -> dict[str, Any]:
 
 LOOKUP = Product("locate", version=2, files=("lookup.zarr",))
 MOSAIC = Product("rectify", version=4, files=("mosaic.zarr",))
-PATCHES = Product("patches", version=4, files=("patches.zarr",))
+PATCHES = Product("patches", version=4, files=("patches.zarr",), made_again=True)
 QUICKLOOK_PX = 512
 SEATS_AT_ONCE = 64
 CACHE_SHARE = 8  # raw lines kept for the next patches may take this part of the memory
