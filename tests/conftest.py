@@ -24,7 +24,7 @@ from flows.settings.load import load_settings
 from models.network.segmenter import Segmenter
 from models.network.sizes import SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
-from models.weights.files import Weights, save_weights
+from models.weights.files import Weights, save_weights, with_record
 from storage.readers.labels import default_colour
 from tests.object_server import bucket, machine, s3_server  # noqa: F401 - fixtures
 from tests.remembered_work import WORKED_OUT, remember, with_effects, without_effects
@@ -115,12 +115,18 @@ def no_effects() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def make_weights(tmp_path_factory: pytest.TempPathFactory) -> WeightsMaker:
-    """Maker of weight files: ``make_weights(wavelengths, names, factor=...)`` gives the path."""
+    """Maker of weight files: ``make_weights(wavelengths, names, scans=..., factor=...)`` gives the path."""
     folder = tmp_path_factory.mktemp("weights")
 
-    def make(wavelength_nm: tuple[float, ...] = RGB_NM, names: tuple[str, ...] = CLASSES, **sizes: Any) -> Path:
+    def make(
+        wavelength_nm: tuple[float, ...] = RGB_NM,
+        names: tuple[str, ...] = CLASSES,
+        scans: dict[str, Any] | None = None,
+        **sizes: Any,
+    ) -> Path:
         path = folder / f"{len(list(folder.iterdir()))}.safetensors"
-        save_weights(random_weights(wavelength_nm, names, **sizes), path)
+        made = random_weights(wavelength_nm, names, **sizes)
+        save_weights(made if scans is None else with_record(made, scans=scans), path)
         return path
 
     return make

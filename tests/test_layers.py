@@ -108,13 +108,9 @@ def called_name(node: ast.Call) -> str:
     return node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
 
 
-def public(node: ast.Module | ast.ClassDef, of: str = "") -> Iterator[tuple[str, Documented]]:
-    """Functions and classes that a file shows, and the methods that those classes show, by their names."""
-    for inner in node.body:
-        if isinstance(inner, Documented) and not inner.name.startswith("_"):
-            yield of + inner.name, inner
-            if isinstance(inner, ast.ClassDef):
-                yield from public(inner, f"{of}{inner.name}.")
+def public(tree: ast.AST) -> Iterator[Documented]:
+    """Functions and classes whose names begin with no underscore, wherever they stand: in others too."""
+    return (node for node in nodes(tree) if isinstance(node, Documented) and not node.name.startswith("_"))
 
 
 def module_name(path: Path) -> str:
@@ -218,9 +214,9 @@ def test_class_names_are_unique() -> None:
 def test_what_is_public_says_what_it_does() -> None:
     """A public function, method or class of more lines than are read at a glance has a docstring."""
     silent = [
-        f"{path}:{node.lineno} {name}"
+        f"{path}:{node.lineno} {node.name}"
         for path, tree in source().items()
-        for name, node in public(tree)
+        for node in public(tree)
         if (node.end_lineno or node.lineno) - node.lineno >= MOST_LINES and not ast.get_docstring(node)
     ]
     assert silent == []
@@ -255,6 +251,6 @@ def test_walk_finds_what_it_looks_for() -> None:
 
 
 def test_walk_finds_what_is_public() -> None:
-    """Methods of a class that is shown are seen, and nothing whose name begins with an underscore."""
-    methods = ast.parse("class A:\n    def b(self): ...\n    def _c(self): ...\nclass _D:\n    def e(self): ...\n")
-    assert [name for name, _ in public(methods)] == ["A", "A.b"]
+    """Methods are seen, and functions in functions, but nothing whose own name begins with an underscore."""
+    tree = ast.parse("class A:\n    def b(self): ...\n    def _c(self):\n        def d(): ...\n")
+    assert [node.name for node in public(tree)] == ["A", "b", "d"]

@@ -82,6 +82,7 @@ def _plans(look: Look, camera: LineCamera, cost: CostModel, along: Axis, seed: i
         return spend
 
     def without_a_model(draw: int | None) -> Spend:
+        """What shows the most of those lines that lie evenly, or by chance where a draw is numbered."""
 
         def spend(seconds: float) -> tuple[Seats, float, int]:
             if draw is None:

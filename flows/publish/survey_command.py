@@ -231,6 +231,7 @@ def progress_shown(field: str) -> Callable[[str, str, float], None]:
     last: dict[str, float] = {}
 
     def show(stage: str, state: str, done: float) -> None:
+        """Bring a stage's bar up to date, or begin it; that Prefect does not answer stops no survey."""
         now = time.monotonic()
         if now - last.setdefault(stage, now) < 2.0 and not (stage in shown and state != "running"):
             return

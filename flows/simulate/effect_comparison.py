@@ -222,6 +222,7 @@ class _Ways:
         return unit_at(both.exact, self.exact.rig, self.unit, sweep.binning)
 
     def add(self, sweep: Sweep, lines: range, sums: _ChangeSums) -> None:
+        """Simulate some lines both ways, and add to the sums by how much they differ."""
         both = self.take(sweep, lines)
         change = self.change(both, sweep)
         sums.exact_cpu_s += both.exact_cpu_s

@@ -109,6 +109,7 @@ def _task_step(runner: StageRunner) -> Step:
         return None if ref is None else {"uri": ref.uri, "key": ref.key}
 
     def step(name: str, /, *inputs: StageRef) -> StageRef | None:
+        """Run a stage as a task of its name, tried again where a device or a disk did not answer."""
         one = prefect.task(
             name=name,
             task_run_name=f"{name}-{runner.run.name}",

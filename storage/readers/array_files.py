@@ -233,6 +233,7 @@ def _hdf_arrays(path: Path) -> dict[str, _Held]:
 
 def _hdf_loader(path: Path, name: str) -> Callable[[], NDArray[Any]]:
     def load() -> NDArray[Any]:
+        """Read the array, axes as MATLAB counts them; SceneError: it claims more than the file can hold."""
         with importlib.import_module("h5py").File(path, "r") as file:
             item, where = file[name], f"{path}:{name}"
             stored = min(item.id.get_storage_size(), path.stat().st_size)

@@ -235,6 +235,7 @@ def _reader(
     plain = scale == 1.0 and offset == 0.0
 
     def read(start: int, stop: int) -> NDArray[Any]:
+        """Give some lines (line, sample, band); unpacked they are float32, NaN where there is no reading."""
         selection: list[slice | int] = [slice(None)] * array.ndim
         selection[order[0]] = slice(start, stop)
         left = order

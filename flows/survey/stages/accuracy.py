@@ -75,6 +75,7 @@ def evaluate(
     labels = _moved(run, off)
 
     def build(path: Path) -> None:
+        """Write the figures of the map, of the coarse look alone and, where asked for, of other placements."""
         drawn = load_class_map(class_map.path / "class_map.zarr")
         classes = drawn.classes
         judged = np.where(classes == UNLABELLED, np.uint8(UNLABELLED), labels)  # what has no class is not

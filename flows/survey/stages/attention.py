@@ -34,6 +34,7 @@ def attend(run: SurveyRun, mosaic: StageRef) -> Wanted:
     settings = run.settings
 
     def build(path: Path) -> None:
+        """Write every seat's score and rank, and the plan of sweeps; refuse a map that does not fit."""
         work = FieldWork.of(run)
         scores, plan = _whole_field(run) if run.plan.plain else _scored(run, work, mosaic)
         work.crew_for(plan.seats, len(run.scene.wavelength_nm))  # refuses what does not fit before the rig goes back
@@ -152,6 +153,7 @@ def compare_turned(run: SurveyRun, mosaic: StageRef, attention: StageRef) -> Wan
     settings = run.settings
 
     def build(path: Path) -> None:
+        """Write what the plan would be with turned lines, and the sentence that tells of it."""
         scores = load_attention(attention.path / "attention.zarr").score.ravel()
         rows = find_rows(mosaic_brightness(mosaic.path / "mosaic.zarr"))
         turned = compare_orientations(

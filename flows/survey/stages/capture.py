@@ -66,6 +66,7 @@ def sweeps_wanted(
     total = sum(sweep.lines for sweep in sweeps) or 1
 
     def build(path: Path) -> None:
+        """Take the sweeps one after the other, and write what the source recorded beside their cubes."""
         before, manifest = 0, load_manifest(inputs[-1]) if run.source.simulates else None
         run.report(0.0)  # a rig is at work long before its first line is here
         lit = run.source.lit(chosen_effects(inputs[-1]), clock)

@@ -39,6 +39,7 @@ def draw_map(run: SurveyRun, mosaic: StageRef, patches: StageRef) -> Wanted:
     """Draw the class map from coarse and fine patches, region by region; no class where the scene has no value."""
 
     def build(path: Path) -> None:
+        """Draw the map and what is believed; once more without the memory, where that is put aside."""
         work, out = FieldWork.of(run), path / "class_map.zarr"
         lies = _memory_lies(run, mosaic)
         drawing = _drawing(run, work, mosaic, patches, path, lies)

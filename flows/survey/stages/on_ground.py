@@ -33,6 +33,7 @@ def ground(run: SurveyRun, class_map: StageRef, mosaic: StageRef) -> Wanted | No
     pose, choice = run.settings.pose, run.settings.map
 
     def build(path: Path) -> None:
+        """Write the map block by block, then the area of each class."""
         shown = ShownField.read(class_map, mosaic, run.grid.factor)
         legend = ClassNames(shown.found.names, shown.found.colours)
         about = {"rig_pose": asdict(grid.frame.view.pose), "scene_pixels": grid.counts()}

@@ -131,6 +131,7 @@ def register_fine(run: SurveyRun, raw: StageRef, mosaic: StageRef) -> Wanted | N
         return None
 
     def build(path: Path) -> None:
+        """Lay each sweep onto the mean of the mosaic's bands, and write where it lies."""
         sweeps = sighted(run, raw, None)
         anchors: list[Anchor] = []
         values = load_mosaic(mosaic.path / "mosaic.zarr").values if sweeps else np.empty((0, 0, 0), np.float32)
@@ -184,6 +185,7 @@ def locate(run: SurveyRun, raw: StageRef, *registration: StageRef) -> Wanted:
     }
 
     def build(path: Path) -> None:
+        """Write the tie tables of each sweep; of one that ties cannot follow, none."""
         tables: dict[str, list[tuple[Track, TieTable]]] = {}
         for number, one in enumerate(sweeps):
             made = one.placed(run.camera, grid).tracks
@@ -201,6 +203,7 @@ def rectify(run: SurveyRun, raw: StageRef, lookup: StageRef, *registration: Stag
     """Bring the coarse sweeps onto the scene grid and blend them into one mosaic, tile by tile."""
 
     def build(path: Path) -> None:
+        """Write mosaic and quicklook tile by tile, and what became of each sweep's lines."""
         grid = PixelGrid.of_scene(run.grid, run.grid.factor)
         recipe = MosaicRecipe(
             raw.path,
@@ -251,6 +254,7 @@ def cut_patches(
     registration = registrations[:1] if run.plan.plain else registrations[1:]
 
     def build(path: Path) -> None:
+        """Write the patches in the order in which sweeps pass them, a batch of seats at a time."""
         seats = load_plan(attention).seats
         row, column = np.divmod(seats, run.grid.seat_shape[1])
         # as the sweeps pass them, so that a few of them need few lines at a time

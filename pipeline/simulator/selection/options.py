@@ -155,6 +155,7 @@ def _menu(effect: Effect, probe: Probe, rig: Rig, present: bool, gain: float) ->
     costs = effect.cost_at(probe, rig) if hasattr(effect, "cost_at") else effect.cost_ns
 
     def option(variant: str) -> Option:
+        """Bound and price one variant of the effect, or its absence; SettingsError: a bound that is no number."""
         bound = effect.bound(probe, rig, variant)
         if not bound.value >= 0:  # refuses NaN
             raise SettingsError(

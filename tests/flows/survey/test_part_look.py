@@ -18,12 +18,11 @@ from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
 from flows.settings.load import load_settings
 from flows.survey.look_choice import LookWorth
 from models.reading.doubts import SeatDoubts
-from models.weights.files import save_weights, with_record
 from pipeline.errors import BudgetError, PipelineError, SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.plain_scans import ScanRecord
 from storage.archive.records import read_run
-from tests.conftest import RGB_NM, Survey, patchy_scene, random_weights
+from tests.conftest import Survey, WeightsMaker, patchy_scene
 from tests.remembered_work import without_effects
 
 pytestmark = pytest.mark.usefixtures("no_effects")
@@ -41,11 +40,9 @@ FIRST, LATER, LAST = "2026-06-01T10:00:00Z", "2026-06-04T10:00:00Z", "2026-06-07
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recorded(make_weights: WeightsMaker) -> Path:
     """Tiny weights with a record of plain scans."""
-    path = tmp_path_factory.mktemp("recorded") / "weights.safetensors"
-    save_weights(with_record(random_weights(RGB_NM), scans=RECORD), path)
-    return path
+    return make_weights(scans=RECORD)
 
 
 @pytest.fixture(scope="module")
@@ -114,11 +111,9 @@ def test_the_same_visit_finds_its_own_lines(visited: Path, visits: Any, survey_p
     assert states["capture_coarse"] == states["draw_map"] == "cached"
 
 
-def test_better_weights_read_the_lines_that_were_taken(visited: Path, visits: Any, tmp_path: Path) -> None:
+def test_better_weights_read_the_lines_that_were_taken(visited: Path, visits: Any, make_weights: WeightsMaker) -> None:
     """Reprocessing makes both visits again, of the light that there is, whatever these weights would have looked at."""
-    other = tmp_path / "other.safetensors"
-    save_weights(with_record(random_weights(RGB_NM, width=4), scans=RECORD), other)
-    run_reprocess(ReprocessRequest(visited, weights=other), Console(quiet=True))
+    run_reprocess(ReprocessRequest(visited, weights=make_weights(scans=RECORD, width=4)), Console(quiet=True))
     runs = [read_run(path, {}) for path in sorted(visited.glob("runs/*"))]
     before, again = (run for run in runs if run.settings["look"] == visits[2].receipt["settings"]["look"])
     assert again.receipt["products"]["class_map"] != before.receipt["products"]["class_map"]

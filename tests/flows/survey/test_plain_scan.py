@@ -16,12 +16,11 @@ from flows.archive.plan_command import plan_content
 from flows.archive.reprocess_command import ReprocessRequest, run_judge, run_reprocess
 from flows.settings.load import load_settings
 from flows.survey.survey import STAGES
-from models.weights.files import save_weights, with_record
 from pipeline.errors import BudgetError, SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
 from storage.archive.keys import StageRef
 from storage.arrays.tile_work import block_means
-from tests.conftest import RGB_NM, Survey, random_weights
+from tests.conftest import Survey, WeightsMaker
 
 RECORD = {
     "scenes": 3,
@@ -35,11 +34,9 @@ QUIET = Console(quiet=True)
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recorded(make_weights: WeightsMaker) -> Path:
     """Tiny weights with a record of plain scans."""
-    path = tmp_path_factory.mktemp("recorded") / "weights.safetensors"
-    save_weights(with_record(random_weights(RGB_NM), scans=RECORD), path)
-    return path
+    return make_weights(scans=RECORD)
 
 
 @pytest.fixture(scope="module")
@@ -121,18 +118,18 @@ def test_a_survey_in_two_passes_stands_beside_the_best_plain_scan(
     assert "taken" not in published.receipt["scans"]
 
 
-def test_seconds_choose_the_scan_and_are_kept(survey_png: Survey, recorded: Path, tmp_path: Path) -> None:
+def test_seconds_choose_the_scan_and_are_kept(
+    survey_png: Survey, recorded: Path, make_weights: WeightsMaker, tmp_path: Path
+) -> None:
     """It ends in time, the settings say what was chosen, and read again by other weights the light is found."""
     published = survey_png(tmp_path, budget=None, seconds="4", weights=str(recorded))
     settings, done = published.receipt["settings"], published.receipt["savings"]["capture_s"]["done"]
     assert 3.5 < done <= 4
     assert settings["seconds"] == 4
     assert settings["scan_step"] in (1, 2, 4)
-    other = tmp_path / "other.safetensors"
     flat = {**RECORD, "miou": [[0.5] * 3, [0.5] * 3, [0.9, 0.5, 0.5]]}  # these would have taken every fourth line
-    save_weights(with_record(random_weights(RGB_NM), scans=flat), other)
     captured = {path.parent.name for path in tmp_path.glob("**/capture/**/*.zarr")}
-    assert run_reprocess(ReprocessRequest(tmp_path, weights=other), QUIET) == 0
+    assert run_reprocess(ReprocessRequest(tmp_path, weights=make_weights(scans=flat)), QUIET) == 0
     assert {path.parent.name for path in tmp_path.glob("**/capture/**/*.zarr")} == captured
     newest = max(tmp_path.glob("runs/*/receipt.json"), key=lambda path: path.stat().st_mtime)
     again = json.loads(newest.read_text())

@@ -1,0 +1,110 @@
+"""Changes planted into a farm that a later look should tell of, and light that changed where nothing else did."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from measure import Row
+from numpy.typing import NDArray
+from visits.farm_visits import (
+    ANEW,
+    CAMERA,
+    FIRST_DAY,
+    HOUR,
+    QUICK,
+    SEEDS,
+    SHAPE,
+    Mask,
+    later,
+    look_at_farm,
+    seen_by,
+    shipped,
+)
+
+from flows.publish.change_picture import CHANGED_SHARE
+from models.reading.remembered import Remembered, changed_from, changed_shares, first_belief
+from pipeline.simulator.scenes.farm.farm_scene import farm_scene
+from pipeline.simulator.scenes.scene import RasterScene, SceneRaster
+
+PLANTED, PLANTED_SEEDS = 3, range(1, 10)  # changes of each kind on each land, and the lands
+LOW_SUN, HIGH_SUN = 6.2, 12.0  # hours of June 21 at which the sun stands at 20 and 61 degrees
+
+
+def planted_changes() -> Iterator[Row]:
+    """Weed nests, tracks, stubble strips and flooded corners that are there three days later, and false alarms."""
+    names, patch = shipped().class_names, shipped().config.patch
+    hits: dict[str, list[bool]] = {}
+    false, unchanged = 0, 0
+    for seed in PLANTED_SEEDS:
+        before = look_at_farm(seed, FIRST_DAY, HOUR, ANEW)
+        scene = farm_scene(seed, SHAPE, camera=CAMERA, day=FIRST_DAY + 3, hour=14.0)
+        changed, places = plant(scene, np.random.default_rng(seed), names)
+        now = seen_by(changed, seed, QUICK)
+        first = first_belief(before.looked)
+        after = later(before, first, now, 3.0)
+        told = changed_shares(changed_from(Remembered(first, None, 3.0), after), patch) >= CHANGED_SHARE
+        for kind, place in places:
+            covered = _shares(place, patch) >= 0.5
+            hits.setdefault(kind, []).append(bool((told & covered).any()))
+        same = _shares(before.labels != now.labels, patch) == 0
+        false, unchanged = false + int((told & same).sum()), unchanged + int(same.sum())
+    for kind, found in hits.items():
+        share = float(np.mean(found))
+        yield Row(f"planted: {kind}", f"{sum(found)} of {len(found)} found", ">= 95 %", share >= 0.95)
+    share = false / unchanged
+    yield Row("places said to have changed that did not", f"{share:.2%} of {unchanged}", "<= 2 %", share <= 0.02)
+
+
+def plant(
+    scene: RasterScene, rng: np.random.Generator, names: Sequence[str]
+) -> tuple[RasterScene, list[tuple[str, Mask]]]:
+    """A scene with changes in places that do not touch, made of pixels that the scene has elsewhere, and the places."""
+    assert scene.labels is not None
+    planes, labels = scene.planes.copy(), scene.labels.copy()
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    shapes: dict[str, tuple[str, Callable[[float, float], Mask]]] = {
+        "weed nest, 40 px across": ("weed", lambda cy, cx: (y - cy) ** 2 + (x - cx) ** 2 <= 20**2),
+        "track, 16 x 120 px": ("track", lambda cy, cx: (abs(y - cy) <= 8) & (abs(x - cx) <= 60)),
+        "bare strip, 24 x 120 px": ("soil", lambda cy, cx: (abs(y - cy) <= 12) & (abs(x - cx) <= 60)),
+        "flooded corner, 60 px": ("water", lambda cy, cx: (y >= cy) & (x >= cx) & (y - cy + x - cx <= 60)),
+    }
+    taken, places = np.zeros(SHAPE, np.bool_), []
+    for kind, (name, at) in shapes.items():
+        donors = np.argwhere(scene.labels == names.index(name))
+        count = 0
+        while count < PLANTED:
+            place = at(rng.uniform(30, SHAPE[0] - 70), rng.uniform(70, SHAPE[1] - 70))
+            own = scene.labels[place] == names.index(name)
+            if (taken & place).any() or own.mean() > 0.05:
+                continue
+            chosen = donors[rng.integers(len(donors), size=int(place.sum()))]
+            planes[place], labels[place] = scene.planes[chosen[:, 0], chosen[:, 1]], names.index(name)
+            taken |= place
+            places.append((kind, place))
+            count += 1
+    return replace(scene, key=f"{scene.key}/planted", raster=SceneRaster.of(planes, labels)), places
+
+
+def other_light() -> Iterator[Row]:
+    """Places said to have changed in half a day between a low sun and a high one, when nothing did."""
+    patch = shipped().config.patch
+    for early, late in ((LOW_SUN, HIGH_SUN), (HIGH_SUN, LOW_SUN)):
+        false, all_seats = 0, 0
+        for seed in SEEDS:
+            before, now = look_at_farm(seed, FIRST_DAY, early, ANEW), look_at_farm(seed, FIRST_DAY, late, QUICK, 1)
+            first = first_belief(before.looked)
+            after = later(before, first, now, abs(late - early) / 24)
+            told = changed_shares(changed_from(Remembered(first, None, 0.3), after), patch) >= CHANGED_SHARE
+            same = _shares(before.labels != now.labels, patch) == 0
+            false, all_seats = false + int((told & same).sum()), all_seats + int(same.sum())
+        share = false / all_seats
+        what = f"places said to have changed, nothing did, sun at {early:g} h then {late:g} h"
+        yield Row(what, f"{share:.2%} of {all_seats}", "<= 2 %", share <= 0.02)
+
+
+def _shares(where: Mask, patch: int) -> NDArray[np.float64]:
+    y, x = where.shape
+    shares: NDArray[np.float64] = where.reshape(y // patch, patch, x // patch, patch).mean(axis=(1, 3))
+    return shares

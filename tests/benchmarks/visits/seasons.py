@@ -1,0 +1,104 @@
+"""Whole fields looked at quickly, by the memory and by everybody else: after some days, and for a season."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from measure import Row
+from visits.farm_visits import (
+    ANEW,
+    FIRST_DAY,
+    HOUR,
+    QUICK,
+    REFERENCE,
+    SEASON,
+    SEEDS,
+    Classes,
+    Seen,
+    later,
+    look_at_farm,
+    mean_figure,
+)
+
+from models.reading.remembered import Belief, first_belief
+
+SIX = (1, 2, 3, 4, 5, 6)
+BEHIND = {1: 0.2, 3: 0.5, 7: 1.0}  # points of mIoU that a later visit may lie behind one that scans anew, by days
+HELD = (2, 3, 4)  # visits from one full scan to the next
+SURE = 0.97
+
+
+def after_days() -> Iterator[Row]:
+    """A quick look after some days, by the memory and by everybody else."""
+    found: dict[int, dict[str, list[float]]] = {}
+    for seed in SIX:
+        before = look_at_farm(seed, FIRST_DAY, HOUR, ANEW)
+        for days in BEHIND:
+            now, anew = (look_at_farm(seed, FIRST_DAY + days, HOUR, how, 1) for how in (QUICK, ANEW))
+            maps = {
+                f"scanned anew, {anew.seconds:.1f} s": anew.alone,
+                "old map kept": before.alone,
+                f"quick look alone, {now.seconds:.1f} s": now.alone,
+                "old class unless surer than .97": _unless_surer(before, now),
+                "memory without a reader": later(before, first_belief(before.looked), now, days, reader=False),
+                "memory": later(before, first_belief(before.looked), now, days),
+            }
+            scores = found.setdefault(days, {})
+            for name, one in maps.items():
+                classes = one.classes()[0] if isinstance(one, Belief) else one
+                scores.setdefault(name, []).append(now.score(classes))
+    for days, scores in found.items():
+        anew = next(values for name, values in scores.items() if name.startswith("scanned anew"))
+        for name, values in scores.items():
+            least = max(np.mean(anew) - BEHIND[days], np.mean(scores["old map kept"]))
+            goal = (f">= {least:.1f}", bool(np.mean(values) >= least)) if name == "memory" else ("", None)
+            yield Row(f"{days} d later, {name}", mean_figure(values), *goal)
+
+
+def _unless_surer(before: Seen, now: Seen) -> Classes:
+    """The old class, unless the new look is surer than .97 of another."""
+    classes, sure = first_belief(now.looked).classes()
+    return np.where(sure > SURE, classes, before.alone)
+
+
+def season() -> Iterator[Row]:
+    """Thirty visits, the mean of their maps, beside full scans made as often as the same seconds allow."""
+    found: dict[str, list[float]] = {}
+    seconds: dict[str, float] = {}
+
+    def note(name: str, scores: Sequence[float], spent: float) -> None:
+        found.setdefault(name, []).append(float(np.mean(scores)))
+        seconds[name] = spent
+
+    for seed in SEEDS:
+        full = [look_at_farm(seed, *moment, REFERENCE) for moment in SEASON]
+        quick = [full[0], *(look_at_farm(seed, *moment, QUICK, 1) for moment in SEASON[1:])]
+        every, fast = full[0].seconds, quick[1].seconds
+        note("full scan at every visit", [one.score(one.alone) for one in full], every)
+        note("quick look at every visit, nothing remembered", [one.score(one.alone) for one in quick], fast)
+        note("quick looks and the memory", _remembered(quick), fast)
+        note("quick looks, memory without a reader", _remembered(quick, reader=False), fast)
+        for k in HELD:
+            maps = [full[number - number % k].alone for number in range(len(full))]
+            scores = [one.score(held) for one, held in zip(full, maps, strict=True)]
+            note(f"full scan every {k} visits, held between", scores, every / k)
+    best = np.mean(found["full scan at every visit"])
+    for name, values in found.items():
+        goal = (
+            (f">= {best - 1:.1f}", bool(np.mean(values) >= best - 1))
+            if name == "quick looks and the memory"
+            else ("", None)
+        )
+        yield Row(f"season, {name}: {seconds[name]:.1f} s a visit", mean_figure(values), *goal)
+
+
+def _remembered(looks: Sequence[Seen], *, reader: bool = True) -> list[float]:
+    """Scores of a season's maps, each by the memory of all looks before it."""
+    belief, scores = first_belief(looks[0].looked), [looks[0].score(looks[0].alone)]
+    moments = [day + hour / 24 for day, hour in SEASON]
+    for number in range(1, len(looks)):
+        days = moments[number] - moments[number - 1]
+        belief = later(looks[number - 1], belief, looks[number], days, reader=reader)
+        scores.append(looks[number].score(belief.classes()[0]))
+    return scores
