@@ -5,9 +5,8 @@ As in `flows.survey.field_work` a worker gets paths and numbers, and arrays neve
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import reduce
 from operator import add
 from pathlib import Path
@@ -15,28 +14,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from flows.survey.field_memory import FieldMemory
 from flows.survey.field_work import FieldWork, WeightsFile, look_at, seat_columns
 from models.reading.familiar import Familiar
 from models.reading.inference import CoarseLook, segment
 from models.reading.regions import Region
-from models.reading.remembered import (
-    Belief,
-    Looked,
-    MemoryAgreement,
-    Remembered,
-    changed_from,
-    compare,
-    first_belief,
-    in_classes,
-    recall,
-)
-from models.weights.files import Weights
+from models.reading.remembered import Looked, MemoryAgreement, changed_from, compare, first_belief, recall
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.rectify.registration.field_shift import FieldShift, field_shift
-from storage.arrays.beliefs import BeliefStore, write_belief_tile, write_changes_tile
+from storage.arrays.beliefs import write_belief_tile, write_changes_tile
 from storage.arrays.class_maps import write_class_tile
 from storage.arrays.layout import read_array
-from storage.arrays.mosaics import PatchStore, mosaic_brightness, open_patches
+from storage.arrays.mosaics import PatchStore, open_patches
 from storage.arrays.tile_work import let_tiles_go
 from storage.parallel.crew import run_blocks
 
@@ -158,55 +146,6 @@ class UnknownRule:
 
 
 @dataclass(frozen=True)
-class FieldMemory:
-    """Where the memory of a field lies, and how it is to be read."""
-
-    belief: Path
-    mosaic: Path
-    days: float
-    classes: tuple[int, ...]  # see `flows.survey.memory.Prior`
-    shift_px: tuple[int, int] = (0, 0)  # down and to the right, that brings it onto today's look
-
-    def of(self, region: Region, weights: Weights) -> Remembered:
-        """Read what is remembered of a region, in the classes of the weights."""
-        store, down, across = BeliefStore(self.belief), *self.shift_px
-        rows, row_gap = _moved(region.read.rows, down, store.shape[0])
-        columns, column_gap = _moved(region.read.columns, across, store.shape[1])
-        gaps = row_gap, column_gap
-        values, age, light = (_framed(part, gaps) for part in store.read(rows, columns))
-        if self.classes != tuple(range(values.shape[-1])):
-            values = in_classes(values, self.classes)
-        coarse, cell = look_at(weights, self.mosaic, region).seen_columns, region.grid.factor
-        moves = [
-            _moved(slice(0, size), round(by / cell), size)
-            for size, by in zip(coarse.shape, self.shift_px, strict=False)
-        ]
-        seen = coarse[moves[0][0], moves[1][0]]
-        return Remembered(
-            Belief(values, age, np.nan_to_num(light)), _framed(seen, (moves[0][1], moves[1][1])), self.days
-        )
-
-
-Gap = tuple[int, int]  # what lies before the first and behind the last
-
-
-def _moved(part: slice, by: int, size: int) -> tuple[slice, Gap]:
-    """Where a part of an axis of ``size`` lies before it is moved ``by``, and what of it lies beyond the ends."""
-    start, stop = part.start - by, part.stop - by
-    first, last = min(max(start, 0), size), min(max(stop, 0), size)
-    whole = stop - start
-    before = min(max(-start, 0), whole)
-    return slice(first, last), (before, whole - before - (last - first))
-
-
-def _framed(values: NDArray[np.float32], gaps: tuple[Gap, Gap]) -> NDArray[np.float32]:
-    """Images (y, x, ...) with NaN where nothing lies."""
-    if not any(map(any, gaps)):
-        return values
-    return np.pad(values, [*gaps, *[(0, 0)] * (values.ndim - 2)], constant_values=np.nan)
-
-
-@dataclass(frozen=True)
 class Drawn:
     """What a worker says of a region that it drew."""
 
@@ -230,25 +169,9 @@ def draw_field(field: FieldWork, work: Drawing, report: Callable[[float], None])
     """
     store = open_patches(work.patches)
     crew = field.crew_for(store.seats, len(store.wavelength_nm))
-    remembered = () if work.memory is None else (work.memory.belief, work.memory.mosaic)
+    remembered = () if work.memory is None else work.memory.paths
     paths = (work.mosaic, work.patches, work.out, work.belief, *remembered)
     parts: list[Drawn] = run_blocks(work, field.regions, crew, report=report, paths=paths)
     strange = sum(part.strange[0] for part in parts), sum(part.strange[1] for part in parts)
     compared = [part.comparison for part in parts if part.comparison is not None]
     return DrawnField(strange, reduce(add, compared) if compared else None)
-
-
-REACH_PX = 64.0  # within which a memory that lies beside today's look is found
-LEAST_SHIFT_PX = 2.0  # less is how well two looks can be laid on each other
-
-
-def memory_lies(before: Path, now: Path, factor: int) -> FieldShift:
-    """How the field of a stored coarse mosaic lies beside that of another, in fine px."""
-    found = field_shift(mosaic_brightness(now), mosaic_brightness(before), reach_px=REACH_PX / factor)
-    return replace(found, shift=(factor * found.shift[0], factor * found.shift[1]))
-
-
-def whole_pixels(lies: FieldShift) -> tuple[int, int]:
-    """Rows and columns to move a memory by; none where it lies as well as looks can be laid on each other."""
-    down, across = lies.shift
-    return (0, 0) if math.hypot(down, across) < LEAST_SHIFT_PX else (round(down), round(across))

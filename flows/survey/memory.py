@@ -23,6 +23,7 @@ from storage.arrays.mosaics import mosaic_shape
 
 NONE, LATEST, AUTO = "none", "latest", "auto"
 LOOKED_THROUGH = 60  # newest runs of a field among which the visit before is looked for
+MOST_LOOKS = 12  # by which a field is known that is looked at in parts
 BELIEF = "belief"  # a product of runs
 MEMORY = "memory.json"  # beside a map that goes on from an earlier one: what became of the memory
 OF_THE_LOOK = (  # settings that the same light has alike
@@ -32,12 +33,20 @@ OF_THE_LOOK = (  # settings that the same light has alike
 
 
 @dataclass(frozen=True)
+class EarlierLook:
+    """What a run saw of a field coarsely."""
+
+    mosaic: StageRef
+    shift_px: tuple[int, int] = (0, 0)  # down and to the right, that brings it onto the newest
+
+
+@dataclass(frozen=True)
 class Prior:
     """The run whose belief is gone on from."""
 
     run: str
     belief: StageRef  # the store that holds belief.zarr
-    mosaic: StageRef  # the coarse look of that run
+    looks: tuple[EarlierLook, ...]  # that run's, then what it had not seen itself, the newest first
     days: float  # between that look and this one
     classes: tuple[int, ...]  # for each class of the weights its number in the belief; -1 where that lacks it
 
@@ -108,11 +117,11 @@ def _usable(
     if any(len(parts) < 3 for parts in places):
         return "it left no belief, as runs of earlier versions"
     try:
-        stores = [archive.find(parts[1], parts[2]) for parts in places]
-        if stores[0] is None or stores[1] is None:
+        belief, mosaic = (archive.find(parts[1], parts[2]) for parts in places)
+        if belief is None or mosaic is None:
             return "what it left was cleared; reprocess makes it again"
-        store = BeliefStore(stores[0].path / "belief.zarr")
-        names, coarse = store.legend.names, mosaic_shape(stores[1].path / "mosaic.zarr")
+        store = BeliefStore(belief.path / "belief.zarr")
+        names, coarse = store.legend.names, mosaic_shape(mosaic.path / "mosaic.zarr")
     except IncompleteStoreError as error:
         return f"{error}"
     if store.shape != (grid.height, grid.width):
@@ -129,7 +138,29 @@ def _usable(
     classes = tuple(names.index(one) if one in names else -1 for one in class_names)
     if all(number < 0 for number in classes):
         return f"it knows none of the classes of these weights, but {', '.join(names)}"
-    return Prior(run.folder.name, stores[0], stores[1], max(_days_since(run, settings), 0.0), classes)
+    looks = (EarlierLook(mosaic), *_looks_before(archive, run, coarse))
+    return Prior(run.folder.name, belief, looks, max(_days_since(run, settings), 0.0), classes)
+
+
+def _looks_before(archive: Archive, run: Run, shape: tuple[int, int]) -> Iterator[EarlierLook]:
+    """What earlier runs saw of the rest of a field, where a run looked at a part of it and went on from them."""
+    down, across = 0, 0
+    for _ in range(MOST_LOOKS - 1):
+        memory = run.receipt.get("memory")
+        if run.settings.get("look", LOOK_WHOLE) == LOOK_WHOLE or memory is None or memory["put_aside"] is not None:
+            return
+        down, across = (sum(both) for both in zip((down, across), memory["shift_px"], strict=True))
+        run = read_run(archive.root / "runs" / memory["run"], {})
+        parts = run.products.get("mosaic", "").split("/")
+        if run.problem is not None or len(parts) < 3:
+            return
+        try:
+            mosaic = archive.find(parts[1], parts[2])
+            if mosaic is None or mosaic_shape(mosaic.path / "mosaic.zarr") != shape:
+                return
+        except IncompleteStoreError:
+            return
+        yield EarlierLook(mosaic, (down, across))
 
 
 def _days_since(run: Run, settings: Settings) -> float:

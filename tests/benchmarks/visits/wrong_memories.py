@@ -24,7 +24,7 @@ from visits.farm_visits import (
     shipped_memory,
 )
 
-from flows.survey.drawing import REACH_PX, whole_pixels
+from flows.survey.field_memory import REACH_PX, whole_pixels
 from flows.survey.stages.maps import MOST_TURN_PX
 from models.reading.remembered import Looked, Remembered, compare, first_belief, recall
 from pipeline.rectify.registration.field_shift import field_shift

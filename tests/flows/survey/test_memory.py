@@ -267,6 +267,22 @@ def test_a_rig_that_was_moved_finds_its_memory(survey_png: Survey, tmp_path: Pat
     assert np.isfinite(belief.age.values).all()
 
 
+def test_a_rig_that_was_moved_between_two_parts_is_noticed(survey_png: Survey, tmp_path: Path) -> None:
+    """Where they share nothing today's lines are laid onto those of the visit before the last."""
+    values, _ = patchy_scene((160, 192), 3, seed=5)
+    for name, part in {"before": np.s_[12:140, 0:160], "now": np.s_[0:128, 20:180]}.items():
+        Image.fromarray(values[part].astype(np.uint8)).save(tmp_path / f"{name}.png")
+    out, given = tmp_path / "archive", {**PLAIN, "labels": None, "name": "north", "prior": "latest"}
+    before, now = ({**given, "scene": str(tmp_path / f"{name}.png")} for name in ("before", "now"))
+    survey_png(out, **before, visit=FIRST)
+    middle = survey_png(out, **before, visit=LATER, look="0:0-20")
+    later = survey_png(out, **now, visit="2026-06-07T10:00:00Z", look="0:40-64")
+    assert later.receipt["memory"]["run"] == middle.folder.name
+    assert later.receipt["memory"]["shift_px"] == [12, -20]
+    last = survey_png(out, **now, visit="2026-06-08T10:00:00Z", look="0:0-20")
+    assert last.receipt["memory"]["shift_px"] == [0, 0]
+
+
 def test_a_rig_that_was_turned_is_noticed(survey_png: Survey, tmp_path: Path) -> None:
     """By four degrees: its memory is put aside, and receipt and page say by how much."""
     values, _ = patchy_scene((300, 320), 3, seed=6)

@@ -1,0 +1,123 @@
+"""What is remembered of a field as its stores hold it, read region by region where it lies by today's look."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from flows.survey.field_work import look_at
+from models.reading.regions import Region
+from models.reading.remembered import Belief, Remembered, in_classes
+from models.weights.files import Weights
+from pipeline.rectify.registration.field_shift import FieldShift, field_shift
+from storage.arrays.beliefs import BeliefStore
+from storage.arrays.mosaics import mosaic_brightness
+
+REACH_PX = 64.0  # within which a memory that lies beside today's look is found
+LEAST_SHIFT_PX = 2.0  # less is how well two looks can be laid on each other
+Gap = tuple[int, int]  # what lies before the first and behind the last
+
+
+@dataclass(frozen=True)
+class CoarseMemory:
+    """Where a coarse look at a field lies."""
+
+    mosaic: Path
+    shift_px: tuple[int, int]  # down and to the right, that brings it onto the newest
+
+
+@dataclass(frozen=True)
+class FieldMemory:
+    """Where the memory of a field lies, and how it is to be read."""
+
+    belief: Path
+    looks: tuple[CoarseMemory, ...]  # the newest first: of a place the first that saw it counts
+    days: float
+    classes: tuple[int, ...]  # see `flows.survey.memory.Prior`
+    shift_px: tuple[int, int] = (0, 0)  # down and to the right, that brings it onto today's look
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """Everything that is read."""
+        return self.belief, *(look.mosaic for look in self.looks)
+
+    def of(self, region: Region, weights: Weights) -> Remembered:
+        """Read what is remembered of a region, in the classes of the weights."""
+        store = BeliefStore(self.belief)
+        rows, columns = (
+            _moved(part, by, size)
+            for part, by, size in zip((region.read.rows, region.read.columns), self.shift_px, store.shape, strict=True)
+        )
+        gaps = rows[1], columns[1]
+        values, age, light = (_framed(part, gaps) for part in store.read(rows[0], columns[0]))
+        if self.classes != tuple(range(values.shape[-1])):
+            values = in_classes(values, self.classes)
+        images = (
+            shifted(
+                look_at(weights, look.mosaic, region).seen_columns,
+                _cells(np.add(look.shift_px, self.shift_px), region.grid.factor),
+            )
+            for look in self.looks
+        )
+        return Remembered(Belief(values, age, np.nan_to_num(light)), laid_together(images), self.days)
+
+
+def laid_together(images: Iterable[NDArray[np.float32]]) -> NDArray[np.float32]:
+    """One image (y, x, ...) out of several of one size: at each pixel the first that is no NaN there."""
+    whole: NDArray[np.float32] | None = None
+    for image in images:
+        if whole is None:
+            whole = image
+            continue
+        told = np.isfinite(whole)
+        if told.all():
+            return whole
+        whole = np.where(told, whole, image)
+    assert whole is not None
+    return whole
+
+
+def shifted(image: NDArray[np.float32], by: tuple[int, int]) -> NDArray[np.float32]:
+    """An image (y, x, ...) moved down and to the right, with NaN where nothing lies."""
+    parts = [_moved(slice(0, size), one, size) for size, one in zip(image.shape, by, strict=False)]
+    return _framed(image[parts[0][0], parts[1][0]], (parts[0][1], parts[1][1]))
+
+
+def memory_lies(before: Sequence[CoarseMemory], now: Path, factor: int) -> FieldShift:
+    """How the field of stored coarse looks, the newest first, lies beside that of another, in fine px."""
+    pictures = (shifted(mosaic_brightness(look.mosaic), _cells(look.shift_px, factor)) for look in before)
+    found = field_shift(mosaic_brightness(now), laid_together(pictures), reach_px=REACH_PX / factor)
+    return replace(found, shift=(factor * found.shift[0], factor * found.shift[1]))
+
+
+def whole_pixels(lies: FieldShift) -> tuple[int, int]:
+    """Rows and columns to move a memory by; none where it lies as well as looks can be laid on each other."""
+    down, across = lies.shift
+    return (0, 0) if math.hypot(down, across) < LEAST_SHIFT_PX else (round(down), round(across))
+
+
+def _cells(shift_px: ArrayLike, factor: int) -> tuple[int, int]:
+    """The shift of a coarse image that is nearest to one in fine px."""
+    down, across = np.rint(np.divide(shift_px, factor)).astype(int).tolist()
+    return down, across
+
+
+def _moved(part: slice, by: int, size: int) -> tuple[slice, Gap]:
+    """Where a part of an axis of ``size`` lies before it is moved ``by``, and what of it lies beyond the ends."""
+    start, stop = part.start - by, part.stop - by
+    first, last = min(max(start, 0), size), min(max(stop, 0), size)
+    whole = stop - start
+    before = min(max(-start, 0), whole)
+    return slice(first, last), (before, whole - before - (last - first))
+
+
+def _framed(values: NDArray[np.float32], gaps: tuple[Gap, Gap]) -> NDArray[np.float32]:
+    """Images (y, x, ...) with NaN where nothing lies."""
+    if not any(map(any, gaps)):
+        return values
+    return np.pad(values, [*gaps, *[(0, 0)] * (values.ndim - 2)], constant_values=np.nan)
