@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     import flows.settings.load as settings_load
     import flows.terminal.processes as processes
     import flows.terminal.progress as terminal_progress
-    import flows.training.train as training
+    import flows.training.train_command as train_command
+    import flows.training.train_scenes as train_scenes
     import models.training.train as models_training
     import spectralzoom.opened as opened
     from flows.settings.survey_settings import Settings
@@ -40,7 +41,8 @@ else:
     settings_load = deferred("flows.settings.load")
     processes = deferred("flows.terminal.processes")
     terminal_progress = deferred("flows.terminal.progress")
-    training = deferred("flows.training.train")
+    train_command = deferred("flows.training.train_command")
+    train_scenes = deferred("flows.training.train_scenes")
     models_training = deferred("models.training.train")
     opened = deferred("spectralzoom.opened")
 
@@ -162,11 +164,11 @@ def train(
     Error
         What was expected, what came, where, and what to do.
     """
-    kind, how, asked = training.TrainRequest, models_training.TrainingSettings, {**flags}
+    kind, how, asked = train_scenes.TrainRequest, models_training.TrainingSettings, {**flags}
     command = f"spectralzoom.train({', '.join([repr(Path(dataset).name), *(f'{k}={v!r}' for k, v in asked.items())])})"
     sizes, choices = _taken(asked, TOKENS), _taken(asked, OF_ONE_SCENE)
     own = _taken(asked, [one.name for one in fields(how)])
-    own.setdefault("crop", training.usual_crop(str(dataset), asked.get("preset", "two-scale")))
+    own.setdefault("crop", train_command.usual_crop(str(dataset), asked.get("preset", "two-scale")))
     if "hold_out" in asked:
         asked["hold_out"] = tuple(_several(asked["hold_out"]))
     if asked.get("init") is not None:
@@ -176,7 +178,7 @@ def train(
         str(dataset), Path(out), **asked, tokens=sizes, choices=choices, settings=how(**own), command=command
     )
     with _working(progress, quiet=quiet) as console:
-        training.run_train(request, console)
+        train_command.run_train(request, console)
     return Path(out)
 
 

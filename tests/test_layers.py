@@ -8,16 +8,25 @@ import importlib
 import re
 import sys
 import tomllib
-from collections import Counter
 from collections.abc import Iterator
-from functools import cache
-from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
-ROOMS = ("pipeline", "models", "storage", "flows", "spectralzoom")
+from tests.house.source_tree import (
+    ROOMS,
+    ROOT,
+    circles,
+    files_by_folder,
+    files_of_tests,
+    imported,
+    imported_in_functions,
+    nodes,
+    public,
+    shared_class_names,
+    source,
+)
+
 MAY_IMPORT = {
     "pipeline": {"pipeline"},
     "models": {"models", "pipeline"},
@@ -50,7 +59,6 @@ FILE_MODULES = {"pathlib", "shutil", "tempfile", "glob", "io", "fileinput"}
 READS = {"open", "read_text", "read_bytes", "getenv", "load_dotenv", "read_csv", "loadtxt", "load_file"}
 MOST_FILES = 25  # in a folder
 MOST_LINES = 8  # of what is clear without a docstring
-Documented = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
 IN_FUNCTIONS = {  # file -> packages that a function of it imports, and why no file's head does
     "flows/publish/survey_command.py": ("PIL", "for Prefect's pages alone"),
     "flows/survey/prefect_engine.py": ("prefect", "that it cannot be imported is told, and the survey runs plain"),
@@ -69,28 +77,6 @@ def _trees_are_no_garbage() -> Iterator[None]:
     gc.enable()
 
 
-@cache
-def source() -> dict[Path, ast.Module]:
-    """The syntax tree of every source file of the house, by its path from the root."""
-    found = sorted(path for room in ROOMS for path in (ROOT / room).rglob("*.py"))
-    return {path.relative_to(ROOT): ast.parse(path.read_text(encoding="utf-8"), str(path)) for path in found}
-
-
-@cache
-def nodes(tree: ast.AST) -> list[ast.AST]:
-    """All nodes of a tree, walked once for every rule."""
-    return list(ast.walk(tree))
-
-
-def imported(tree: ast.AST) -> Iterator[str]:
-    """Names of all modules imported anywhere in the file, those for type checkers included."""
-    for node in nodes(tree):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            yield "." * node.level + (node.module or "")
-
-
 def at_import(tree: ast.Module) -> Iterator[ast.AST]:
     """Nodes that run when the module is imported: all but the bodies of functions."""
     waiting: list[ast.AST] = list(tree.body)
@@ -106,25 +92,6 @@ def at_import(tree: ast.Module) -> Iterator[ast.AST]:
 def called_name(node: ast.Call) -> str:
     """The last part of what is called."""
     return node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
-
-
-def public(tree: ast.AST) -> Iterator[Documented]:
-    """Functions and classes whose names begin with no underscore, wherever they stand: in others too."""
-    return (node for node in nodes(tree) if isinstance(node, Documented) and not node.name.startswith("_"))
-
-
-def module_name(path: Path) -> str:
-    """The name that a file is imported by."""
-    return ".".join(path.with_suffix("").parts).removesuffix(".__init__")
-
-
-def imported_files(path: Path, tree: ast.Module, known: set[str]) -> set[str]:
-    """Modules of the house that a file names, ``from package import module`` included."""
-    names = set(imported(tree))
-    for node in nodes(tree):
-        if isinstance(node, ast.ImportFrom):
-            names |= {f"{node.module}.{alias.name}" for alias in node.names}
-    return (names & known) - {module_name(path)}
 
 
 def test_imports_go_one_way() -> None:
@@ -174,41 +141,25 @@ def test_pipeline_opens_no_files() -> None:
 
 def test_no_file_imports_itself_in_a_circle() -> None:
     """Every file stands above all that it imports, within functions and for type checkers too."""
-    known = {module_name(path) for path in source() if path.name != "__init__.py"}
-    graph = {module_name(path): imported_files(path, tree, known) for path, tree in source().items()}
-    circles = []
-    while True:
-        try:
-            TopologicalSorter(graph).prepare()
-            break
-        except CycleError as error:
-            circle = error.args[1]
-            circles.append(" -> ".join(reversed(circle)))
-            graph[circle[1]].discard(circle[0])
-    assert circles == []
+    assert circles(source()) == []
 
 
 def test_files_say_at_their_heads_what_they_need() -> None:
     """What takes long to load is deferred at a file's head; functions import only what the table gives a reason for."""
-    found: dict[str, set[str]] = {}
-    for path, tree in source().items():
-        inner = [node for node in nodes(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
-        if names := {name.split(".")[0] for function in inner for name in imported(function)}:
-            found[path.as_posix()] = names
-    assert found == {path: set(packages.split()) for path, (packages, _) in IN_FUNCTIONS.items()}
+    assert imported_in_functions(source()) == {
+        path: set(packages.split()) for path, (packages, _) in IN_FUNCTIONS.items()
+    }
 
 
 def test_folders_can_be_held_in_mind() -> None:
     """No folder of the house or of its tests has more files than a person can hold in mind."""
-    tests = (path.relative_to(ROOT) for path in (ROOT / "tests").rglob("*.py"))
-    count = Counter(path.parent for path in (*source(), *tests))
-    assert {folder.as_posix(): files for folder, files in count.items() if files > MOST_FILES} == {}
+    count = files_by_folder([*source(), *files_of_tests()])
+    assert {folder: files for folder, files in count.items() if files > MOST_FILES} == {}
 
 
 def test_class_names_are_unique() -> None:
     """Whoever reads the name of a class knows which one is meant."""
-    names = Counter(node.name for tree in source().values() for node in nodes(tree) if isinstance(node, ast.ClassDef))
-    assert {name: count for name, count in names.items() if count > 1} == {}
+    assert shared_class_names(source()) == {}
 
 
 def test_what_is_public_says_what_it_does() -> None:

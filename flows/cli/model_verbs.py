@@ -18,7 +18,8 @@ from flows.terminal.progress import print_json
 from flows.tradeoff.command import run_tradeoff
 from flows.training.measure_familiar import FamiliarRequest, run_measure_familiar
 from flows.training.remember import JUDGED_LANDS, LANDS, MemoryRequest, run_remember
-from flows.training.train import TrainRequest, asked_command, run_train, usual_crop
+from flows.training.train_command import asked_command, run_train, usual_crop
+from flows.training.train_scenes import TrainRequest
 from models.training.memory import MemoryTraining
 from models.training.train import TrainingSettings
 from pipeline.errors import SettingsError

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from flows.publish.panels import class_palette, class_rgb, outline, save_png
 from flows.publish.receipt import Receipt
-from flows.publish.receipt_table import days_words
+from flows.publish.receipt_words import days_words
 from flows.publish.report import Picture
 from flows.survey.memory import Prior
 from flows.terminal.figures import counted

@@ -14,7 +14,7 @@ from flows.publish.field_map import FieldMap, SweepShown
 from flows.publish.page_places import PagePlaces, places_of_grid, places_of_pose
 from flows.publish.page_spectra import PageSpectra, page_spectra
 from flows.publish.quicklook import QuicklookData, colours_of
-from flows.publish.receipt_table import days_words
+from flows.publish.receipt_words import days_words
 from flows.survey.run import SurveyRun
 from flows.survey.stages.on_ground import survey_grid
 from flows.survey.survey import Products

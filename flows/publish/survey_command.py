@@ -19,7 +19,8 @@ from rich.console import Console
 from rich.markup import escape
 
 from flows.publish.receipt import Receipt, is_pending
-from flows.publish.receipt_table import COST_LABELS, cost_rows, headline, print_table, sentences
+from flows.publish.receipt_table import COST_LABELS, cost_rows, print_table
+from flows.publish.receipt_words import headline, sentences
 from flows.publish.report import render_markdown
 from flows.publish.run_folder import Published, add_accuracy, asked_settings, publish_run
 from flows.settings.survey_settings import OF_THE_MACHINE, Settings

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from flows.publish.change_picture import CHANGED_SHARE
 from flows.publish.page_pictures import in_base64, indexed_png
 from flows.publish.panels import UNLABELLED_COLOUR, class_palette
-from flows.publish.receipt_table import days_words
+from flows.publish.receipt_words import days_words
 from flows.terminal.figures import format_percent, format_points, format_seconds, known_number
 from storage.archive.archive import Archive
 from storage.archive.records import Run

@@ -261,7 +261,15 @@ _VGG_FROM = {"vgg-static": VGG_FROM, "vgg-trained": TRAINED_VGG_FROM}  # policie
 
 
 def _wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]:
-    policy, scene, air, camera = settings.policy, settings.scene, settings.air, settings.camera
+    """What does not go together, in words that say what to do about it."""
+    yield from _policy_wrongs(settings)
+    yield from _scene_wrongs(settings, origin)
+    yield from _rig_wrongs(settings)
+    yield from _look_wrongs(settings, origin)
+
+
+def _policy_wrongs(settings: Settings) -> Iterator[str]:
+    policy = settings.policy
     if (policy == "mask") != (settings.mask is not None):
         wants = "policy 'mask' needs a mask file" if settings.mask is None else "a mask is used by policy 'mask' only"
         yield f"{wants}: got policy = {policy!r}, mask = {settings.mask!r}; give both or neither"
@@ -276,6 +284,10 @@ def _wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]:
             f"threshold is a gain [nat], and policy {policy!r} scores in a unit of its own: leave --threshold out, or "
             f"take --policy {' or '.join(IN_NAT)} (entropy is the most that a look can gain)"
         )
+
+
+def _scene_wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]:
+    scene = settings.scene
     bands, wavelengths = settings.bands, settings.wavelengths
     if bands is not None and wavelengths is not None and len(bands) != len(wavelengths):
         place = place_of("wavelengths", origin.get("wavelengths"))
@@ -290,6 +302,15 @@ def _wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]:
                 f"{place_of(name, origin.get(name))} = {value:g} is for the scene {FARM_LAW}, whose fields grow; "
                 f"{scene} is as it is: leave it out"
             )
+    if settings.zones.plots_name is not None and settings.zones.plots is None:
+        place = place_of("zones.plots_name", origin.get("zones.plots_name"))
+        yield f"{place} = {settings.zones.plots_name!r} names plots, and there are none: give --plots FILE too"
+    if settings.pose is None and settings.map != MapChoice():
+        yield "[map] says how to draw the ground, which needs to know where the rig stands: give [pose]"
+
+
+def _rig_wrongs(settings: Settings) -> Iterator[str]:
+    air, camera = settings.air, settings.camera
     if camera.dark_dn >= camera.full_scale_dn:
         yield (
             f"camera.dark_dn = {camera.dark_dn:g} leaves no room below the {camera.full_scale_dn} DN of {camera.bits} "
@@ -304,9 +325,9 @@ def _wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]:
     pairs = settings.cost.vector_pairs
     if settings.source == "rig" and not 2 <= pairs <= MOST_PAIRS:
         yield f"cost.vector_pairs = {pairs}: the mirror's vector memory takes 2 to {MOST_PAIRS} pairs; give what it has"
-    if settings.zones.plots_name is not None and settings.zones.plots is None:
-        place = place_of("zones.plots_name", origin.get("zones.plots_name"))
-        yield f"{place} = {settings.zones.plots_name!r} names plots, and there are none: give --plots FILE too"
+
+
+def _look_wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]:
     if settings.look == LOOK_PART and settings.seconds is None:
         place = place_of("look", origin.get("look"))
         yield f"{place} = 'part' looks where the seconds are worth most: give --seconds too"
@@ -320,8 +341,6 @@ def _wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]:
     if settings.refresh is not None and settings.look == LOOK_WHOLE:
         place = place_of("refresh", origin.get("refresh"))
         yield f"{place} says how old a place may become of which a visit looks at a part: give --look part too"
-    if settings.pose is None and settings.map != MapChoice():
-        yield "[map] says how to draw the ground, which needs to know where the rig stands: give [pose]"
 
 
 def place_of(key: str, origin: str | None) -> str:

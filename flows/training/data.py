@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,6 +26,7 @@ FARM_TEST_SEED = 300_000  # of farm scenes to judge on: neither trained on, nor 
 SEASON_DAYS = (96, 304)  # of training scenes: April to October
 SEASON_HOURS = (9, 15)  # true solar time
 _GOLDEN, _SILVER = 0.6180339887, 0.4142135624  # steps round a circle that no number of points comes back on
+Report = Callable[[str, float, str], None]  # what is done, how far 0..1, a figure
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.training.data import TrainingData, read_farm_name
+from flows.training.data import Report, TrainingData, read_farm_name
 from models.network.spectral import patches_of
 from models.reading.inference import glance_of_columns, segment
 from models.training.calibration import JudgedMap, judge_confidence
@@ -23,8 +23,6 @@ from pipeline.errors import SceneError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M
 from pipeline.simulator.scenes.farm.seasons import sun_over_farm
-
-Report = Callable[[str, float, str], None]
 
 
 @dataclass(frozen=True)

@@ -6,19 +6,17 @@ they and all that was made with them stay what they are.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 
 from flows.terminal.progress import one_after_the_other
-from flows.training.data import TrainingData, open_training_data
+from flows.training.data import Report, TrainingData, open_training_data
 from flows.training.familiarity import SeenScenes, measured_calibration, save_beside, trained_on
-from flows.training.train import TrainRequest, observe_all
-from models.training.examples import Example, normalised
+from flows.training.train_scenes import TrainRequest, as_read, observe_all
+from models.training.examples import Example
 from models.training.looks import REFERENCE_MS
 from models.training.train import TrainingSettings
 from models.weights.familiar_files import familiar_path
@@ -26,8 +24,6 @@ from models.weights.files import CALIBRATION, Weights, load_weights
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES
-
-Report = Callable[[str, float, str], None]
 
 
 @dataclass(frozen=True)
@@ -98,7 +94,6 @@ def _looked_at(weights: Weights, data: TrainingData, request: FamiliarRequest, r
         settings=TrainingSettings(seed=seed),
         camera=data.camera,
     )
-    reached = np.ones(config.columns, np.bool_)
     looks: list[list[Example]] = []
     about = None
     for what, names in (("looking at scenes", data.train), ("looking at validation scenes", data.validation)):
@@ -108,7 +103,7 @@ def _looked_at(weights: Weights, data: TrainingData, request: FamiliarRequest, r
                 " that nobody can say how often a known pixel would be unknown; train them with --validation 1 or more"
             )
         found, about = observe_all(how, data, names, what, report, about)
-        looks.append([normalised(one, weights.normalisation, reached) for one in found])
+        looks.append(as_read(found, weights.normalisation))
         if (about.basis, about.names) != (weights.basis, weights.class_names):
             raise SettingsError(f"{request.dataset} has other bands or classes than {request.weights} was trained on")
     assert about is not None

@@ -1,77 +1,30 @@
-"""`spectralzoom train`: labelled scenes in, one file of weights out, with the split and the figures kept in it."""
+"""Labelled scenes in, one file of weights out, with the split and the figures kept in it."""
 
 from __future__ import annotations
 
 import math
-import shlex
-import sys
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-from rich.console import Console
-from rich.table import Table
-
-from flows.terminal.progress import one_after_the_other
-from flows.training.data import (
-    TrainingData,
-    alike_notes,
-    either_mask,
-    only_class,
-    open_training_data,
-    pack_mask,
-    trained_pixels,
-)
+from flows.training.data import Report, TrainingData, either_mask, open_training_data
 from flows.training.familiarity import SeenScenes, measured_calibration, save_beside, trained_on
 from flows.training.figures import judge_scans, validate
-from flows.training.look import observe_scene
+from flows.training.train_scenes import About, TrainRequest, as_read, network_config, observe_all, question_labels
 from models.network.segmenter import Segmenter
-from models.network.sizes import PRESETS, Positions, Preset, SegmenterConfig
-from models.network.spectral import SpectralBasis
-from models.training.examples import Example, Observation, measured_normalisation, normalised
+from models.network.sizes import Preset, SegmenterConfig
+from models.network.spectral import Normalisation
+from models.training.examples import Example, measured_normalisation
 from models.training.looks import REFERENCE_MS, Looks
-from models.training.start_weights import StartFile
-from models.training.train import Progress, TrainingSettings, train
+from models.training.start_weights import Start, StartFile
+from models.training.train import Progress, train
 from models.weights.files import CALIBRATION, AnyWeights, Weights, save_weights, with_record
 from models.weights.sealed_files import read_checkpoint
 from models.weights.trained_on import TRAINED_ON
-from pipeline.errors import SceneError, SettingsError, ShapeError
-from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid
-from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES
-from pipeline.simulator.scenes.scene import RasterScene
+from pipeline.errors import SettingsError, ShapeError
 
-FRAME_CROP, FARM_CROP = 384, 256  # px
-WHOLE_CROP = 1024  # px; the paper's network counts its places along the whole scene, a crop's would be others
-
-
-@dataclass(frozen=True)
-class TrainRequest:
-    """What to train on and how; ``patch`` and ``columns`` follow from the data where None."""
-
-    dataset: str
-    out: Path
-    hold_out: tuple[str, ...] = ()
-    validation: int | None = None
-    scenes: int | None = None  # of a built-in farm; by its law where None
-    patch: int | None = None
-    factor: int = 4
-    columns: int = 24
-    width: int = 24
-    positions: Positions = "2d"
-    preset: Preset = "two-scale"
-    tokens: dict[str, Any] = field(default_factory=dict)  # dim, layers, heads, mlp_ratio, where not the usual ones
-    init: Path | None = None  # weights to begin from
-    choices: dict[str, Any] = field(default_factory=dict)  # of load_data_set: labels, bands, wavelengths, masks
-    settings: TrainingSettings = field(default_factory=TrainingSettings)
-    camera: LineCamera = field(default_factory=LineCamera)
-    command: str = ""
-
-
-Report = Callable[[str, float, str], None]  # what is done, how far 0..1, a figure
+Split = dict[str, Any]
 
 
 def train_weights(
@@ -99,42 +52,15 @@ def train_weights(
     refuse_seen(start, data)
     for note in data.notes:
         tell(note)
-    seen, about = observe_all(request, data, data.train, "looking at scenes", report)
-    _question_labels(about, request.dataset, tell)
-    normalisation = measured_normalisation(seen, math.sqrt(request.settings.darkest_ms * REFERENCE_MS))
-    reached = np.ones(about.basis.columns, bool)
-    examples = [normalised(observation, normalisation, reached) for observation in seen]
-    config = _config(request, about)
-    begun = None
-    if start is not None:
-        config = replace(config, patch_kernel=start.patch_kernel)
-        begun = start.begin(config, about.basis, normalisation, about.names)
-    state = None if begun is None else begun.state
-
-    def progress(now: Progress) -> None:
-        report("training", now.done, f"step {now.step}, loss {now.loss:.3f}")
-
+    lesson = _lesson(request, data, start, report, tell)
+    about = lesson.about
     own = {"train": dict(about.keys), "validation": list(data.validation), "held_out": list(data.held_out)}
-    split = joined_split(
-        own | {"pixels": dict(about.pixels)}, start
-    )  # before validation scenes are looked at: what was trained on
-    looks = None
-    if request.settings.darkest_ms < REFERENCE_MS:
-        looks = Looks(normalisation, darkest_ms=request.settings.darkest_ms)
-    model, summary = train(
-        config,
-        examples,
-        normalisation.gain_shift,
-        request.settings,
-        progress,
-        start=state,
-        looks=looks,
-        checkpoint=checkpoint,
-    )
-    weights = AnyWeights(model, about.basis, normalisation, about.names, about.colours)
+    # before validation scenes are looked at: what was trained on
+    split = joined_split(own | {"pixels": dict(about.pixels)}, start)
+    weights, summary = _learned(request, lesson, checkpoint, report)
     kept, _ = observe_all(request, data, data.validation, "looking at validation scenes", report, about)
-    frames = [normalised(one, normalisation, reached) for one in kept]
-    whole = SeenScenes(examples, frames, about.wavelength_nm, request.settings.darkest_ms, request.settings.seed)
+    frames = as_read(kept, lesson.normalisation)
+    whole = SeenScenes(lesson.examples, frames, about.wavelength_nm, request.settings.darkest_ms, request.settings.seed)
     told = trained_on(data, whole, about.names)
     record = {
         "command": request.command,
@@ -144,15 +70,65 @@ def train_weights(
         "settings": asdict(request.settings),
         "camera": asdict(request.camera),
         "training": summary,
-        **_figures(weights, frames, looks, request.settings.seed, report),
-        **({} if begun is None else {"begun_from": begun.record}),
+        **_figures(weights, frames, lesson.looks, request.settings.seed, report),
+        **({} if lesson.begun is None else {"begun_from": lesson.begun.record}),
     }
     save_weights(with_record(weights, **record), request.out)
     checkpoint.unlink(missing_ok=True)
-    if isinstance(model, Segmenter):
+    if isinstance(weights.network, Segmenter):
         why = save_beside(_two_scale(weights), request.out, whole, told, {"command": request.command}, report)
         record = record if why is None else {**record, "familiar": why}
     return record
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """What there is to learn from: scenes as the network reads them, and the tensors that it begins with."""
+
+    about: About
+    config: SegmenterConfig
+    normalisation: Normalisation
+    examples: list[Example]
+    looks: Looks | None  # None where all light is that of the reference
+    begun: Start | None
+
+
+def _lesson(
+    request: TrainRequest, data: TrainingData, start: StartFile | None, report: Report, tell: Callable[[str], None]
+) -> Lesson:
+    """Look at the scenes to train on, and lay the start's tensors into the network that is wanted."""
+    seen, about = observe_all(request, data, data.train, "looking at scenes", report)
+    question_labels(about, request.dataset, tell)
+    darkest_ms = request.settings.darkest_ms
+    normalisation = measured_normalisation(seen, math.sqrt(darkest_ms * REFERENCE_MS))
+    config, begun = network_config(request, about), None
+    if start is not None:
+        config = replace(config, patch_kernel=start.patch_kernel)
+        begun = start.begin(config, about.basis, normalisation, about.names)
+    looks = Looks(normalisation, darkest_ms=darkest_ms) if darkest_ms < REFERENCE_MS else None
+    return Lesson(about, config, normalisation, as_read(seen, normalisation), looks, begun)
+
+
+def _learned(
+    request: TrainRequest, lesson: Lesson, checkpoint: Path, report: Report
+) -> tuple[AnyWeights, dict[str, float | int]]:
+    """Train the network; weights, and a summary of the training."""
+
+    def progress(now: Progress) -> None:
+        report("training", now.done, f"step {now.step}, loss {now.loss:.3f}")
+
+    model, summary = train(
+        lesson.config,
+        lesson.examples,
+        lesson.normalisation.gain_shift,
+        request.settings,
+        progress,
+        start=None if lesson.begun is None else lesson.begun.state,
+        looks=lesson.looks,
+        checkpoint=checkpoint,
+    )
+    about = lesson.about
+    return AnyWeights(model, about.basis, lesson.normalisation, about.names, about.colours), summary
 
 
 def _two_scale(weights: AnyWeights, **entries: Any) -> Weights:
@@ -189,107 +165,6 @@ def _check_places(out: Path, checkpoint: Path) -> None:
                 f"-o {out}: {path} is a folder, and training keeps a file of that name; move it away, or name other "
                 "weights"
             )
-
-
-@dataclass
-class About:
-    """What all scenes of a data set have in common, and what training saw of each."""
-
-    basis: SpectralBasis
-    names: tuple[str, ...]
-    colours: NDArray[np.uint8]
-    patch: int
-    wavelength_nm: NDArray[np.float64]
-    keys: dict[str, str] = field(default_factory=dict)  # scene -> identity of its light
-    pixels: dict[str, str] = field(default_factory=dict)  # identity -> trained pixels, where not all labelled ones
-    alike: dict[str, str] = field(default_factory=dict)  # scene -> class, where all its labels are one
-
-
-def observe_all(
-    request: TrainRequest,
-    data: TrainingData,
-    names: tuple[str, ...],
-    what: str,
-    report: Report,
-    about: About | None = None,
-) -> tuple[list[Observation], About]:
-    """Look at named scenes of the data, and say what they have in common with each other, and with earlier ones."""
-    seen = []
-    for number, (name, scene) in enumerate(zip(names, data.scenes(names), strict=True)):
-        report(what, number / len(names), name)
-        known = about or _common(request, scene)
-        _check_alike(scene, known)
-        known.keys[name] = scene.key
-        mask = trained_pixels(scene)
-        if request.choices.get("train_mask") is not None:
-            known.pixels[scene.key] = pack_mask(mask)
-        about = known
-        if (alone := only_class(scene)) is not None:
-            known.alike[name] = alone
-        grid = SceneGrid(*scene.shape, known.patch, request.factor)
-        rng = np.random.default_rng([request.settings.seed, 0x0B5, number])
-        seen.append(observe_scene(scene, request.camera, grid, known.basis, rng))
-    if about is None:
-        raise SceneError(f"{request.dataset} has no scene to train on")
-    return seen, about
-
-
-def _question_labels(about: About, dataset: str, tell: Callable[[str], None]) -> None:
-    """Tell which scenes have labels of one class (SceneError: all of them, and of the same)."""
-    notes = alike_notes(about.alike)
-    if len(about.alike) == len(about.keys) and len(notes) == 1:
-        raise SceneError(f"{dataset}: training needs two or more classes, and {notes[0]}")
-    for note in notes:
-        tell(note)
-
-
-def _common(request: TrainRequest, scene: RasterScene) -> About:
-    trained_pixels(scene)  # refuses a scene without labels
-    if len(scene.class_names) < 2:
-        notes = alike_notes({scene.name: scene.class_names[0]})
-        raise SceneError(f"{request.dataset}: training needs two or more classes, and {notes[0]}")
-    basis = SpectralBasis.spanning(scene.wavelength_nm, request.columns)
-    patch = request.patch or suggested_patch(scene.shape, built_in=request.dataset in FARM_NAMES)
-    about = About(basis, scene.class_names, scene.class_colours, patch, scene.wavelength_nm)
-    _config(request, about)  # refuses sizes that do not fit before the first look
-    return about
-
-
-def suggested_patch(shape: tuple[int, int], *, built_in: bool) -> int:
-    """Patch size for scenes of this shape: 16 for the farm, 32 for frames, less where a scene would hold few seats."""
-    if built_in:
-        return 16
-    return 32 if min(shape) >= 512 else 16 if min(shape) >= 256 else 8
-
-
-def usual_crop(dataset: str, preset: Preset) -> int:
-    """Size of the crops to train on [px]: whole scenes for the paper's network, as far as they are square."""
-    return WHOLE_CROP if preset == "paper" else FARM_CROP if dataset in FARM_NAMES else FRAME_CROP
-
-
-def _check_alike(scene: RasterScene, about: About) -> None:
-    if scene.class_names != about.names:
-        raise SceneError(f"scene {scene.name} has classes {scene.class_names}, the scenes before it {about.names}")
-    if not np.array_equal(scene.wavelength_nm, about.wavelength_nm):
-        raise SceneError(f"scene {scene.name} has other bands than the scenes before it; train on scenes of one camera")
-
-
-def _config(request: TrainRequest, about: About) -> SegmenterConfig:
-    try:
-        return SegmenterConfig(
-            classes=len(about.names),
-            columns=about.basis.columns,
-            patch=about.patch,
-            factor=request.factor,
-            width=request.width,
-            **request.tokens,
-            **{"positions": request.positions, **PRESETS[request.preset]},
-        )
-    except ValueError as error:
-        raise SettingsError(f"{error}; choose another --patch or --factor, --dim or --heads") from error
-
-
-Split = dict[str, Any]
 
 
 def open_start(init: Path | None, tokens: Mapping[str, Any], preset: Preset) -> StartFile | None:
@@ -332,92 +207,3 @@ def joined_split(split: Split, start: StartFile | None) -> Split:
     masks = {key: either_mask(parts.get(key), parts_before.get(key)) for key in parts.keys() | parts_before.keys()}
     more = {f"{start.path.name}: {name}": key for name, key in before.items() if key not in own.values()}
     return split | {"train": own | more, "pixels": {key: mask for key, mask in masks.items() if key not in whole}}
-
-
-def print_start(begun: Mapping[str, Any], console: Console) -> None:
-    """Say what became of the tensors of the file."""
-    skipped: Mapping[str, list[str]] = begun["skipped"]
-    counts = f"{begun['matched']} tensors matched, {len(begun['resized'])} resized"
-    console.print(f"begun from {begun['file']} ({begun['kind']}): {counts}, {sum(map(len, skipped.values()))} skipped")
-    for name, how in begun["resized"].items():
-        console.print(f"  resized {name}: {how}")
-    for why, names in skipped.items():
-        shown = f"{names[0]} and {len(names) - 1} more" if len(names) > 1 else names[0]
-        console.print(f"  skipped {shown}: {why}")
-    if "unsealed" in begun:
-        console.print(f"  note: {begun['unsealed']}", markup=False, soft_wrap=True)
-    if begun["licence"]:
-        console.print(f"  its licence: {begun['licence']}")
-
-
-def run_train(request: TrainRequest, console: Console) -> dict[str, Any]:
-    """Train with a progress bar on ``console``; give the record kept in the weights."""
-    _check_counts(request)
-    request = replace(request, command=request.command or asked_command())
-    with one_after_the_other(console) as report:
-        record = train_weights(
-            request, report, lambda note: console.print(f"note: {note}", markup=False, soft_wrap=True)
-        )
-    if "begun_from" in record:
-        print_start(record["begun_from"], console)
-    _print_figures(record, request, console)
-    return record
-
-
-def _check_counts(request: TrainRequest) -> None:
-    settings = request.settings
-    counts = {
-        "--steps": settings.steps,
-        "--minutes": settings.minutes,
-        "--batch": settings.batch,
-        "--crop": settings.crop,
-        "--scenes": request.scenes,
-        "--patch": request.patch,
-        "--factor": request.factor,
-        "--columns": request.columns,
-        **{"--" + name.replace("_", "-"): size for name, size in request.tokens.items()},
-    }
-    for name, value in counts.items():
-        if value is not None and not value > 0:
-            raise SettingsError(f"{name} must be above 0, got {value}")
-    for name, number in {"--validation": request.validation, "--seed": settings.seed}.items():
-        if number is not None and number < 0:
-            raise SettingsError(f"{name} must be 0 or more, got {number}")
-    if not 0 < settings.darkest_ms <= REFERENCE_MS:
-        raise SettingsError(
-            f"--darkest-ms must be above 0 and at most {REFERENCE_MS:g}, the exposure that scenes are looked at with,"
-            f" got {settings.darkest_ms}"
-        )
-    if request.positions == "paper" and request.preset not in ("two-scale", "paper"):
-        raise SettingsError(
-            f"--positions paper is not for --preset {request.preset}, which reads one scale; leave it out"
-        )
-
-
-def asked_command() -> str:
-    """The command without folders: a machine's paths do not belong in weights."""
-    words = [Path(word).name if "/" in word else word for word in sys.argv[1:]]
-    return shlex.join(["spectralzoom", *words])
-
-
-def _print_figures(record: dict[str, Any], request: TrainRequest, console: Console) -> None:
-    out = request.out
-    console.print(f"weights: {out} ({out.stat().st_size / 1e6:.1f} MB), {record['training']['steps']} steps")
-    if "familiar" in record:
-        console.print(record["familiar"], markup=False, soft_wrap=True)
-    figures = record["validation"]
-    if figures is None:
-        given = "--weights" if request.preset == "two-scale" else "--weights OTHERS --control"
-        console.print(
-            "no scene was kept for validation; to judge the weights on scenes that they were not trained on: "
-            f"spectralzoom evaluate {request.dataset} {given} {out}",
-            soft_wrap=True,
-        )
-        return
-    title = f"{figures['scenes']} scene{'s' if figures['scenes'] > 1 else ''} kept for validation"
-    caption = f"none: the coarse pass alone; all: fine everywhere; else fine at {figures['share_of_seats']:.0%}"
-    table = Table("placement", "mIoU", "overall", title=title, caption=caption)
-    for name in ("none", "random", "sobel", "entropy", "gain", "all"):
-        if name in figures:  # a control has some of them
-            table.add_row(name, *(f"{figures[name][figure]:.1%}" for figure in ("miou", "overall_accuracy")))
-    console.print(table)

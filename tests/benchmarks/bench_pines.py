@@ -178,7 +178,8 @@ def _peer(name: str, values: Values, split: Split, classifier: Any, grid: dict[s
 
 
 def _trained(folder: Path, out: Path) -> Path:
-    from flows.training.train import TrainRequest, train_weights
+    from flows.training.train import train_weights
+    from flows.training.train_scenes import TrainRequest
 
     path = out / "pines.safetensors"
     train_weights(TrainRequest(str(folder / SCENE), path, choices=_choices(folder), settings=_settings()))

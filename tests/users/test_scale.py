@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from flows.publish.receipt_table import sentences
+from flows.publish.receipt_words import sentences
 from flows.settings.load import load_settings
 from flows.survey.zones import place_of_field
 from pipeline.geometry.camera import LineCamera

@@ -22,7 +22,8 @@ from flows.evaluate.summary import summarise
 from flows.evaluate.table import print_evaluation
 from flows.evaluate.work import KeptResults
 from flows.training.data import farm_test_data, pack_mask
-from flows.training.train import TrainRequest, train_weights
+from flows.training.train import train_weights
+from flows.training.train_scenes import TrainRequest
 from models.evaluation.metrics import average_accuracy, kappa, mean_iou, overall_accuracy
 from models.training.train import TrainingSettings
 from models.weights.files import load_weights, save_weights

@@ -13,7 +13,8 @@ import pytest
 from rich.console import Console
 
 from flows.publish.receipt import COSTS, Header, Receipt, build_receipt, check_receipt, comparable
-from flows.publish.receipt_table import headline, print_table
+from flows.publish.receipt_table import print_table
+from flows.publish.receipt_words import headline
 from flows.publish.report import Picture, render_report
 from flows.settings.survey_settings import Settings
 from flows.terminal.figures import area_words

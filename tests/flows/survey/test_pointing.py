@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from flows.publish.receipt_table import sentences
+from flows.publish.receipt_words import sentences
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings, parse_settings
 from flows.survey.capture_plan import plan_capture

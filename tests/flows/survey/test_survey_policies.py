@@ -13,7 +13,7 @@ import torch
 from rich.console import Console
 
 from flows.publish.receipt import check_receipt
-from flows.publish.receipt_table import sentences
+from flows.publish.receipt_words import sentences
 from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings, parse_settings

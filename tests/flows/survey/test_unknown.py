@@ -17,7 +17,7 @@ import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flows.publish.receipt_table import sentences
+from flows.publish.receipt_words import sentences
 from flows.settings.load import load_settings
 from flows.settings.values import parse_unknown
 from flows.survey.beyond_training import beyond_training

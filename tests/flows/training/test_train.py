@@ -19,9 +19,12 @@ from flows.cli.main import main
 from flows.settings.load import load_settings
 from flows.survey.run import open_run
 from flows.training import train as flow
+from flows.training import train_scenes
 from flows.training.data import pack_mask, unpack_mask
 from flows.training.measure_familiar import FamiliarRequest, measure_familiar
-from flows.training.train import TrainRequest, joined_split, run_train, suggested_patch, train_weights, usual_crop
+from flows.training.train import joined_split, train_weights
+from flows.training.train_command import run_train, usual_crop
+from flows.training.train_scenes import TrainRequest, suggested_patch
 from models.network.sizes import PRESETS, Preset
 from models.training.start_weights import StartFile
 from models.training.train import TrainingSettings
@@ -109,8 +112,8 @@ def test_networks_that_cannot_be_are_refused_before_the_first_look(
 ):
     """No scene is opened for a start of another width, and none is looked at for sizes that do not fit."""
     begun = {"init": _transformer(out.with_name("vit.pth"))} if "init" in choices else {}
-    opened = "open_training_data" if begun else "observe_scene"
-    monkeypatch.setattr(flow, opened, lambda *given, **named: pytest.fail("a scene was looked at"))
+    opened = (flow, "open_training_data") if begun else (train_scenes, "observe_scene")
+    monkeypatch.setattr(*opened, lambda *given, **named: pytest.fail("a scene was looked at"))
     with pytest.raises(SettingsError, match=words):
         train_weights(_begun(folder, out, **{**choices, **begun}))
 
@@ -142,10 +145,10 @@ def test_scenes_of_other_bands_are_not_mixed(folder: Path, out: Path):
     request = _request(folder, out)
     data = flow.open_training_data(request.dataset, 0, None, request.camera)
     first, second = data.scenes(data.train[:2])
-    common = flow._common(request, first)
-    flow._check_alike(second, common)
+    common = train_scenes._common(request, first)
+    train_scenes._check_alike(second, common)
     with pytest.raises(SceneError, match=r"scene 002.* has other bands"):
-        flow._check_alike(replace(second, wavelength_nm=second.wavelength_nm + 10), common)
+        train_scenes._check_alike(replace(second, wavelength_nm=second.wavelength_nm + 10), common)
 
 
 @pytest.mark.parametrize(

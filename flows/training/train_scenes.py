@@ -1,0 +1,146 @@
+"""What a training is asked for, and what it sees of its scenes: looks at them, and what all have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.training.data import Report, TrainingData, alike_notes, only_class, pack_mask, trained_pixels
+from flows.training.look import observe_scene
+from models.network.sizes import PRESETS, Positions, Preset, SegmenterConfig
+from models.network.spectral import Normalisation, SpectralBasis
+from models.training.examples import Example, Observation, normalised
+from models.training.train import TrainingSettings
+from pipeline.errors import SceneError, SettingsError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES
+from pipeline.simulator.scenes.scene import RasterScene
+
+
+@dataclass(frozen=True)
+class TrainRequest:
+    """What to train on and how; ``patch`` and ``columns`` follow from the data where None."""
+
+    dataset: str
+    out: Path
+    hold_out: tuple[str, ...] = ()
+    validation: int | None = None
+    scenes: int | None = None  # of a built-in farm; by its law where None
+    patch: int | None = None
+    factor: int = 4
+    columns: int = 24
+    width: int = 24
+    positions: Positions = "2d"
+    preset: Preset = "two-scale"
+    tokens: dict[str, Any] = field(default_factory=dict)  # dim, layers, heads, mlp_ratio, where not the usual ones
+    init: Path | None = None  # weights to begin from
+    choices: dict[str, Any] = field(default_factory=dict)  # of load_data_set: labels, bands, wavelengths, masks
+    settings: TrainingSettings = field(default_factory=TrainingSettings)
+    camera: LineCamera = field(default_factory=LineCamera)
+    command: str = ""
+
+
+@dataclass
+class About:
+    """What all scenes of a data set have in common, and what training saw of each."""
+
+    basis: SpectralBasis
+    names: tuple[str, ...]
+    colours: NDArray[np.uint8]
+    patch: int
+    wavelength_nm: NDArray[np.float64]
+    keys: dict[str, str] = field(default_factory=dict)  # scene -> identity of its light
+    pixels: dict[str, str] = field(default_factory=dict)  # identity -> trained pixels, where not all labelled ones
+    alike: dict[str, str] = field(default_factory=dict)  # scene -> class, where all its labels are one
+
+
+def observe_all(
+    request: TrainRequest,
+    data: TrainingData,
+    names: tuple[str, ...],
+    what: str,
+    report: Report,
+    about: About | None = None,
+) -> tuple[list[Observation], About]:
+    """Look at named scenes of the data, and say what they have in common with each other, and with earlier ones."""
+    seen = []
+    for number, (name, scene) in enumerate(zip(names, data.scenes(names), strict=True)):
+        report(what, number / len(names), name)
+        known = about or _common(request, scene)
+        _check_alike(scene, known)
+        known.keys[name] = scene.key
+        mask = trained_pixels(scene)
+        if request.choices.get("train_mask") is not None:
+            known.pixels[scene.key] = pack_mask(mask)
+        about = known
+        if (alone := only_class(scene)) is not None:
+            known.alike[name] = alone
+        grid = SceneGrid(*scene.shape, known.patch, request.factor)
+        rng = np.random.default_rng([request.settings.seed, 0x0B5, number])
+        seen.append(observe_scene(scene, request.camera, grid, known.basis, rng))
+    if about is None:
+        raise SceneError(f"{request.dataset} has no scene to train on")
+    return seen, about
+
+
+def as_read(seen: Sequence[Observation], normalisation: Normalisation) -> list[Example]:
+    """What a network reads of looks by a basis that spans their bands, so that these reach every column of it."""
+    reached = np.ones(len(normalisation.centre), np.bool_)
+    return [normalised(one, normalisation, reached) for one in seen]
+
+
+def question_labels(about: About, dataset: str, tell: Callable[[str], None]) -> None:
+    """Tell which scenes have labels of one class (SceneError: all of them, and of the same)."""
+    notes = alike_notes(about.alike)
+    if len(about.alike) == len(about.keys) and len(notes) == 1:
+        raise SceneError(f"{dataset}: training needs two or more classes, and {notes[0]}")
+    for note in notes:
+        tell(note)
+
+
+def _common(request: TrainRequest, scene: RasterScene) -> About:
+    trained_pixels(scene)  # refuses a scene without labels
+    if len(scene.class_names) < 2:
+        notes = alike_notes({scene.name: scene.class_names[0]})
+        raise SceneError(f"{request.dataset}: training needs two or more classes, and {notes[0]}")
+    basis = SpectralBasis.spanning(scene.wavelength_nm, request.columns)
+    patch = request.patch or suggested_patch(scene.shape, built_in=request.dataset in FARM_NAMES)
+    about = About(basis, scene.class_names, scene.class_colours, patch, scene.wavelength_nm)
+    network_config(request, about)  # refuses sizes that do not fit before the first look
+    return about
+
+
+def suggested_patch(shape: tuple[int, int], *, built_in: bool) -> int:
+    """Patch size for scenes of this shape: 16 for the farm, 32 for frames, less where a scene would hold few seats."""
+    if built_in:
+        return 16
+    return 32 if min(shape) >= 512 else 16 if min(shape) >= 256 else 8
+
+
+def _check_alike(scene: RasterScene, about: About) -> None:
+    if scene.class_names != about.names:
+        raise SceneError(f"scene {scene.name} has classes {scene.class_names}, the scenes before it {about.names}")
+    if not np.array_equal(scene.wavelength_nm, about.wavelength_nm):
+        raise SceneError(f"scene {scene.name} has other bands than the scenes before it; train on scenes of one camera")
+
+
+def network_config(request: TrainRequest, about: About) -> SegmenterConfig:
+    """Sizes of the network that is asked for, for these scenes. Raises SettingsError where they do not fit."""
+    try:
+        return SegmenterConfig(
+            classes=len(about.names),
+            columns=about.basis.columns,
+            patch=about.patch,
+            factor=request.factor,
+            width=request.width,
+            **request.tokens,
+            **{"positions": request.positions, **PRESETS[request.preset]},
+        )
+    except ValueError as error:
+        raise SettingsError(f"{error}; choose another --patch or --factor, --dim or --heads") from error

@@ -1,0 +1,85 @@
+"""Print the house as it is: python tests/house [--journey], the figures that design rules are held against.
+
+With --journey a small survey is run as well, to find the files that a simulated line passes; it takes half a minute.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import redirect_stdout
+from io import StringIO
+from pathlib import Path
+
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+sys.path[0] = str(Path(__file__).resolve().parents[2])  # not this folder: its modules go by their full names
+
+from tests.benchmarks.measure import aligned  # noqa: E402
+from tests.house.source_tree import (  # noqa: E402
+    ROOMS,
+    circles,
+    files_by_folder,
+    files_of_tests,
+    imported_in_functions,
+    lines_of,
+    shared_class_names,
+    source,
+)
+
+SHORT = 60  # lines, below which a file is short
+SURVEY = ("survey", "--scene", "farm", "--size", "192x160", "--seconds", "6", "--engine", "plain")
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Print the table, and below it the files that a line passes where they are asked for."""
+    print(aligned([("what", "is", "where"), *figures()], (52, 10, 60)))
+    if "--journey" in arguments:
+        passed = journey()
+        print(f"\nA simulated line passes {len(passed)} files from the command to the class map:")
+        print("\n".join(passed))
+    return 0
+
+
+def figures() -> Iterator[tuple[str, str, str]]:
+    """What, how much, and where: of source and tests."""
+    lines = {path: len(lines_of(path)) for path in source()}
+    by_room = {room: sum(count for path, count in lines.items() if path.parts[0] == room) for room in ROOMS}
+    yield "source lines", str(sum(lines.values())), ", ".join(f"{room} {count}" for room, count in by_room.items())
+    yield "source files", str(len(lines)), ""
+    folder, most = files_by_folder([*source(), *files_of_tests()]).most_common(1)[0]
+    yield "files in a folder, most", str(most), folder
+    found = circles(source())
+    yield "import circles", str(len(found)), "; ".join(found)
+    inner = imported_in_functions(source())
+    yield "files with imports inside functions", str(len(inner)), ", ".join(inner)
+    faces = [path for path in lines if path.name == "__init__.py"]
+    short = sorted(path.as_posix() for path, count in lines.items() if count < SHORT and path not in faces)
+    yield f"files under {SHORT} lines, beside {len(faces)} __init__", str(len(short)), ", ".join(short)
+    yield "longest file, lines", str(max(lines.values())), max(lines, key=lambda path: lines[path]).as_posix()
+    yield "class names that collide", str(len(shared_class_names(source()))), ", ".join(shared_class_names(source()))
+    skipped = sum("# fmt: skip" in line for path in lines for line in lines_of(path))
+    yield "`# fmt: skip`", str(skipped), ""
+    tests = files_of_tests()
+    yield "lines of tests", str(sum(len(lines_of(path)) for path in tests)), f"{len(tests)} files"
+    yield "lines of the README", str(len(lines_of(Path("README.md")))), ""
+
+
+def journey() -> list[str]:
+    """Run a small survey; give the files that pixels pass on their way to its class map."""
+    from flows.cli.main import main as run
+    from tests.house.journey import passed_files
+
+    with tempfile.TemporaryDirectory(prefix="house-") as folder, passed_files() as passed, redirect_stdout(StringIO()):
+        try:
+            run([*SURVEY, "--out", folder])
+        except SystemExit as left:
+            if left.code:
+                raise
+    return sorted(passed)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

@@ -1,0 +1,75 @@
+"""The files that a simulated line passes from the command to the class map, found while a small survey runs.
+
+A file is passed where it stands on the stack as a function of the house takes or gives pixels: an array of two axes or
+more with at least as many numbers as one line of the camera has, by itself, in a sequence, or as a field of what is
+handed over. What is worked out of lines (tables, looks, beliefs, the map) is pixels too.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from types import CodeType, FrameType
+from typing import Any
+
+from tests.house.source_tree import ROOMS, ROOT
+
+LINE = 640  # numbers: the samples of a line in one band
+FIRST = 4  # of a sequence that are looked at
+MAP_DRAWN = ("flows/survey/stages/maps.py", "build")  # whose return is the end of the way
+
+
+@cache
+def file_of(code: CodeType) -> str | None:
+    """The file of the house that code stands in, from the root; None of code from elsewhere."""
+    path = Path(code.co_filename)
+    if not path.is_relative_to(ROOT):
+        return None
+    inner = path.relative_to(ROOT)
+    return inner.as_posix() if inner.parts[0] in ROOMS else None
+
+
+def has_pixels(value: Any, deep: bool = True) -> bool:
+    """Whether a value is, holds in a sequence or has as a field an array of as many numbers as a line."""
+    shape = getattr(value, "shape", None)
+    if isinstance(shape, tuple) and hasattr(value, "dtype"):
+        sizes = [size for size in shape if isinstance(size, int)]
+        count = 1
+        for size in sizes:
+            count *= size
+        return len(sizes) > 1 and count >= LINE
+    if isinstance(value, tuple | list):
+        return any(has_pixels(one, deep) for one in value[:FIRST])
+    return deep and any(has_pixels(one, False) for one in vars(value).values()) if hasattr(value, "__dict__") else False
+
+
+@contextmanager
+def passed_files() -> Iterator[set[str]]:
+    """Collect the files that pixels pass while the block runs, until the map is drawn; in threads begun in it too."""
+    passed: set[str] = set()
+    drawn = threading.Event()
+
+    def watch(frame: FrameType, event: str, given: Any) -> None:
+        if drawn.is_set() or event not in ("call", "return") or file_of(frame.f_code) is None:
+            return
+        values = [given] if event == "return" else frame.f_locals.values()
+        if any(map(has_pixels, values)):
+            place: FrameType | None = frame
+            while place is not None:
+                if (file := file_of(place.f_code)) is not None:
+                    passed.add(file)
+                place = place.f_back
+        if event == "return" and (file_of(frame.f_code), frame.f_code.co_name) == MAP_DRAWN:
+            drawn.set()
+
+    threading.setprofile(watch)
+    sys.setprofile(watch)
+    try:
+        yield passed
+    finally:
+        sys.setprofile(None)
+        threading.setprofile(None)

@@ -1,0 +1,102 @@
+"""The source files of the house as syntax trees, and what can be read off them: lines, imports, circles, names."""
+
+from __future__ import annotations
+
+import ast
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from functools import cache
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+ROOMS = ("pipeline", "models", "storage", "flows", "spectralzoom")
+Trees = Mapping[Path, ast.Module]
+Documented = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
+
+
+@cache
+def source() -> dict[Path, ast.Module]:
+    """The syntax tree of every source file of the house, by its path from the root."""
+    found = sorted(path for room in ROOMS for path in (ROOT / room).rglob("*.py"))
+    return {path.relative_to(ROOT): ast.parse(path.read_text(encoding="utf-8"), str(path)) for path in found}
+
+
+def files_of_tests() -> list[Path]:
+    """Every file of the tests, by its path from the root."""
+    return sorted(path.relative_to(ROOT) for path in (ROOT / "tests").rglob("*.py"))
+
+
+@cache
+def nodes(tree: ast.AST) -> list[ast.AST]:
+    """All nodes of a tree, walked once for every rule."""
+    return list(ast.walk(tree))
+
+
+def imported(tree: ast.AST) -> Iterator[str]:
+    """Names of all modules imported anywhere in the file, those for type checkers included."""
+    for node in nodes(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield "." * node.level + (node.module or "")
+
+
+def imported_in_functions(trees: Trees) -> dict[str, set[str]]:
+    """Packages that functions import, by the file that these stand in."""
+    found: dict[str, set[str]] = {}
+    for path, tree in trees.items():
+        inner = [node for node in nodes(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+        if names := {name.split(".")[0] for function in inner for name in imported(function)}:
+            found[path.as_posix()] = names
+    return found
+
+
+def module_name(path: Path) -> str:
+    """The name that a file is imported by."""
+    return ".".join(path.with_suffix("").parts).removesuffix(".__init__")
+
+
+def imported_files(path: Path, tree: ast.Module, known: set[str]) -> set[str]:
+    """Modules of the house that a file names, ``from package import module`` included."""
+    names = set(imported(tree))
+    for node in nodes(tree):
+        if isinstance(node, ast.ImportFrom):
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return (names & known) - {module_name(path)}
+
+
+def circles(trees: Trees) -> list[str]:
+    """Files that import each other in a circle, within functions and for type checkers too."""
+    known = {module_name(path) for path in trees if path.name != "__init__.py"}
+    graph = {module_name(path): imported_files(path, tree, known) for path, tree in trees.items()}
+    found = []
+    while True:
+        try:
+            TopologicalSorter(graph).prepare()
+            return found
+        except CycleError as error:
+            circle = error.args[1]
+            found.append(" -> ".join(reversed(circle)))
+            graph[circle[1]].discard(circle[0])
+
+
+def files_by_folder(paths: Iterable[Path]) -> Counter[str]:
+    """How many files every folder has."""
+    return Counter(path.parent.as_posix() for path in paths)
+
+
+def shared_class_names(trees: Trees) -> dict[str, int]:
+    """Names that more than one class has."""
+    names = Counter(node.name for tree in trees.values() for node in nodes(tree) if isinstance(node, ast.ClassDef))
+    return {name: count for name, count in names.items() if count > 1}
+
+
+def public(tree: ast.AST) -> Iterator[Documented]:
+    """Functions and classes whose names begin with no underscore, wherever they stand: in others too."""
+    return (node for node in nodes(tree) if isinstance(node, Documented) and not node.name.startswith("_"))
+
+
+def lines_of(path: Path) -> list[str]:
+    """The lines of a file of the house, by its path from the root."""
+    return (ROOT / path).read_text(encoding="utf-8").splitlines()
