@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations, product
@@ -28,6 +28,7 @@ from visits.farm_visits import (
     shipped_memory,
 )
 
+from flows.survey.field_memory import laid_together
 from models.reading.doubts import SeatDoubts
 from models.reading.remembered import COME_TRUE, Belief, Looked, Remembered, carried, first_belief
 from pipeline.geometry.camera import LineCamera
@@ -40,6 +41,7 @@ from pipeline.planning.plain_scans import ScanRecord
 STRIPS = LineCamera(samples=160)  # of which a field is four strips wide
 PART_DAYS, PART_SHARES = (3, 7), (0.35, 0.6)  # days without a look; seconds of a visit, of those of a whole quick look
 SEASON_SHARES = (0.15, 0.25)  # seconds of a visit of a season, of those of a full scan
+ROUNDS = (1, 2)  # visits from one quick look at everything to the next
 
 
 @dataclass(frozen=True)
@@ -107,27 +109,44 @@ def parts() -> Iterator[Row]:
 
 
 def season_of_parts() -> Iterator[Row]:
-    """Thirty visits to a field four strips wide, each at a part of it, in a share of a full scan's seconds."""
+    """Thirty visits to a field four strips wide: parts of it at each, or all of it at some, at equal seconds."""
     found: dict[str, list[float]] = {}
-    field, moments = Strips.of_field(), [day + hour / 24 for day, hour in SEASON]
+    field = Strips.of_field()
     for seed in SEEDS:
         first = look_at_farm(seed, *SEASON[0], REFERENCE)
         quick = [first, *(look_at_farm(seed, *moment, QUICK, 1) for moment in SEASON[1:])]
-        for share in (*SEASON_SHARES, None):
-            belief, before, scores = first_belief(first.looked), first, [first.score(first.alone)]
-            for number in range(1, len(quick)):
-                now, days = quick[number], moments[number] - moments[number - 1]
-                if share is not None:
-                    shown, _ = field.chosen(before, belief, days, share * field.full_s)
-                    now = replace(now, looked=_only(now.looked, seat_image(shown, field.grid), field.grid.factor))
-                belief = later(before, belief, now, days)
-                scores.append(now.score(belief.classes()[0]))
-                before = now
-            seconds = field.whole_s if share is None else share * field.full_s
-            name = f"{seconds:.1f} s a visit, {seconds / field.full_s:.0%} of a full scan's"
-            found.setdefault(name, []).append(float(np.mean(scores)))
+        for share in SEASON_SHARES:
+            name = f"a part at each visit, in {share:.0%} of a full scan's seconds"
+            found.setdefault(name, []).append(_season_score(field, quick, share, 1))
+        for every in ROUNDS:
+            share = field.whole_s / field.full_s / every
+            name = f"all of it at every {every}. visit, by memory between, {share:.0%}"
+            found.setdefault(name, []).append(_season_score(field, quick, None, every))
     for name, values in found.items():
         yield Row(f"season of parts, {name}", mean_figure(values))
+
+
+def _season_score(field: Strips, quick: Sequence[Seen], share: float | None, every: int) -> float:
+    """Mean mIoU over the visits; at some of them quick looks, at parts that cost a ``share`` of a full scan, or at all.
+
+    At the others the map is the memory brought to that day.
+    """
+    moments, reader = [day + hour / 24 for day, hour in SEASON], shipped_memory().reader
+    before, belief, scores, last = quick[0], first_belief(quick[0].looked), [quick[0].score(quick[0].alone)], moments[0]
+    for number in range(1, len(quick)):
+        now, days = quick[number], moments[number] - last
+        if number % every:
+            unseen = carried(Remembered(belief, None, days), reader)
+            scores.append(now.score(unseen.classes()[0]))
+            continue
+        if share is not None:
+            shown, _ = field.chosen(before, belief, days, share * field.full_s)
+            now = replace(now, looked=_only(now.looked, seat_image(shown, field.grid), field.grid.factor))
+        belief, last = later(before, belief, now, days), moments[number]
+        scores.append(now.score(belief.classes()[0]))
+        coarse = laid_together((now.looked.coarse, before.looked.coarse))
+        before = replace(now, looked=replace(now.looked, coarse=coarse))
+    return float(np.mean(scores))
 
 
 def _part_score(before: Seen, now: Seen, first: Belief, days: float, grid: SceneGrid, shown: Mask) -> float:
