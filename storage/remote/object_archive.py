@@ -118,7 +118,7 @@ class ObjectArchive(Archive):
         self.copy.ensure([ref.uri])
         cleared = super().clear(store_at(self.root, ref.stage, ref.key), wait=wait)
         if cleared:
-            self.copy.send(ref.uri)
+            self.copy.send_cleared(ref.uri)
         return cleared
 
     @contextmanager

@@ -92,13 +92,21 @@ class WorkingCopy:
                 return
             ours = (self.root / uri / MANIFEST_NAME).read_bytes()
             standing = send_folder(self.objects, uri, self.root / uri)
-            if standing != ours and (_was_cleared(standing) or _was_cleared(ours)):
+            if _was_cleared(standing) and not _was_cleared(ours):
                 send_extension(self.objects, uri, self.root / uri, standing)
                 standing = ours
             if standing == ours:
                 self._note(uri)
             elif (dated := self.objects.read_dated(f"{uri}/{MANIFEST_NAME}")) is not None:
                 self._take(uri, *dated)
+
+    def send_cleared(self, uri: str) -> None:
+        """Have the files of a store go from the bucket too, once they have gone here; nobody may be reading them."""
+        with self._alone(uri):
+            standing = self.objects.read(f"{uri}/{MANIFEST_NAME}")
+            if standing is not None and not _was_cleared(standing):
+                send_extension(self.objects, uri, self.root / uri, standing)
+                self._note(uri)
 
     def fetch(self, uri: str) -> None:
         """Have a store or run here whole; of one of which nothing is known, a reader says what it finds.

@@ -525,3 +525,16 @@ def test_a_run_that_rests_on_what_was_cleared_brings_it_back(machine: Machine) -
     small_survey(second, kernel="bilinear")
     assert any(name.endswith("/data.bin") for name in second.objects.listing(small.mosaic.uri))
     assert problems(second) == []
+
+
+def test_a_clearing_that_never_reached_the_bucket_is_undone(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Killed before it told the bucket: what stands there counts, for others may have gone on with it."""
+    first = machine(FIRST)
+    small = small_survey(first)
+    with monkeypatch.context() as patch:
+        patch.setattr(object_copies.WorkingCopy, "send_cleared", lambda copy, uri: None)
+        clear_up(first, keep_days=0, made_again={"rectify": 1})
+    again = machine(FIRST)
+    assert again.find("rectify", small.mosaic.key) is not None
+    assert (again.ref("rectify", small.mosaic.key).path / "data.bin").is_file()
+    assert problems(again) == []
