@@ -120,8 +120,8 @@ def _survey(stack: ExitStack, settings: Settings, moments: Moments) -> None:
     from flows.survey.run import make_source, open_run
     from flows.survey.stages.effects import chosen_effects
     from flows.survey.survey import StageRunner, survey
-    from pipeline.rig.devices import ManualClock
     from pipeline.rig.emulator.emulated_rig import EmulatedRig
+    from tests.pipeline.rig.in_process import InProcessRig, ManualClock
 
     run = open_run(settings)
     moments.coarse_s = run.plan.coarse_s
@@ -138,7 +138,7 @@ def _survey(stack: ExitStack, settings: Settings, moments: Moments) -> None:
     assert effects is not None
     source = make_source(run.scene, settings)
     rig = EmulatedRig(replace(source, chosen=chosen_effects(effects)), ManualClock(10.0))
-    line = stack.enter_context(rig.in_process())
+    line = stack.enter_context(InProcessRig(rig))
     stack.enter_context(patch("flows.survey.rig_field.open_devices", _devices(rig, line)))
     try:
         survey(step)
