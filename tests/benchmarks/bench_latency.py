@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -29,7 +29,6 @@ from measure import Row
 if TYPE_CHECKING:
     from flows.settings.survey_settings import Settings
     from pipeline.rig.capture.capture_runner import RigDevices
-    from pipeline.rig.emulator.emulated_rig import EmulatedRig
 
 PX, MOST_S = 2560, 5.0
 
@@ -139,24 +138,15 @@ def _survey(stack: ExitStack, settings: Settings, moments: Moments) -> None:
     source = make_source(run.scene, settings)
     rig = EmulatedRig(replace(source, chosen=chosen_effects(effects)), ManualClock(10.0))
     line = stack.enter_context(InProcessRig(rig))
-    stack.enter_context(patch("flows.survey.rig_field.open_devices", _devices(rig, line)))
+
+    def open_devices(told: Settings, *_: object) -> RigDevices:
+        return line.devices(told.rig.mirror(told.cost.vector_pairs))
+
+    stack.enter_context(patch("flows.survey.rig_field.open_devices", open_devices))
     try:
         survey(step)
     except _AskedError:
         return
-
-
-def _devices(rig: EmulatedRig, line: Any) -> Callable[..., RigDevices]:
-    from pipeline.rig.capture.capture_runner import RigDevices
-    from pipeline.rig.mirror.mirror_controller import MirrorController
-
-    def open_devices(told: Settings, *_: object) -> RigDevices:
-        line.transport = type(line.transport)(rig.mirror, line.clock)
-        mirror = MirrorController(line.transport, told.rig.mirror(told.cost.vector_pairs), line.clock)
-        mirror.connect()
-        return RigDevices(mirror, line.camera(), line.clock)
-
-    return open_devices
 
 
 def main() -> int:

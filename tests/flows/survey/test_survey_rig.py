@@ -36,7 +36,6 @@ from pipeline.rig.devices import SYSTEM_CLOCK, DeviceGone
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock
 from pipeline.rig.emulator.fault_names import CameraFault, make_fault
 from pipeline.rig.emulator.scene_camera import REFERENCE_FRAMES, SceneView
-from pipeline.rig.mirror.mirror_controller import MirrorController
 from pipeline.rig.mirror.pro_mode import Command
 from pipeline.rig.transports import SerialTransport
 from pipeline.simulator.effects.registry import effects_on
@@ -85,10 +84,7 @@ def emulated(
     with InProcessRig(whole) as line:
 
         def open_devices(told: Settings, *_: object) -> RigDevices:
-            line.transport = type(line.transport)(whole.mirror, line.clock)
-            mirror = MirrorController(line.transport, told.rig.mirror(told.cost.vector_pairs), line.clock)
-            mirror.connect()
-            return RigDevices(mirror, line.camera(), line.clock)
+            return line.devices(told.rig.mirror(told.cost.vector_pairs))
 
         patch.setattr(flows.survey.rig_field, "open_devices", open_devices)
         yield whole

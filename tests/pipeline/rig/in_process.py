@@ -9,13 +9,15 @@ from itertools import count
 
 from pipeline.errors import SettingsError
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
-from pipeline.rig.device_settings import FileServer
+from pipeline.rig.capture.capture_runner import RigDevices
+from pipeline.rig.device_settings import FileServer, MirrorSettings
 from pipeline.rig.devices import Clock, Closing, DeadlinePassed, DeviceGone
 from pipeline.rig.emulator import Chunk
 from pipeline.rig.emulator.camera_device import CameraDevice
 from pipeline.rig.emulator.camera_server import CameraConnection, CameraServer
 from pipeline.rig.emulator.emulated_rig import EmulatedRig
 from pipeline.rig.emulator.mirror_device import MirrorDevice, VanishedError
+from pipeline.rig.mirror.mirror_controller import MirrorController
 from pipeline.rig.transports import BITS_PER_BYTE
 
 
@@ -184,6 +186,13 @@ class InProcessRig(Closing):
     def camera(self) -> HeadwallCamera:
         """Give a driver that is connected to the camera."""
         return HeadwallCamera(self.camera_line, self.files, clock=self.clock)
+
+    def devices(self, settings: MirrorSettings) -> RigDevices:
+        """Connect drivers to both, the mirror's by a line of its own."""
+        self.transport = InProcessTransport(self.rig.mirror, self.clock)
+        mirror = MirrorController(self.transport, settings, self.clock)
+        mirror.connect()
+        return RigDevices(mirror, self.camera(), self.clock)
 
     def close(self) -> None:
         """Let go of the port for files."""

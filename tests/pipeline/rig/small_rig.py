@@ -21,7 +21,6 @@ from pipeline.rig.device_settings import SurveyRig
 from pipeline.rig.emulator.emulated_rig import EmulatedRig
 from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults
 from pipeline.rig.emulator.mirror_device import Fault
-from pipeline.rig.mirror.mirror_controller import MirrorController
 from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import raster_from_values
@@ -80,10 +79,7 @@ class SmallRig:
     def devices(self) -> RigDevices:
         """Connect to both."""
         self.opened += 1
-        self.line.transport = type(self.line.transport)(self.emulated.mirror, self.line.clock)
-        mirror = MirrorController(self.line.transport, self.settings.mirror(self.vector_pairs), self.line.clock)
-        mirror.connect()
-        return RigDevices(mirror, self.line.camera(), self.line.clock)
+        return self.line.devices(self.settings.mirror(self.vector_pairs))
 
     def source(self, kept: Kept | None = None) -> RigSource:
         """A source that looks through the rig; another call is another process."""
