@@ -14,10 +14,17 @@ from rich.console import Console
 from rich.markup import escape
 
 from flows.archive.export_areas import CSV, write_areas
-from flows.archive.export_layers import ExportedRun, Layer, Rows, map_layers, open_exported, seen_rows
-from flows.archive.export_memory import memory_layers
+from flows.archive.export_layers import (
+    ExportedRun,
+    Layer,
+    Rows,
+    map_layers,
+    memory_layers,
+    open_exported,
+    seen_rows,
+    write_layer_style,
+)
 from flows.archive.export_spectra import spectral_layers
-from flows.archive.export_styles import write_layer_style
 from flows.archive.export_zones import check_zones, write_zones
 from flows.archive.product_choice import NO_PRODUCTS, ProductChoice, ProductFlags, choose_products
 from flows.cli.app import ArchiveName, AsJson, OutFile, Switch, check_outside, stderr

@@ -20,16 +20,20 @@ from pipeline.ground.georeference import zoomed_out
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.archive.records import RECEIPT, read_run, read_store
-from storage.arrays.class_maps import ClassNames
+from storage.arrays.beliefs import OLD_CLASS, unpacked_days
+from storage.arrays.class_maps import ClassNames, legend_of
 from storage.arrays.georeference import load_geobox
 from storage.arrays.ground_maps import StoredImage, open_image
-from storage.arrays.layout import grid_of
-from storage.export.image_files import ANGULAR, CogImage, Place
+from storage.arrays.layout import grid_of, open_group
+from storage.arrays.quicklooks import choose_bands
+from storage.export.image_files import ANGULAR, CogImage, Place, value_span
+from storage.export.qgis_styles import GREENS, GREYS, write_class_style, write_colour_style, write_ramp_style
 from storage.export.stac_items import classes
 
 Rows = Iterator[tuple[int, NDArray[Any]]]
 RGB = ("red", "green", "blue")
 LATEST = "latest"
+BELIEF, GROUND = "belief", "ground_map"
 
 
 @dataclass(frozen=True)
@@ -215,3 +219,56 @@ def seen_rows(run: ExportedRun) -> Iterator[tuple[int, NDArray[np.bool_]]]:
     found, pictures = (open_image(run.path("ground_map"), name).rows() for name in ("classes", "picture"))
     for (first, numbers), (_, picture) in zip(found, pictures, strict=True):
         yield first, (numbers != UNLABELLED) | (picture.max(axis=2) > 0)
+
+
+def memory_layers(run: ExportedRun) -> list[Layer]:
+    """Days since each pixel was looked at; of a run that goes on from another what changed, and from which class.
+
+    On the map where there is a pose. A run that believes nothing, of an earlier version, has none of them.
+    """
+    layers = []
+    if (product := _product_with(run, "age")) is not None:
+        seen = _ages(run) if product == BELIEF else image_layer(run, product, "age", ("age",), nodata=np.nan)
+        layers.append(Layer("age", "Days since the pixel was looked at", ("data",), *seen, "days"))
+    if (product := _product_with(run, "changed")) is not None:
+        title = "Share of the patch's pixels with another class than remembered"
+        if product == BELIEF:
+            changed = seat_layer(run, BELIEF, "changed", ("changed",))
+        else:
+            changed = image_layer(run, product, "changed", ("changed",), nodata=np.nan)
+        layers.append(Layer("changed", title, ("data",), *changed, "1"))
+    if (product := _product_with(run, OLD_CLASS)) is not None:
+        legend = legend_of(open_group(run.path(product)))
+        was = image_layer(run, product, OLD_CLASS, ("class",), nodata=UNLABELLED, legend=legend)
+        title = "Class remembered, where the map is sure of another one"
+        layers.append(Layer(OLD_CLASS, title, ("data",), *was, fields=classes(legend)))
+    return layers
+
+
+def _product_with(run: ExportedRun, array: str) -> str | None:
+    """The store of which an image is taken: the map on the ground, else what is believed; None where neither has it."""
+    products = (name for name in (GROUND, BELIEF) if run.store(name) is not None)
+    return next((name for name in products if array in open_group(run.path(name))), None)
+
+
+def _ages(run: ExportedRun) -> tuple[CogImage, Callable[[], Rows]]:
+    """Ages of the field's own pixels, unpacked: few readers of GeoTIFF know of scales."""
+    image, packed = image_layer(run, BELIEF, "age", ("age",), nodata=np.nan)
+    return replace(image, dtype="float32"), lambda: ((first, unpacked_days(rows)) for first, rows in packed())
+
+
+def write_layer_style(layer: Layer, image: Path) -> Path:
+    """Write the style of a layer beside its image, which is there already; gives its path."""
+    path, about = image.with_suffix(".qml"), layer.image
+    if about.legend is not None:
+        named = zip(about.legend.names, about.legend.colours.tolist(), strict=True)
+        write_class_style(path, [(number, name, tuple(colour)) for number, (name, colour) in enumerate(named)])
+    elif about.bands == RGB:
+        write_colour_style(path, (1, 2, 3), 1, 255)
+    elif about.wavelength_nm is not None:
+        red_green_blue = [band + 1 for band in choose_bands(np.array(about.wavelength_nm))[0]]
+        write_colour_style(path, red_green_blue, *value_span(image, red_green_blue))
+    else:
+        ramp = GREENS if "index" in about.tags else GREYS
+        write_ramp_style(path, *value_span(image, [1]), ramp)
+    return path

@@ -18,7 +18,7 @@ from flows.archive.export_spectra import MosaicView
 from flows.archive.product_choice import ProductChoice, class_numbers
 from pipeline.errors import SettingsError
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.ground.georeference import pixel_side_m
+from pipeline.ground.georeference import crs_wkt, degree_m, pixel_side_m, to_degrees, to_plane
 from pipeline.planning.orientation import find_rows
 from pipeline.products.outlines import class_polygons
 from pipeline.products.prescriptions import (
@@ -34,7 +34,6 @@ from pipeline.products.regions import grow_class, merge_small
 from storage.arrays.class_maps import ClassNames
 from storage.arrays.ground_maps import open_image
 from storage.arrays.mosaics import mosaic_brightness
-from storage.export.map_scale import crs_wkt, degree_m, to_degrees, to_plane
 from storage.export.qgis_styles import NONE, REDS, STYLE, Entry, ramp_colour, write_polygon_style
 from storage.export.task_data import DEGREE_DIGITS, TaskGrid, TaskWords, write_task_data
 from storage.export.vector_files import GEOJSON, GEOPACKAGE, SHAPEFILE, write_geojson, write_geopackage, write_shapefile

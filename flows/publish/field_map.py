@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib import colormaps
 from numpy.typing import NDArray
 
-from flows.publish.page_pictures import grey_png, in_base64, indexed_png, jpeg
+from flows.publish.page_parts import grey_png, in_base64, indexed_png, jpeg
 from flows.publish.page_places import PagePlaces
 from flows.publish.page_spectra import NOTHING, PageSpectra, class_means
 from flows.publish.panels import UNLABELLED_COLOUR, class_palette

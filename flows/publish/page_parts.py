@@ -1,13 +1,20 @@
-"""What a page carries with it instead of loading it: own scripts, a library for maps, and who may run in the page."""
+"""What a page carries with it instead of loading it: scripts, a library for maps, pictures; and who may run in it.
+
+Numbers go as PNG with a palette that a page can read again, photographs as JPEG.
+"""
 
 from __future__ import annotations
 
+import base64
 import hashlib
-from base64 import b64encode
+import io
 from functools import cache
 from importlib.resources import files
 
+import numpy as np
 from markupsafe import Markup
+from numpy.typing import NDArray
+from PIL import Image
 
 LEAFLET = "vendor/leaflet-1.9.4"  # leafletjs.com, BSD-2-Clause: unchanged from npm's registry
 SHA256 = {
@@ -15,6 +22,9 @@ SHA256 = {
     f"{LEAFLET}/leaflet.css": "a7837102824184820dfa198d1ebcd109ff6d0ff9a2672a074b9a1b4d147d04c6",
     f"{LEAFLET}/LICENSE": "53e8dc25862014e4324741ca18fbe3611e11d42ef69f59f86ea8c5389647d4cb",
 }
+
+Bytes = NDArray[np.uint8]
+QUALITY = 84  # of photographs
 
 
 @cache
@@ -32,9 +42,46 @@ def scripts(names: tuple[str, ...]) -> Markup:
 
 def policy(names: tuple[str, ...]) -> str:
     """The content security policy of a page with these scripts: they alone run, and nothing is loaded from anywhere."""
-    sources = [f"'sha256-{b64encode(hashlib.sha256(part(name).encode()).digest()).decode()}'" for name in names]
+    sources = [f"'sha256-{base64.b64encode(hashlib.sha256(part(name).encode()).digest()).decode()}'" for name in names]
     allowed = " ".join(sources) or "'none'"
     return (
         f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {allowed}; "
         "base-uri 'none'; form-action 'none'"
     )
+
+
+def indexed_png(numbers: Bytes, colours: Bytes) -> bytes:
+    """PNG of (y, x) numbers, each drawn in its row of ``colours``, (number, 3 or 4) red green blue and opacity.
+
+    A reader of the PNG gets the numbers themselves; those without a row are black.
+    """
+    picture = Image.fromarray(np.ascontiguousarray(numbers, np.uint8))
+    table = np.zeros((256, 4), np.uint8)
+    table[:, 3] = 255
+    table[: len(colours), : colours.shape[1]] = colours
+    picture.putpalette(table[:, :3].tobytes())
+    opaque = bool((table[:, 3] == 255).all())
+    return _saved(picture, **({} if opaque else {"transparency": table[:, 3].tobytes()}))
+
+
+def grey_png(values: Bytes) -> bytes:
+    """PNG of (y, x) bytes as they are."""
+    return _saved(Image.fromarray(np.ascontiguousarray(values, np.uint8)))
+
+
+def _saved(picture: Image.Image, **choices: bytes) -> bytes:
+    file = io.BytesIO()
+    picture.save(file, "PNG", **choices)
+    return file.getvalue()
+
+
+def jpeg(picture: Bytes) -> bytes:
+    """JPEG of a (y, x, 3) photograph."""
+    file = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(picture, np.uint8)).save(file, "JPEG", quality=QUALITY)
+    return file.getvalue()
+
+
+def in_base64(content: bytes) -> str:
+    """Bytes as a page holds them."""
+    return base64.b64encode(content).decode("ascii")

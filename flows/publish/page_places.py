@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.ground.map_grid import WGS84, MapFrame
+from pipeline.ground.georeference import WGS84
+from pipeline.ground.map_grid import MapFrame
 from pipeline.lazy import deferred
 
 if TYPE_CHECKING:

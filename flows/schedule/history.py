@@ -18,8 +18,7 @@ from flows.publish.receipt import areas_on_ground
 from flows.publish.report import render_page
 from flows.schedule.date_charts import Chart, line_chart
 from flows.schedule.field_schedule import ENDINGS, moment_words, read_moment
-from flows.schedule.look_dates import look_of
-from flows.schedule.visit_pictures import VisitPicture, visit_pictures
+from flows.schedule.field_visits import VisitPicture, look_of, visit_pictures
 from flows.survey.scores import score_of
 from flows.terminal.figures import DASH, LEAST_HECTARES, area_words, counted, format_percent, known_number
 from flows.terminal.processes import DONE

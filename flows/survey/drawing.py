@@ -169,7 +169,7 @@ def draw_field(field: FieldWork, work: Drawing, report: Callable[[float], None])
     """
     store = open_patches(work.patches)
     crew = field.crew_for(store.seats, len(store.wavelength_nm))
-    remembered = () if work.memory is None else work.memory.paths
+    remembered = () if work.memory is None else (work.memory.belief, work.memory.mosaic)
     paths = (work.mosaic, work.patches, work.out, work.belief, *remembered)
     parts: list[Drawn] = run_blocks(work, field.regions, crew, report=report, paths=paths)
     strange = sum(part.strange[0] for part in parts), sum(part.strange[1] for part in parts)

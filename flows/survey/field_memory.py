@@ -36,15 +36,10 @@ class FieldMemory:
     """Where the memory of a field lies, and how it is to be read."""
 
     belief: Path
-    looks: tuple[CoarseMemory, ...]  # the newest first: of a place the first that saw it counts
+    mosaic: Path  # of the last look alone: the days since are those of no other
     days: float
     classes: tuple[int, ...]  # see `flows.survey.memory.Prior`
     shift_px: tuple[int, int] = (0, 0)  # down and to the right, that brings it onto today's look
-
-    @property
-    def paths(self) -> tuple[Path, ...]:
-        """Everything that is read."""
-        return self.belief, *(look.mosaic for look in self.looks)
 
     def of(self, region: Region, weights: Weights) -> Remembered:
         """Read what is remembered of a region, in the classes of the weights."""
@@ -57,14 +52,9 @@ class FieldMemory:
         values, age, light = (_framed(part, gaps) for part in store.read(rows[0], columns[0]))
         if self.classes != tuple(range(values.shape[-1])):
             values = in_classes(values, self.classes)
-        images = (
-            shifted(
-                look_at(weights, look.mosaic, region).seen_columns,
-                _cells(np.add(look.shift_px, self.shift_px), region.grid.factor),
-            )
-            for look in self.looks
-        )
-        return Remembered(Belief(values, age, np.nan_to_num(light)), laid_together(images), self.days)
+        coarse = look_at(weights, self.mosaic, region).seen_columns
+        lies = shifted(coarse, _cells(self.shift_px, region.grid.factor))
+        return Remembered(Belief(values, age, np.nan_to_num(light)), lies, self.days)
 
 
 def laid_together(images: Iterable[NDArray[np.float32]]) -> NDArray[np.float32]:

@@ -1,8 +1,8 @@
-"""Where a scene lies on the earth, as its file says: a GeoBox, what keys hold of it, its coarser grids, its areas."""
+"""Where a scene lies on the earth, as its file says: a GeoBox, what keys hold of it, coarser grids, areas, degrees."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,6 +20,9 @@ else:
     pyproj = deferred("pyproj")
 
 Floats = NDArray[np.float64]
+Places = Callable[[Floats, Floats], Floats]  # of x and y
+WGS84 = 4326  # by EPSG
+APART_DEG = 1e-3  # of places between which a degree is measured
 STEP_M = 100.0  # over which the slopes of a projection are taken
 TIES = 9  # along each side of a grid, between which the scale of its map is linear
 
@@ -105,3 +108,42 @@ def _m2_of_units(geobox: GeoBox, column: Floats, row: Floats) -> Floats:
     bent = 1 - ellipsoid.es * np.sin(lat) ** 2  # radii of curvature are a (1 - e2) / bent^1.5 and a / sqrt(bent)
     metres = ellipsoid.a**2 * (1 - ellipsoid.es) / bent**2 * np.cos(lat)
     return np.asarray(np.abs(east[0] * north[1] - east[1] * north[0]) * metres, np.float64)
+
+
+def crs_wkt(geobox: GeoBox) -> str:
+    """A grid's CRS as WKT."""
+    assert geobox.crs is not None
+    return geobox.crs.to_wkt()
+
+
+def to_degrees(geobox: GeoBox) -> Places:
+    """What gives (..., 2) latitude and longitude [deg] of a map's x and y."""
+    transformer = pyproj.Transformer.from_crs(crs_wkt(geobox), WGS84, always_xy=True)
+    return lambda x, y: np.stack(transformer.transform(x, y)[::-1], axis=-1)
+
+
+def degree_m(geobox: GeoBox) -> tuple[float, float]:
+    """Metres of a degree to the north and of one to the east, in the middle of a map."""
+    middle = geobox.affine * (geobox.shape[1] / 2, geobox.shape[0] / 2)
+    lat, lon = to_degrees(geobox)(*np.array(middle)[:, None])[0].tolist()
+    geod = pyproj.Geod(ellps="WGS84")
+    north, east = (
+        geod.inv(lon, lat, lon + across, lat + along)[2] / APART_DEG
+        for along, across in ((APART_DEG, 0.0), (0.0, APART_DEG))
+    )
+    return float(north), float(east)
+
+
+def to_plane(geobox: GeoBox) -> tuple[Places, str]:
+    """What gives (..., 2) metres east and north of a map's x and y, and the CRS (WKT) that they are in.
+
+    The map's own where it is projected in metres, else the UTM zone of its middle.
+    """
+    crs = pyproj.CRS.from_wkt(crs_wkt(geobox))
+    if crs.is_projected and all(axis.unit_conversion_factor == 1 for axis in crs.axis_info[:2]):
+        return (lambda x, y: np.stack([x, y], axis=-1)), crs.to_wkt()
+    middle = geobox.affine * (geobox.shape[1] / 2, geobox.shape[0] / 2)
+    lat, lon = to_degrees(geobox)(*np.array(middle)[:, None])[0]
+    zone = pyproj.CRS.from_epsg((32600 if lat >= 0 else 32700) + int((lon + 180) % 360 // 6) + 1)
+    transformer = pyproj.Transformer.from_crs(crs, zone, always_xy=True)
+    return (lambda x, y: np.stack(transformer.transform(x, y), axis=-1)), zone.to_wkt()

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import PoseError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
+from pipeline.ground.georeference import WGS84
 from pipeline.ground.view import LEAST_SINK, ROWS_AT_ONCE, GroundView, RigPose, pixel_places
 from pipeline.lazy import deferred
 from pipeline.rectify.resample import resample
@@ -32,7 +33,6 @@ else:
 Floats = NDArray[np.float64]
 Pixel = TypeVar("Pixel", bound=np.generic)
 
-WGS84 = 4326
 UTM_LATITUDES = (-80.0, 84.0)
 POLAR = {False: 5042, True: 5041}  # universal polar stereographic, south and north, axes east and north
 AREA_SLACK_DEG = 1.0  # a field may lie this far outside the area that a CRS is made for

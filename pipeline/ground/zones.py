@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.grid import SceneGrid
 from pipeline.ground.field_places import BORDER_PX, FieldPlace
+from pipeline.ground.georeference import WGS84
 from pipeline.lazy import deferred
 
 if TYPE_CHECKING:
@@ -27,7 +28,6 @@ else:
 
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float64]
-WGS84 = 4326
 ROUND_THE_FIELD = 1.0  # times its size, on every side, up to which polygons are followed
 EDGE_PARTS = 256  # of that: a straight edge of one map is bent on another
 FAR_EAST_DEG = 90.0  # beyond this longitude of the field, those of polygons are told from it and not from Greenwich

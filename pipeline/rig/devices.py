@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Protocol, Self
 
-from pipeline.errors import RigError, SettingsError
+from pipeline.errors import RigError
 
 
 class Clock(Protocol):
@@ -47,26 +47,6 @@ class Closing(ABC):
     @abstractmethod
     def close(self) -> None:
         """Let go of what is held."""
-
-
-class ManualClock:
-    """A clock that moves only when it is told to: sleeping takes no time and moves it."""
-
-    def __init__(self, start: float = 0.0) -> None:
-        self._now = start
-
-    def now(self) -> float:
-        return self._now
-
-    def sleep(self, seconds: float) -> None:
-        if seconds > 0:
-            self._now += seconds
-
-    def advance(self, seconds: float) -> None:
-        """Move the clock on by so much; SettingsError where that is below 0. [s]"""
-        if not seconds >= 0:
-            raise SettingsError(f"a clock only goes forward, got {seconds} s; give 0 or more")
-        self._now += seconds
 
 
 class DeviceGone(RigError):  # noqa: N818 - the name says what is the case

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import zarr
@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 from pipeline.errors import IncompleteStoreError, ShapeError
 from pipeline.geometry.scan import Sweep
-from pipeline.lazy import deferred
-from pipeline.rectify.calibration.calibrate import calibrate
 from pipeline.source import Line, References
 from storage.arrays.layout import (
     SHARD_ROWS,
@@ -32,15 +30,7 @@ from storage.arrays.layout import (
 )
 from storage.arrays.quicklooks import LineThumbnail, Quicklook, quicklook_of, write_quicklook
 
-if TYPE_CHECKING:
-    import dask.array as da
-    import xarray as xr
-else:
-    da = deferred("dask.array")
-    xr = deferred("xarray")
-
 _LINE_COORDINATES = "time mirror_x mirror_y exposure_ms valid_line"
-_NO_VALUES = np.empty((0, 0, 0), np.float32)
 
 
 @dataclass(frozen=True)
@@ -242,49 +232,3 @@ def open_raw_cube(path: Path) -> RawCube:
         started=None if "started" not in group.attrs else str(group.attrs["started"]),
         group=group,
     )
-
-
-def open_reflectance(path: Path, *, saturated_dn: float) -> xr.DataArray:
-    """Open a sweep in scene values, calibrated 64 lines at a time when a part is asked for.
-
-    The file keeps the raw numbers: nothing is stored twice, and other references give other values.
-
-    Parameters
-    ----------
-    saturated_dn
-        Least DN that counts as saturated, as of :func:`pipeline.rectify.calibration.calibrate.calibrate`.
-
-    Returns
-    -------
-    (line, sample, band) float32 backed by dask, in the unit of the panel's values; NaN where a sample is not valid.
-    Coordinates: wavelength, fwhm, time, mirror_x, mirror_y, exposure_ms, valid_line.
-
-    Raises
-    ------
-    IncompleteStoreError : there is no sweep, it was not closed, or it is damaged; on computing, where a chunk is.
-    """
-    cube = open_raw_cube(path)
-    lines, samples, bands = cube.shape
-    starts = range(0, lines, SHARD_ROWS)
-    chunks = (tuple(min(SHARD_ROWS, lines - start) for start in starts), (samples,), (bands,))
-    values = da.map_blocks(  # type: ignore[no-untyped-call]
-        _reflectance_block, cube, saturated_dn, chunks=chunks, dtype=np.float32, meta=_NO_VALUES
-    )
-    with xr.open_zarr(path, consolidated=False, chunks=None) as stored:
-        coordinates = stored["dn"].coords.to_dataset().load().coords
-    about = {"long_name": "scene value", "units": "1"}
-    return xr.DataArray(values, coordinates, ("line", "sample", "band"), "reflectance", about)
-
-
-def _reflectance_block(
-    cube: RawCube, saturated_dn: float, block_info: Mapping[Any, Any] | None = None
-) -> NDArray[np.float32]:
-    """One block of lines, NaN where not valid; dask says which."""
-    assert block_info is not None
-    start, stop = block_info[None]["array-location"][0]
-    usable = cube.valid_line[start:stop]
-    position = np.where(usable[:, None], cube.position[start:stop], np.nan)  # of other lines it may be beyond the rim
-    values, valid = calibrate(cube.read(start, stop), cube.references, saturated_dn=saturated_dn, position=position)
-    values[~valid] = np.nan
-    values[~usable] = np.nan
-    return values

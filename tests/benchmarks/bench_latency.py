@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -29,7 +29,6 @@ from measure import Row
 if TYPE_CHECKING:
     from flows.settings.survey_settings import Settings
     from pipeline.rig.capture.capture_runner import RigDevices
-    from pipeline.rig.emulator.emulated_rig import EmulatedRig
 
 PX, MOST_S = 2560, 5.0
 
@@ -120,8 +119,8 @@ def _survey(stack: ExitStack, settings: Settings, moments: Moments) -> None:
     from flows.survey.run import make_source, open_run
     from flows.survey.stages.effects import chosen_effects
     from flows.survey.survey import StageRunner, survey
-    from pipeline.rig.devices import ManualClock
     from pipeline.rig.emulator.emulated_rig import EmulatedRig
+    from tests.pipeline.rig.in_process import InProcessRig, ManualClock
 
     run = open_run(settings)
     moments.coarse_s = run.plan.coarse_s
@@ -138,25 +137,16 @@ def _survey(stack: ExitStack, settings: Settings, moments: Moments) -> None:
     assert effects is not None
     source = make_source(run.scene, settings)
     rig = EmulatedRig(replace(source, chosen=chosen_effects(effects)), ManualClock(10.0))
-    line = stack.enter_context(rig.in_process())
-    stack.enter_context(patch("flows.survey.rig_field.open_devices", _devices(rig, line)))
+    line = stack.enter_context(InProcessRig(rig))
+
+    def open_devices(told: Settings, *_: object) -> RigDevices:
+        return line.devices(told.rig.mirror(told.cost.vector_pairs))
+
+    stack.enter_context(patch("flows.survey.rig_field.open_devices", open_devices))
     try:
         survey(step)
     except _AskedError:
         return
-
-
-def _devices(rig: EmulatedRig, line: Any) -> Callable[..., RigDevices]:
-    from pipeline.rig.capture.capture_runner import RigDevices
-    from pipeline.rig.mirror.mirror_controller import MirrorController
-
-    def open_devices(told: Settings, *_: object) -> RigDevices:
-        line.transport = type(line.transport)(rig.mirror, line.clock)
-        mirror = MirrorController(line.transport, told.rig.mirror(told.cost.vector_pairs), line.clock)
-        mirror.connect()
-        return RigDevices(mirror, line.camera(), line.clock)
-
-    return open_devices
 
 
 def main() -> int:

@@ -9,8 +9,6 @@ import os
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import redirect_stdout
-from io import StringIO
 from pathlib import Path
 
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -72,7 +70,7 @@ def journey() -> list[str]:
     from flows.cli.main import main as run
     from tests.house.journey import passed_files
 
-    with tempfile.TemporaryDirectory(prefix="house-") as folder, passed_files() as passed, redirect_stdout(StringIO()):
+    with tempfile.TemporaryDirectory(prefix="house-") as folder, passed_files() as passed:
         try:
             run([*SURVEY, "--out", folder])
         except SystemExit as left:

@@ -114,7 +114,7 @@ def _drawing(
     memory = None
     if prior is not None and not _is_turned(run, lies):
         belief = (prior.belief.path / "belief.zarr").resolve()
-        memory = FieldMemory(belief, _coarse_looks(prior), prior.days, prior.classes, whole_pixels(lies))
+        memory = FieldMemory(belief, _coarse_looks(prior)[0].mosaic, prior.days, prior.classes, whole_pixels(lies))
     create_belief(path / "belief.zarr", shape, legend, grid=run.angular_grid(), goes_on=memory is not None)
     seen = (mosaic.path / "mosaic.zarr").resolve(), (patches.path / "patches.zarr").resolve()
     made = (path / "class_map.zarr").resolve(), (path / "belief.zarr").resolve()

@@ -1,4 +1,4 @@
-"""Ways to the emulated camera: a control line in this process, or its control socket and files over FTP on free ports.
+"""The way to the emulated camera: its control socket, and its files over FTP, on free ports.
 
 The files stay in memory; pyftpdlib serves them.
 """
@@ -12,14 +12,12 @@ import socket
 import stat
 import threading
 import warnings
-from collections import deque
 from contextlib import suppress
-from dataclasses import dataclass, field
 from typing import Any
 
 from pipeline.errors import RigError
 from pipeline.rig.device_settings import FileServer
-from pipeline.rig.devices import Clock, Closing, DeviceGone
+from pipeline.rig.devices import Closing
 from pipeline.rig.emulator import Chunk
 from pipeline.rig.emulator.camera_device import MOST_LINE, PROMPT, CameraDevice
 from pipeline.rig.emulator.fault_names import CameraFault
@@ -61,59 +59,6 @@ class CameraConnection:
                 return chunks, False
             chunks += reply
         return chunks, len(self._held) <= MOST_LINE
-
-
-@dataclass
-class InProcessCameraLine:
-    """A :class:`~pipeline.rig.transports.Transport` to ``device``; both share the clock."""
-
-    device: CameraDevice
-    clock: Clock
-    port: str = "emulated camera"
-    _coming: deque[tuple[float, bytes]] = field(default_factory=deque, init=False)
-    _open: bool = field(default=True, init=False)
-
-    def __post_init__(self) -> None:
-        self._talk = CameraConnection(self.device)
-        self._say(self.device.greet())
-
-    def write(self, data: bytes, deadline: float) -> None:
-        self._check_open()
-        chunks, self._open = self._talk.feed(data)
-        self._say(chunks)
-
-    def read(self, at_most: int, deadline: float) -> bytes:
-        """Give what the camera has answered by then."""
-        if not self._coming:
-            self._check_open()
-        if not self._coming or self._coming[0][0] > deadline:
-            self.clock.sleep(deadline - self.clock.now())
-            return b""
-        due_s, data = self._coming.popleft()
-        self.clock.sleep(due_s - self.clock.now())
-        if len(data) > at_most:
-            self._coming.appendleft((due_s, data[at_most:]))
-        return data[:at_most]
-
-    def drain(self) -> bytes:
-        found = b""
-        while self._coming and self._coming[0][0] <= self.clock.now():
-            found += self._coming.popleft()[1]
-        return found
-
-    def close(self) -> None:
-        self._open = False
-        self._coming.clear()
-
-    def _say(self, chunks: list[Chunk]) -> None:
-        due_s = self.clock.now()
-        for chunk in chunks:
-            due_s += chunk.delay_s
-            self._coming.append((due_s, chunk.data))
-
-    def _check_open(self) -> None:
-        if not self._open:
-            raise DeviceGone(f"the connection to {self.port} was lost (closed by the other end)")
 
 
 class CameraServer(Closing):

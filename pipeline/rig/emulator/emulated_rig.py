@@ -16,14 +16,13 @@ from dataclasses import dataclass
 
 from pipeline.errors import SettingsError
 from pipeline.geometry.mirror import STRAIGHT, Mounting
-from pipeline.rig.camera.headwall_camera import HeadwallCamera
-from pipeline.rig.device_settings import FileServer, Pulses
-from pipeline.rig.devices import SYSTEM_CLOCK, Clock, Closing, ManualClock
+from pipeline.rig.device_settings import Pulses
+from pipeline.rig.devices import SYSTEM_CLOCK, Clock, Closing
 from pipeline.rig.emulator.camera_device import CameraUnit
-from pipeline.rig.emulator.camera_server import CameraServer, InProcessCameraLine
+from pipeline.rig.emulator.camera_server import CameraServer
 from pipeline.rig.emulator.fault_names import CameraFaults
 from pipeline.rig.emulator.mirror_device import Fault, MirrorDevice
-from pipeline.rig.emulator.mirror_ports import EmulatedPort, InProcessTransport
+from pipeline.rig.emulator.mirror_ports import EmulatedPort
 from pipeline.rig.emulator.mirror_state import MirrorUnit
 from pipeline.rig.emulator.scene_camera import SceneCamera, SceneView
 from pipeline.simulator.simulated import SimulatedSource
@@ -65,7 +64,7 @@ class EmulatedRig:
     Parameters
     ----------
     clock
-        Of both devices: one turned by hand for :meth:`in_process`, a ``FastClock`` for :meth:`serve`.
+        Of both devices; a ``FastClock`` for :meth:`serve`.
     wired
         What pulses the mirror's trigger input gets: one for each held ``position``, each ``frame``, or ``none``.
     kept
@@ -77,7 +76,7 @@ class EmulatedRig:
     def __init__(
         self,
         source: SimulatedSource,
-        clock: Clock | None = None,
+        clock: Clock,
         *,
         mirror_faults: Sequence[Fault] = (),
         camera_faults: CameraFaults | None = None,
@@ -87,7 +86,7 @@ class EmulatedRig:
         camera: CameraUnit | None = None,
         mounting: Mounting = STRAIGHT,
     ) -> None:
-        self.clock = ManualClock() if clock is None else clock
+        self.clock = clock
         self.mirror = MirrorDevice(self.clock, mirror_faults, unit=mirror)
         self.camera = SceneCamera(
             SceneView(source, mounting),
@@ -107,44 +106,9 @@ class EmulatedRig:
         mode = "gone" if self.mirror.gone else "hung" if self.mirror.hung else self.mirror.mode.value
         return RigState((float(x), float(y)), mode, last, self.camera.is_capturing(), len(self.camera.captures))
 
-    def in_process(self) -> InProcessRig:
-        """Give lines to both devices without ports; only the camera's files go through a socket of this machine."""
-        return InProcessRig(self, InProcessTransport(self.mirror, self.clock), CameraServer(self.camera))
-
     def serve(self, *, baud: int = 0) -> ServedRig:
         """Open a pty for the mirror, and the camera's sockets (else RigError); use it as a context, or close it."""
         return ServedRig(self, baud)
-
-
-@dataclass
-class InProcessRig(Closing):
-    """Lines to an emulated rig on a clock that waiting moves. Close it: a thread serves the camera's files."""
-
-    rig: EmulatedRig
-    transport: InProcessTransport
-    server: CameraServer
-
-    @property
-    def clock(self) -> Clock:
-        """Clock of the devices, and of drivers that talk to them."""
-        return self.rig.clock
-
-    @property
-    def files(self) -> FileServer:
-        """Where the camera's files are."""
-        return FileServer(self.server.host, self.server.file_port)
-
-    def camera_line(self) -> InProcessCameraLine:
-        """Connect to the camera's control."""
-        return InProcessCameraLine(self.rig.camera, self.clock)
-
-    def camera(self) -> HeadwallCamera:
-        """Give a driver that is connected to the camera."""
-        return HeadwallCamera(self.camera_line, self.files, clock=self.clock)
-
-    def close(self) -> None:
-        """Let go of the port for files."""
-        self.server.close()
 
 
 class ServedRig(Closing):

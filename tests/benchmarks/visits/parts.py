@@ -28,7 +28,6 @@ from visits.farm_visits import (
     shipped_memory,
 )
 
-from flows.survey.field_memory import laid_together
 from models.reading.doubts import SeatDoubts
 from models.reading.remembered import COME_TRUE, Belief, Looked, Remembered, carried, first_belief
 from pipeline.geometry.camera import LineCamera
@@ -144,8 +143,7 @@ def _season_score(field: Strips, quick: Sequence[Seen], share: float | None, eve
             now = replace(now, looked=_only(now.looked, seat_image(shown, field.grid), field.grid.factor))
         belief, last = later(before, belief, now, days), moments[number]
         scores.append(now.score(belief.classes()[0]))
-        coarse = laid_together((now.looked.coarse, before.looked.coarse))
-        before = replace(now, looked=replace(now.looked, coarse=coarse))
+        before = now
     return float(np.mean(scores))
 
 

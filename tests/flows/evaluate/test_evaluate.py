@@ -31,45 +31,39 @@ from pipeline.errors import SceneError, SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.effects.registry import USUAL
 from pipeline.simulator.scenes.farm.farm_plan import CLASSES
+from tests.flows.evaluate.conftest import Judged
 from tests.flows.small_fields import FRAMES, QUICK, looked_at, scene_at, write_weights
 from tests.models.conftest import make_weights
-
-
-@pytest.fixture(scope="module")
-def drawn(data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
-    """An evaluation of two seeds, and its folder."""
-    folder = tmp_path_factory.mktemp("out")
-    weights = tuple(write_weights(folder / f"w{seed}.safetensors", seed) for seed in (0, 1))
-    return folder, evaluate_weights(EvaluateRequest(str(data), weights, folder / "out", **QUICK))
 
 
 def _row(content: dict[str, Any], policy: str, share: float) -> dict[str, Any]:
     return next(row for row in content["rows"] if (row["policy"], row["share"]) == (policy, share))
 
 
-def test_every_row_is_there(drawn: tuple[Path, dict[str, Any]]):
+def test_every_row_is_there(judged: Judged):
     """Every policy at every share, with means of the seeds and their spread; and the files of the folder."""
-    folder, content = drawn
+    request, content = judged
+    folder = request.out
+    assert folder is not None
     keys = [(row["policy"], row["share"]) for row in content["rows"]]
     names = ("entropy", "random", "entropy, pooled", ORACLE)
     policies = [(policy, share) for policy in names for share in (0.25, 0.5)]
     assert keys == [("none", 0.0), *policies, ("all", 1.0)]
     assert content["frames"] == list(FRAMES)
     assert [one["frames"] for one in content["weights"]] == [3, 3]
-    files = {path.name for path in (folder / "out").iterdir()}
+    files = {path.name for path in folder.iterdir()}
     assert files >= {"evaluation.json", "evaluation.png", "worst.png", "frames"}
-    kept = json.loads((folder / "out" / "evaluation.json").read_text())
+    kept = json.loads((folder / "evaluation.json").read_text())
     assert kept["rows"][1]["miou"] == content["rows"][1]["miou"]
-    _, content = drawn
     row = _row(content, "entropy", 0.25)
     assert row["miou"] == pytest.approx(np.mean(row["by_seed"]))
     assert row["spread"] == pytest.approx(np.std(row["by_seed"], ddof=1))
     assert len(row["by_seed"]) == 2
 
 
-def test_costs_stand_beside_all_and_the_oracle_has_all_the_gain(drawn: tuple[Path, dict[str, Any]]):
+def test_costs_stand_beside_all_and_the_oracle_has_all_the_gain(judged: Judged):
     """More seats cost more, `all` costs all; what uses labels is marked, with a ratio and a rank of 1."""
-    _, content = drawn
+    _, content = judged
     cost = {share: _row(content, "entropy", share)["cost"] for share in (0.25, 0.5)}
     for column in ("samples", "bytes", "multiply_adds", "cpu_s", "frame_s", "rig_s"):
         assert cost[0.25][column]["done"] is not None
@@ -83,7 +77,6 @@ def test_costs_stand_beside_all_and_the_oracle_has_all_the_gain(drawn: tuple[Pat
     assert _row(content, "all", 1.0)["cost"]["rig_s"]["ratio"] == 1
     adds = cost[0.25]["multiply_adds"]
     assert sum(adds[part] for part in ("glance", "score", "encode", "decode")) == adds["done"]
-    _, content = drawn
     row = _row(content, ORACLE, 0.5)
     assert row["uses_labels"]
     assert row["captured_gain"] in (None, pytest.approx(1))
@@ -306,9 +299,7 @@ def test_records_count_by_their_pixels():
     assert ends([[good, bad]], "none", 0.0) == [("worst", "002", 0), ("best", "001", 0)]
 
 
-def test_a_class_that_no_label_has_is_told_apart(
-    drawn: tuple[Path, dict[str, Any]], capsys: pytest.CaptureFixture[str]
-):
+def test_a_class_that_no_label_has_is_told_apart(judged: Judged, capsys: pytest.CaptureFixture[str]):
     """Rows are means over the classes of all frames' labels; a false class has pixels, and both means are told."""
     counts = [[[8, 0, 2], [1, 9, 0], [0, 0, 0]], [[7, 3, 0], [0, 10, 0], [0, 0, 0]]]
     records = [_record("001", np.random.default_rng(0)), _record("002", np.random.default_rng(0))]
@@ -324,7 +315,7 @@ def test_a_class_that_no_label_has_is_told_apart(
     assert row["boundary_iou"] == pytest.approx(0.5)
     assert row["false_classes"] == {"weed": 2}
     assert np.isnan(row["per_class_iou"]["weed"])
-    shown = {**drawn[1], "rows": [*drawn[1]["rows"][:1], *found["rows"]], "support": found["support"]}
+    shown = {**judged[1], "rows": [*judged[1]["rows"][:1], *found["rows"]], "support": found["support"]}
     shown["rows"][0] = {**found["rows"][0], "policy": "none"}
     print_evaluation({**shown, "curves": found["curves"]}, Console(width=200))
     text = capsys.readouterr().out
@@ -408,13 +399,9 @@ def test_what_cannot_be_is_refused(data: Path, tmp_path: Path, change: dict[str,
         evaluate_weights(replace(request, **change))
 
 
-def test_figures_are_printed(
-    drawn: tuple[Path, dict[str, Any]], data: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
-):
+def test_figures_are_printed(judged: Judged, data: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path):
     """Rows, classes and what the figures mean, from what was kept; with --json one object on stdout."""
-    folder, _ = drawn
-    weights = tuple(folder / f"w{seed}.safetensors" for seed in (0, 1))
-    run_evaluate(EvaluateRequest(str(data), weights, folder / "out", **QUICK), Console(stderr=True))
+    run_evaluate(judged[0], Console(stderr=True))
     shown = capsys.readouterr()
     for words in ("oracle*", "multiply-adds", "rig s", "crop", "uses labels", "paired bootstrap", "baseline: all"):
         assert words in shown.out

@@ -29,20 +29,12 @@ from flows.evaluate.rows import (
 from flows.evaluate.series import Row, by_seed, collect_row, curve_figures, difference, seeds_of
 from models.policies.policies import score_seats
 from pipeline.planning.selection import seat_count
+from tests.flows.evaluate.conftest import Judged
 from tests.flows.small_fields import FRAMES, QUICK, looked_at, scene_at, write_weights
 
 POLICY = "entropy, pooled"
 FAST: dict[str, Any] = {**QUICK, "policies": ("entropy", "random"), "timed_frames": 0}
 scores = st.lists(st.lists(st.floats(-1, 1) | st.sampled_from([0.0, np.nan]), max_size=12), min_size=1, max_size=5)
-
-
-@pytest.fixture(scope="module")
-def judged(data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[EvaluateRequest, dict[str, Any]]:
-    """An evaluation of two seeds with one frame timed, and what was asked for."""
-    folder = tmp_path_factory.mktemp("out")
-    weights = tuple(write_weights(folder / f"w{seed}.safetensors", seed) for seed in (0, 1))
-    request = EvaluateRequest(str(data), weights, folder / "out", **{**FAST, "timed_frames": 1})
-    return request, evaluate_weights(request)
 
 
 def _records(each: list[list[float]]) -> list[dict[str, Any]]:
@@ -100,7 +92,7 @@ def _rows(content: dict[str, Any], policy: str) -> list[dict[str, Any]]:
     return [row for row in content["rows"] if row["policy"] == policy]
 
 
-def test_rows_say_what_frames_bought_and_cost(judged: tuple[EvaluateRequest, dict[str, Any]]):
+def test_rows_say_what_frames_bought_and_cost(judged: Judged):
     """Seats are the share of all in the mean, costs those of the policy at its own seats; lines are not told."""
     content = judged[1]
     for row, own in zip(_rows(content, POLICY), _rows(content, "entropy"), strict=True):
@@ -120,9 +112,7 @@ def test_rows_say_what_frames_bought_and_cost(judged: tuple[EvaluateRequest, dic
         assert cost["samples"]["done"] == pytest.approx(12 * 20 + 64 * seats["mean"])
 
 
-def test_pooled_rows_are_printed_and_drawn(
-    judged: tuple[EvaluateRequest, dict[str, Any]], capsys: pytest.CaptureFixture[str]
-):
+def test_pooled_rows_are_printed_and_drawn(judged: Judged, capsys: pytest.CaptureFixture[str]):
     """A table of seats and thresholds, and a line of its own in the plot."""
     request, content = judged
     run_evaluate(request, Console(stderr=True))

@@ -16,8 +16,7 @@ from PIL import Image
 
 from flows.publish import page_spectra as spectra_of_page
 from flows.publish.field_map import FieldMap, map_facts
-from flows.publish.page_parts import SHA256, part, policy
-from flows.publish.page_pictures import indexed_png
+from flows.publish.page_parts import SHA256, indexed_png, part, policy
 from flows.publish.page_places import places_of_grid, places_of_pose
 from flows.publish.page_spectra import class_means, page_spectra
 from flows.publish.report import MAP_SCRIPTS

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from flows.schedule.date_charts import COLOURS, line_chart
+from flows.schedule.field_visits import look_of
 from flows.schedule.history import FieldHistory, read_histories, render_history, render_index, way_to
-from flows.schedule.look_dates import look_of
 from storage.archive.archive import Archive
 from storage.archive.ledger import Ledger
 from storage.archive.records import Run

@@ -12,7 +12,7 @@ import pytest
 
 from flows.settings.load import load_settings
 from flows.survey.drawing import Drawing, draw_field
-from flows.survey.field_memory import CoarseMemory, FieldMemory
+from flows.survey.field_memory import FieldMemory
 from flows.survey.field_work import SHARD, FieldWork, Scoring, WeightsFile, region_params
 from flows.survey.run import SurveyRun, open_run
 from models.reading.regions import Region, plan_regions, whole_field
@@ -176,10 +176,10 @@ def test_a_memory_is_moved_and_leaves_nothing_behind(surveyed: tuple[SurveyRun, 
     """What lay at a pixel lies ``shift`` further, in fine and coarse pixels alike, and nothing where it came from."""
     run, stages = surveyed
     belief, mosaic = _store(stages, "segment/*/belief.zarr"), _store(stages, "rectify/*/mosaic.zarr")
-    looks, region = (CoarseMemory(mosaic, (0, 0)),), whole_field(run.grid)
+    region = whole_field(run.grid)
     classes = tuple(range(len(run.weights.class_names)))
-    still = FieldMemory(belief, looks, 1.0, classes).of(region, run.weights)
-    moved = FieldMemory(belief, looks, 1.0, classes, shift).of(region, run.weights)
+    still = FieldMemory(belief, mosaic, 1.0, classes).of(region, run.weights)
+    moved = FieldMemory(belief, mosaic, 1.0, classes, shift).of(region, run.weights)
     coarse = tuple(round(by / run.grid.factor) for by in shift)
     assert still.coarse is not None
     assert moved.coarse is not None

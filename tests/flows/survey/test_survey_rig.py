@@ -32,11 +32,10 @@ from pipeline.geometry.scan import Sweep, exposing
 from pipeline.rig.camera.camera_cubes import mean_frame
 from pipeline.rig.capture.capture_paths import REFERENCES
 from pipeline.rig.capture.capture_runner import RigDevices
-from pipeline.rig.devices import SYSTEM_CLOCK, DeviceGone, ManualClock
+from pipeline.rig.devices import SYSTEM_CLOCK, DeviceGone
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock
 from pipeline.rig.emulator.fault_names import CameraFault, make_fault
 from pipeline.rig.emulator.scene_camera import REFERENCE_FRAMES, SceneView
-from pipeline.rig.mirror.mirror_controller import MirrorController
 from pipeline.rig.mirror.pro_mode import Command
 from pipeline.rig.transports import SerialTransport
 from pipeline.simulator.effects.registry import effects_on
@@ -49,6 +48,7 @@ from storage.arrays.cubes import open_raw_cube
 from storage.remote.opening import verify_archive
 from tests.conftest import patchy_scene
 from tests.flows.conftest import CommandLine
+from tests.pipeline.rig.in_process import InProcessRig, ManualClock
 from tests.remembered_work import without_effects
 
 QUIET = Console(quiet=True)
@@ -81,13 +81,10 @@ def emulated(
     seen = open_scene(settings)[0] if scene is None else scene
     source = replace(make_source(seen, settings), chosen=effects)
     whole = EmulatedRig(source, ManualClock(10.0), wired=settings.rig.pulses, mounting=mounting)
-    with whole.in_process() as line:
+    with InProcessRig(whole) as line:
 
         def open_devices(told: Settings, *_: object) -> RigDevices:
-            line.transport = type(line.transport)(whole.mirror, line.clock)
-            mirror = MirrorController(line.transport, told.rig.mirror(told.cost.vector_pairs), line.clock)
-            mirror.connect()
-            return RigDevices(mirror, line.camera(), line.clock)
+            return line.devices(told.rig.mirror(told.cost.vector_pairs))
 
         patch.setattr(flows.survey.rig_field, "open_devices", open_devices)
         yield whole

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from pipeline.rig.devices import ManualClock
+from tests.pipeline.rig.in_process import ManualClock
 
 
 @dataclass(frozen=True)

@@ -18,17 +18,15 @@ from pipeline.rig.camera.camera_files import Kept, KeptInMemory
 from pipeline.rig.capture.capture_runner import RigDevices
 from pipeline.rig.capture.rig_source import RigSource
 from pipeline.rig.device_settings import SurveyRig
-from pipeline.rig.devices import ManualClock
-from pipeline.rig.emulator.camera_server import CameraServer
-from pipeline.rig.emulator.emulated_rig import EmulatedRig, InProcessRig
+from pipeline.rig.emulator.emulated_rig import EmulatedRig
 from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults
 from pipeline.rig.emulator.mirror_device import Fault
-from pipeline.rig.mirror.mirror_controller import MirrorController
 from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Line
+from tests.pipeline.rig.in_process import InProcessRig, ManualClock
 
 CAMERA = LineCamera(samples=48)
 NAMES = ("rotation", "slit", "smear", "vignetting", "shot", "read-noise")
@@ -81,10 +79,7 @@ class SmallRig:
     def devices(self) -> RigDevices:
         """Connect to both."""
         self.opened += 1
-        self.line.transport = type(self.line.transport)(self.emulated.mirror, self.line.clock)
-        mirror = MirrorController(self.line.transport, self.settings.mirror(self.vector_pairs), self.line.clock)
-        mirror.connect()
-        return RigDevices(mirror, self.line.camera(), self.line.clock)
+        return self.line.devices(self.settings.mirror(self.vector_pairs))
 
     def source(self, kept: Kept | None = None) -> RigSource:
         """A source that looks through the rig; another call is another process."""
@@ -120,6 +115,5 @@ def small_rig(
         camera_faults=CameraFaults(dict(faults or {}), 0, passes),
         mounting=mounting,
     )
-    with rig.in_process() as line:
-        assert isinstance(line.server, CameraServer)
+    with InProcessRig(rig) as line:
         yield SmallRig(line, SurveyRig(**settings), vector_pairs, looked.wavelength_nm)

@@ -13,9 +13,9 @@ from pipeline.errors import RigError
 from pipeline.rig.camera.camera_files import log_in
 from pipeline.rig.capture.capture_paths import capture_prefix
 from pipeline.rig.device_settings import FileServer, MirrorSettings
-from pipeline.rig.devices import DeviceGone, DeviceRefused, ManualClock
+from pipeline.rig.devices import DeviceGone, DeviceRefused
 from pipeline.rig.emulator.camera_device import CameraUnit
-from pipeline.rig.emulator.emulated_rig import EmulatedRig, InProcessRig
+from pipeline.rig.emulator.emulated_rig import EmulatedRig
 from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults, make_fault
 from pipeline.rig.emulator.mirror_device import Mode
 from pipeline.rig.mirror.mirror_controller import MirrorController
@@ -23,6 +23,7 @@ from pipeline.rig.mirror.path_player import MotionLog
 from pipeline.rig.mirror.pro_mode import Command
 from pipeline.rig.mirror.registers import Status
 from pipeline.rig.rig_check import SQUARE, CheckRow, check_camera, check_mirror, failed, works
+from tests.pipeline.rig.in_process import InProcessRig, ManualClock
 from tests.pipeline.rig.small_rig import FINE, small_source
 
 SETS = {Command.SET_VALUE, Command.SET_VALUES, Command.SET_VECTOR}
@@ -33,7 +34,7 @@ def rig(*faults: str, camera: CameraFaults | None = None) -> Iterator[InProcessR
     """An emulated rig whose mirror's faults strike at the first occasion."""
     struck = [make_fault(name, at=0) for name in faults]
     whole = EmulatedRig(small_source(), ManualClock(), mirror_faults=struck, camera_faults=camera)
-    with whole.in_process() as line:
+    with InProcessRig(whole) as line:
         yield line
 
 

@@ -12,10 +12,9 @@ import xarray as xr
 
 from pipeline.errors import ChunkError, IncompleteStoreError, ShapeError
 from pipeline.geometry.scan import Sweep
-from pipeline.rectify.calibration.calibrate import calibrate
 from pipeline.source import Line, References
 from storage.archive.archive import Archive
-from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube, open_reflectance
+from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
 from storage.arrays.layout import AngularGrid, round_bits
 from storage.arrays.mosaics import (
     Attention,
@@ -96,9 +95,9 @@ def test_raw_cube_refuses_what_does_not_fit(tmp_path: Path) -> None:
         SweepHeader(header.sweep, header.references, np.arange(3.0))
 
 
-def _calibrated(tmp_path: Path, started: str | None = None) -> tuple[Path, SweepHeader, list[Line]]:
+def _calibrated(tmp_path: Path) -> tuple[Path, SweepHeader, list[Line]]:
     """A stored sweep of 130 lines whose references have all that references can have."""
-    header = _header(130, 9, 4, started)
+    header = _header(130, 9, 4)
     rng = np.random.default_rng(4)
     flat = rng.uniform(0.9, 1.1, (9, 4)).astype(np.float32)
     bad = np.zeros((9, 4), np.bool_)
@@ -127,45 +126,15 @@ def test_bad_flat_and_mirror_come_back(tmp_path: Path) -> None:
         replace(plain, references=replace(plain.references, bad=np.zeros((9, 3), np.bool_)))
 
 
-def test_reflectance_is_the_calibrated_cube(tmp_path: Path) -> None:
-    """All of it equals the lines calibrated at once, NaN where not valid; coordinates say where and when."""
-    path, header, lines = _calibrated(tmp_path, started="2026-05-01T10:00:00")
-    opened = open_reflectance(path, saturated_dn=4000)
-    position = [(line.mirror_x, line.mirror_y) for line in lines]
-    raw = np.stack([line.data for line in lines])
-    values, valid = calibrate(raw, header.references, saturated_dn=4000, position=position)
-    values[~valid] = np.nan
-    values[[not line.valid for line in lines]] = np.nan
-    np.testing.assert_array_equal(opened.values, values)
-    assert 0 < np.isnan(values).sum() < values.size
-    assert opened.dims == ("line", "sample", "band")
-    facts = {"time", "mirror_x", "mirror_y", "exposure_ms", "valid_line"}
-    assert set(opened.coords) == {"line", "sample", "band", "wavelength", "fwhm", *facts}
-    assert opened["time"].values[10] == np.datetime64("2026-05-01T10:00:01")
-    np.testing.assert_array_equal(opened["mirror_x"], [x for x, _ in position])
-
-
-def test_reflectance_of_an_invalid_line_with_an_impossible_position(tmp_path: Path) -> None:
-    """A line marked as not valid, whose mirror was read beyond the rim, is NaN; its neighbours are as they were."""
-    path, header, lines = _calibrated(tmp_path)
-    spoilt = [replace(line, mirror_x=1.5, valid=False) if line.number == 7 else line for line in lines]
-    with RawCubeWriter(tmp_path / "spoilt.zarr", header) as cube:
-        cube.write(spoilt)
-    expected = open_reflectance(path, saturated_dn=4000).values
-    expected[7] = np.nan
-    np.testing.assert_array_equal(open_reflectance(tmp_path / "spoilt.zarr", saturated_dn=4000).values, expected)
-
-
-def test_reflectance_reads_what_is_asked_for(tmp_path: Path) -> None:
+def test_lines_are_read_as_they_are_asked_for(tmp_path: Path) -> None:
     """Opening reads no line: a damaged block is an error only where it is asked for, and is named."""
-    path, _, _ = _calibrated(tmp_path)
+    path, _, lines = _calibrated(tmp_path)
     shard = path / "dn" / "c" / "1" / "0" / "0"
     shard.write_bytes(shard.read_bytes()[:-40])
-    opened = open_reflectance(path, saturated_dn=4000)
-    assert opened.chunks == ((64, 64, 2), (9,), (4,))
-    assert np.isfinite(opened[11].mean().values)
+    cube = open_raw_cube(path)
+    np.testing.assert_array_equal(cube.read(11, 12)[0], lines[11].data)
     with pytest.raises(IncompleteStoreError, match="dn cannot be read"):
-        opened[100].compute()
+        cube.read(100, 101)
 
 
 def test_layout_is_one_range_read_a_patch(tmp_path: Path) -> None:

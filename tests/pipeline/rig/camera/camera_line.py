@@ -7,9 +7,8 @@ from numpy.typing import NDArray
 
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.device_settings import ControlPatience, FileServer
-from pipeline.rig.devices import ManualClock
 from pipeline.rig.emulator.camera_device import CameraDevice
-from pipeline.rig.emulator.camera_server import InProcessCameraLine
+from tests.pipeline.rig.in_process import InProcessCameraLine, ManualClock
 
 
 def control_of(device: CameraDevice, clock: ManualClock, retries: int = 2) -> HeadwallCamera:

@@ -7,11 +7,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from pipeline.rig.devices import DeviceRefused, ManualClock
+from pipeline.rig.devices import DeviceRefused
 from pipeline.rig.emulator.camera_device import CameraDevice, CameraUnit
 from pipeline.rig.emulator.camera_server import CameraConnection
 from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults
 from tests.pipeline.rig.camera.camera_line import LinesOf, control_of
+from tests.pipeline.rig.in_process import ManualClock
 
 CAPTURE = b'capture({"prefix": "", "maxCubes": 1, "maxFramesPerCube": 5})'
 PROMPT = b"\r\nhpi> "

@@ -14,12 +14,13 @@ from pipeline.errors import RigError
 from pipeline.rig.camera.camera_files import KeptInMemory, RemoteFile, fetch_files
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.device_settings import CameraAddress, ControlPatience, FileServer
-from pipeline.rig.devices import SYSTEM_CLOCK, DeviceGone, DeviceRefused, ManualClock
+from pipeline.rig.devices import SYSTEM_CLOCK, DeviceGone, DeviceRefused
 from pipeline.rig.emulator.camera_device import CameraDevice, CameraUnit, FrameClock, IndexLayout
 from pipeline.rig.emulator.camera_server import CameraServer
 from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults
 from pipeline.rig.transports import SocketTransport
 from tests.pipeline.rig.camera.camera_line import LinesOf, wait_for
+from tests.pipeline.rig.in_process import ManualClock
 
 
 def remote_files(device: CameraDevice, folder: str) -> list[RemoteFile]:

@@ -11,13 +11,13 @@ import pytest
 from pipeline.errors import RigError
 from pipeline.rig.camera.camera_files import KeptInMemory, RemoteFile, fetch_files
 from pipeline.rig.device_settings import FileServer
-from pipeline.rig.devices import ManualClock
 from pipeline.rig.emulator.camera_device import CameraDevice, CameraUnit
 from pipeline.rig.emulator.camera_server import CameraServer
 from pipeline.rig.emulator.fault_names import CameraFault
 from tests.pipeline.rig.camera.camera_line import LinesOf, control_of
 from tests.pipeline.rig.chaos_line import ChaosLine
 from tests.pipeline.rig.chaotic_surveys import survey_in_chaos
+from tests.pipeline.rig.in_process import ManualClock
 
 DARK = "/captured/000000/darkReference"
 

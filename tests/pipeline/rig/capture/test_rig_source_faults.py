@@ -185,9 +185,9 @@ def test_camera_that_writes_for_long_is_waited_for():
 def test_wrong_password_costs_no_capture():
     """Files that are not given to this user stay where they are: with another password the capture is used."""
     with small_rig() as rig:
-        kept, right = KeptInMemory(), type(rig.line).files
+        kept = KeptInMemory()
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(type(rig.line), "files", property(lambda line: replace(right.fget(line), password="x")))
+            patch.setattr(rig.line, "files", replace(rig.line.files, password="x"))
             with pytest.raises(DeviceRefused, match="look at user and password"):
                 list(rig.source(kept).lines(FINE))
         assert_same(list(rig.source(kept).lines(FINE)))

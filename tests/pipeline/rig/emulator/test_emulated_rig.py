@@ -24,6 +24,7 @@ from pipeline.rig.transports import SocketTransport
 from pipeline.simulator.effects.registry import QUIET
 from pipeline.simulator.simulated import SimulatedSource
 from tests.pipeline.rig.camera.camera_line import wait_for
+from tests.pipeline.rig.in_process import InProcessRig, ManualClock
 from tests.pipeline.rig.small_rig import CAMERA, COARSE, FINE, small_source
 
 MOST_S = 60.0
@@ -58,8 +59,8 @@ class Pair:
 @contextmanager
 def connected(source: SimulatedSource | None = None, **rig: Any) -> Iterator[tuple[Pair, EmulatedRig]]:
     """Drivers of an emulated rig in this process."""
-    whole = EmulatedRig(small_source() if source is None else source, **rig)
-    with whole.in_process() as line:
+    whole = EmulatedRig(small_source() if source is None else source, ManualClock(), **rig)
+    with InProcessRig(whole) as line:
         mirror = MirrorController(line.transport, MirrorSettings(), line.clock)
         mirror.connect()
         yield Pair(mirror, line.camera(), line.clock), whole
@@ -174,7 +175,7 @@ def test_state_in_words() -> None:
 
 def test_camera_line_ends_when_the_camera_hangs_up() -> None:
     """After exit nothing can be written or read."""
-    with EmulatedRig(small_source()).in_process() as line:
+    with InProcessRig(EmulatedRig(small_source(), ManualClock())) as line:
         wire = line.camera_line()
         assert wire.drain().endswith(b"hpi> ")
         wire.write(b"exit\r", 1.0)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 
 from pipeline.errors import SettingsError
-from pipeline.rig.devices import ManualClock
 from pipeline.rig.emulator.fault_names import KINDS, CameraFault, fault_table, make_fault, read_fault, read_faults
 from pipeline.rig.emulator.mirror_device import MirrorDevice, Mode, VanishedError
 from pipeline.rig.emulator.mirror_faults import LATE_S, SLOW_S, TICK_S
 from pipeline.rig.mirror.pro_mode import ErrorCode, Frame, ask_status, encode, float_cell, get_value, refuse, set_vector
 from pipeline.rig.mirror.registers import VECTOR_MEMORY, Status, X
+from tests.pipeline.rig.in_process import ManualClock
 from tests.pipeline.rig.mirror.mirror_bytes import ASK_FIRMWARE, set_value
 
 CODES = {

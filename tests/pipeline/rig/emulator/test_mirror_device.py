@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.rig.devices import ManualClock
 from pipeline.rig.emulator.mirror_device import MirrorDevice, Mode
 from pipeline.rig.emulator.mirror_state import MirrorUnit
 from pipeline.rig.mirror.registers import Status
+from tests.pipeline.rig.in_process import ManualClock
 
 GO_PRO_CRC = b"GOPROCRC\r\n"
 

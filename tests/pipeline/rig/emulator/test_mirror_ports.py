@@ -13,12 +13,13 @@ import serial
 
 from pipeline.errors import RigError, SettingsError
 from pipeline.rig.device_settings import MirrorSettings
-from pipeline.rig.devices import SYSTEM_CLOCK, DeadlinePassed, DeviceGone, ManualClock
+from pipeline.rig.devices import SYSTEM_CLOCK, DeadlinePassed, DeviceGone
 from pipeline.rig.emulator.emulated_rig import FastClock
 from pipeline.rig.emulator.fault_names import make_fault
 from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.emulator.mirror_ports import EmulatedPort, InProcessTransport
+from pipeline.rig.emulator.mirror_ports import EmulatedPort
 from pipeline.rig.mirror.mirror_controller import open_mirror
+from tests.pipeline.rig.in_process import InProcessTransport, ManualClock
 
 
 def line(*faults: str, baud: int = 0) -> InProcessTransport:

@@ -9,7 +9,6 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.geometry.scan import Ends
-from pipeline.rig.devices import ManualClock
 from pipeline.rig.emulator import mirror_motion
 from pipeline.rig.emulator.mirror_device import MirrorDevice
 from pipeline.rig.emulator.mirror_motion import MOST_STEPS, AxisMotion, Stiffness, VectorPlayer
@@ -41,6 +40,7 @@ from pipeline.rig.mirror.registers import (
     Y,
     log_slot,
 )
+from tests.pipeline.rig.in_process import ManualClock
 from tests.pipeline.rig.mirror.mirror_bytes import set_value
 
 STIFF = Stiffness(20.0, 0.7)

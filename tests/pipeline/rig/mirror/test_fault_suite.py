@@ -10,13 +10,13 @@ import pytest
 
 from pipeline.errors import RigError
 from pipeline.rig.device_settings import MirrorSettings
-from pipeline.rig.devices import ManualClock, StateUnknown
+from pipeline.rig.devices import StateUnknown
 from pipeline.rig.emulator.fault_names import KINDS, make_fault
 from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.emulator.mirror_ports import InProcessTransport
 from pipeline.rig.mirror.mirror_controller import MirrorController
 from pipeline.rig.mirror.pro_mode import Command, Frame, FrameReader, cell_int, read_registers
 from pipeline.rig.mirror.registers import VectorRegister, X, Y
+from tests.pipeline.rig.in_process import InProcessTransport, ManualClock
 
 SEEDS = range(8)
 SETTINGS = MirrorSettings(expected_id="MR-E", read_back="all")

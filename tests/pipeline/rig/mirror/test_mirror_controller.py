@@ -11,13 +11,13 @@ import pytest
 
 from pipeline.errors import PoseError, RigError, SettingsError, ShapeError
 from pipeline.rig.device_settings import MirrorSettings
-from pipeline.rig.devices import DeadlinePassed, DeviceGone, DeviceRefused, ManualClock, StateUnknown
+from pipeline.rig.devices import DeadlinePassed, DeviceGone, DeviceRefused, StateUnknown
 from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.emulator.mirror_ports import InProcessTransport
 from pipeline.rig.mirror import mirror_controller
 from pipeline.rig.mirror.mirror_controller import MirrorController, open_mirror
 from pipeline.rig.mirror.mirror_requests import Identity
 from pipeline.rig.mirror.registers import Status, Trigger
+from tests.pipeline.rig.in_process import InProcessTransport, ManualClock
 from tests.pipeline.rig.mirror import mirror_bytes as w
 from tests.pipeline.rig.mirror.mirror_bytes import connected, pair
 from tests.pipeline.rig.scripted import Late, Pair, ScriptedTransport, scripted

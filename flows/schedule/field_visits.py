@@ -1,20 +1,24 @@
-"""A field's visits in pictures, for a page that plays them: the map of each, what changed, and its words."""
+"""A field's visits, for a page of its history: when each looked, its map in pictures, what changed, and its words."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flows.publish.change_picture import CHANGED_SHARE
-from flows.publish.page_pictures import in_base64, indexed_png
+from flows.publish.page_parts import in_base64, indexed_png
 from flows.publish.panels import UNLABELLED_COLOUR, class_palette
 from flows.publish.receipt_words import days_words
+from flows.schedule.field_schedule import read_moment
+from flows.settings.survey_settings import BUILT_IN_SCENES
 from flows.terminal.figures import format_percent, format_points, format_seconds, known_number
+from pipeline.simulator.scenes.farm.farm_scene import USUAL_HOUR
 from storage.archive.archive import Archive
 from storage.archive.records import Run
 from storage.arrays.beliefs import BeliefStore
@@ -24,6 +28,29 @@ MOST_VISITS = 60  # that a page plays: the newest
 MOST_PX = 400  # of a picture's longer side
 PALE = 0.8  # of what did not change
 MOST_CLASSES = 128  # that are told apart, the last of them standing for none
+
+
+def look_of(run: Run, due: object) -> datetime | None:
+    """The moment that a run's visit is called by, else when it was ``due``, else the day that its farm was drawn on.
+
+    Of others when they began, or were published. The day is of the year in which the run was published. None where
+    nothing of that can be read.
+    """
+    named = next((at for at in map(read_moment, (run.settings.get("visit"), due)) if at is not None), None)
+    if named is not None:
+        return named
+    began = next((at for at in map(read_moment, (run.receipt.get("started"), run.created)) if at is not None), None)
+    return _day_of_farm(run.settings, began) or began
+
+
+def _day_of_farm(settings: Mapping[str, Any], published: datetime | None) -> datetime | None:
+    day, hour = settings.get("day"), settings.get("hour")
+    if settings.get("scene") not in BUILT_IN_SCENES or not isinstance(day, int) or published is None:
+        return None
+    of_day = float(hour) if isinstance(hour, int | float) else USUAL_HOUR
+    if not (1 <= day <= 366 and 0 <= of_day <= 24):
+        return None
+    return datetime(published.year, 1, 1, tzinfo=UTC) + timedelta(days=day - 1, hours=of_day)
 
 
 @dataclass(frozen=True)

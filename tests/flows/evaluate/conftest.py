@@ -1,0 +1,23 @@
+"""One evaluation that several tests look at."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flows.evaluate.command import evaluate_weights
+from flows.evaluate.frames import EvaluateRequest
+from tests.flows.small_fields import QUICK, write_weights
+
+Judged = tuple[EvaluateRequest, dict[str, Any]]
+
+
+@pytest.fixture(scope="package")
+def judged(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Judged:
+    """What was asked for, and an evaluation of two seeds, one frame of which is timed."""
+    folder = tmp_path_factory.mktemp("out")
+    weights = tuple(write_weights(folder / f"w{seed}.safetensors", seed) for seed in (0, 1))
+    request = EvaluateRequest(str(data), weights, folder / "out", **{**QUICK, "timed_frames": 1})
+    return request, evaluate_weights(request)

@@ -1,0 +1,199 @@
+"""Emulated devices in this process: lines without ports, on a clock that waiting moves."""
+
+from __future__ import annotations
+
+import heapq
+from collections import deque
+from dataclasses import dataclass, field
+from itertools import count
+
+from pipeline.errors import SettingsError
+from pipeline.rig.camera.headwall_camera import HeadwallCamera
+from pipeline.rig.capture.capture_runner import RigDevices
+from pipeline.rig.device_settings import FileServer, MirrorSettings
+from pipeline.rig.devices import Clock, Closing, DeadlinePassed, DeviceGone
+from pipeline.rig.emulator import Chunk
+from pipeline.rig.emulator.camera_device import CameraDevice
+from pipeline.rig.emulator.camera_server import CameraConnection, CameraServer
+from pipeline.rig.emulator.emulated_rig import EmulatedRig
+from pipeline.rig.emulator.mirror_device import MirrorDevice, VanishedError
+from pipeline.rig.mirror.mirror_controller import MirrorController
+from pipeline.rig.transports import BITS_PER_BYTE
+
+
+class ManualClock:
+    """A clock that moves only when it is told to: sleeping takes no time and moves it."""
+
+    def __init__(self, start: float = 0.0) -> None:
+        self._now = start
+
+    def now(self) -> float:
+        return self._now
+
+    def sleep(self, seconds: float) -> None:
+        if seconds > 0:
+            self._now += seconds
+
+    def advance(self, seconds: float) -> None:
+        """Move the clock on by so much; SettingsError where that is below 0. [s]"""
+        if not seconds >= 0:
+            raise SettingsError(f"a clock only goes forward, got {seconds} s; give 0 or more")
+        self._now += seconds
+
+
+@dataclass
+class InProcessTransport:
+    """A :class:`~pipeline.rig.transports.Transport` to ``device``; both share the clock.
+
+    ``sent`` are the writes, for whoever checks what was sent. ``baud`` paces both directions; 0 does not.
+    """
+
+    device: MirrorDevice
+    clock: Clock
+    baud: int = 0
+    port: str = "emulator"
+    sent: list[bytes] = field(default_factory=list)
+    _due: list[tuple[float, int, bytes]] = field(default_factory=list, init=False)
+    _order: count[int] = field(default_factory=count, init=False)
+    _free_s: float = field(default=0.0, init=False)  # when the line from the device is free again
+    _closed: bool = field(default=False, init=False)
+
+    def __post_init__(self) -> None:
+        self._schedule(self.device.opened())
+
+    def write(self, data: bytes, deadline: float) -> None:
+        """Hand the bytes to the device at once."""
+        self._check_open()
+        self.sent.append(data)
+        if self.device.hung:
+            self.clock.sleep(deadline - self.clock.now())
+            raise DeadlinePassed(f"{self.port} did not take {len(data)} bytes in time; is the device on?")
+        self.clock.sleep(self._seconds(len(data)))
+        try:
+            self._schedule(self.device.receive(data))
+        except VanishedError as error:
+            raise self._gone() from error
+
+    def read(self, at_most: int, deadline: float) -> bytes:
+        """Give what the device has answered by then."""
+        self._check_open()
+        if not self._due and self.device.gone:
+            raise self._gone()
+        until = min(self._due[0][0], deadline) if self._due else deadline
+        self.clock.sleep(until - self.clock.now())
+        data = self.drain()
+        if len(data) > at_most:
+            heapq.heappush(self._due, (self.clock.now(), -next(self._order), data[at_most:]))
+        return data[:at_most]
+
+    def drain(self) -> bytes:
+        self._check_open()
+        data = b""
+        while self._due and self._due[0][0] <= self.clock.now():
+            data += heapq.heappop(self._due)[2]
+        return data
+
+    def close(self) -> None:
+        self._closed = True
+        self._due.clear()
+
+    def _schedule(self, chunks: list[Chunk]) -> None:
+        now = self.clock.now()
+        for delay_s, data in chunks:
+            self._free_s = max(now + delay_s, self._free_s if self.baud else 0.0) + self._seconds(len(data))
+            heapq.heappush(self._due, (self._free_s, next(self._order), data))
+
+    def _seconds(self, size: int) -> float:
+        return size * BITS_PER_BYTE / self.baud if self.baud else 0.0
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise DeviceGone(f"{self.port} is closed; open it again")
+
+    def _gone(self) -> DeviceGone:
+        return DeviceGone(f"{self.port} went away; look at the cable and the power, then connect again")
+
+
+@dataclass
+class InProcessCameraLine:
+    """A :class:`~pipeline.rig.transports.Transport` to ``device``; both share the clock."""
+
+    device: CameraDevice
+    clock: Clock
+    port: str = "emulated camera"
+    _coming: deque[tuple[float, bytes]] = field(default_factory=deque, init=False)
+    _open: bool = field(default=True, init=False)
+
+    def __post_init__(self) -> None:
+        self._talk = CameraConnection(self.device)
+        self._say(self.device.greet())
+
+    def write(self, data: bytes, deadline: float) -> None:
+        self._check_open()
+        chunks, self._open = self._talk.feed(data)
+        self._say(chunks)
+
+    def read(self, at_most: int, deadline: float) -> bytes:
+        """Give what the camera has answered by then."""
+        if not self._coming:
+            self._check_open()
+        if not self._coming or self._coming[0][0] > deadline:
+            self.clock.sleep(deadline - self.clock.now())
+            return b""
+        due_s, data = self._coming.popleft()
+        self.clock.sleep(due_s - self.clock.now())
+        if len(data) > at_most:
+            self._coming.appendleft((due_s, data[at_most:]))
+        return data[:at_most]
+
+    def drain(self) -> bytes:
+        found = b""
+        while self._coming and self._coming[0][0] <= self.clock.now():
+            found += self._coming.popleft()[1]
+        return found
+
+    def close(self) -> None:
+        self._open = False
+        self._coming.clear()
+
+    def _say(self, chunks: list[Chunk]) -> None:
+        due_s = self.clock.now()
+        for chunk in chunks:
+            due_s += chunk.delay_s
+            self._coming.append((due_s, chunk.data))
+
+    def _check_open(self) -> None:
+        if not self._open:
+            raise DeviceGone(f"the connection to {self.port} was lost (closed by the other end)")
+
+
+@dataclass
+class InProcessRig(Closing):
+    """Lines to an emulated rig. Close it: a thread serves the camera's files, through a socket of this machine."""
+
+    rig: EmulatedRig
+
+    def __post_init__(self) -> None:
+        self.clock = self.rig.clock  # of the devices, and of drivers that talk to them
+        self.transport = InProcessTransport(self.rig.mirror, self.clock)
+        self.server = CameraServer(self.rig.camera)
+        self.files = FileServer(self.server.host, self.server.file_port)
+
+    def camera_line(self) -> InProcessCameraLine:
+        """Connect to the camera's control."""
+        return InProcessCameraLine(self.rig.camera, self.clock)
+
+    def camera(self) -> HeadwallCamera:
+        """Give a driver that is connected to the camera."""
+        return HeadwallCamera(self.camera_line, self.files, clock=self.clock)
+
+    def devices(self, settings: MirrorSettings) -> RigDevices:
+        """Connect drivers to both, the mirror's by a line of its own."""
+        self.transport = InProcessTransport(self.rig.mirror, self.clock)
+        mirror = MirrorController(self.transport, settings, self.clock)
+        mirror.connect()
+        return RigDevices(mirror, self.camera(), self.clock)
+
+    def close(self) -> None:
+        """Let go of the port for files."""
+        self.server.close()
