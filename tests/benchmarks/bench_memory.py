@@ -8,7 +8,8 @@ and looked for three days later. Farms that no training saw, each with noise of 
 
 `python tests/benchmarks/bench_memory.py season` draws the season alone, `days` the visits after a few days, `changes`
 what was planted, `light` fields that did not change under another sun, `wrong` memories that are none of the field,
-`parts` visits that look at a part: fields as wide as four strips of a narrower camera, `strips` a season of them.
+`parts` visits that look at a part: fields as wide as four strips of a narrower camera, `strips` a season of them,
+`doubts` what a memory expects of itself that nobody looks after.
 `storage --size 128x96 --visits 3` says what so many visits to so small a farm store; alone it takes 640x512 px, ten.
 """
 
@@ -22,7 +23,7 @@ from functools import partial
 from measure import Row
 from visits.changes import other_light, planted_changes
 from visits.farm_visits import QUICK, REFERENCE, SEASON, SHAPE
-from visits.parts import parts, season_of_parts
+from visits.parts import parts, season_of_parts, unwatched
 from visits.seasons import after_days, season
 from visits.stored_season import stored_rows
 from visits.wrong_memories import wrong_memories
@@ -43,6 +44,7 @@ PARTS: dict[str, Callable[[], Iterator[Row]]] = {
     "wrong": wrong_memories,
     "parts": parts,
     "strips": season_of_parts,
+    "doubts": unwatched,
     "storage": storage,
 }
 

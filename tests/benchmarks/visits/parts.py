@@ -11,6 +11,7 @@ import numpy as np
 from measure import Row
 from visits.farm_visits import (
     ANEW,
+    CAMERA,
     COST,
     FIRST_DAY,
     HOUR,
@@ -31,15 +32,17 @@ from visits.farm_visits import (
 from models.reading.doubts import SeatDoubts
 from models.reading.remembered import COME_TRUE, Belief, Looked, Remembered, carried, first_belief
 from pipeline.geometry.camera import LineCamera
-from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.planning.area_cover import seats_shown
 from pipeline.planning.coverage import cheapest_full, plain_sweeps
 from pipeline.planning.part_looks import SeatRows, part_look, sweeps_of_runs
 from pipeline.planning.plain_scans import ScanRecord
+from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 
 STRIPS = LineCamera(samples=160)  # of which a field is four strips wide
 PART_DAYS, PART_SHARES = (3, 7), (0.35, 0.6)  # days without a look; seconds of a visit, of those of a whole quick look
 SEASON_SHARES = (0.15, 0.25)  # seconds of a visit of a season, of those of a full scan
+UNWATCHED = (1, 2, 3, 5)  # visits of the season, none of which is made
 ROUNDS = (1, 2)  # visits from one quick look at everything to the next
 
 
@@ -123,6 +126,28 @@ def season_of_parts() -> Iterator[Row]:
             found.setdefault(name, []).append(_season_score(field, quick, None, every))
     for name, values in found.items():
         yield Row(f"season of parts, {name}", mean_figure(values))
+
+
+def unwatched() -> Iterator[Row]:
+    """A memory that nobody looks after: how much of it it expects to be wrong, and how much is."""
+    field, names, reader = Strips.of_field(), shipped().class_names, shipped_memory().reader
+    found: dict[int, list[tuple[float, float]]] = {}
+    for seed in SEEDS:
+        first = first_belief(look_at_farm(seed, *SEASON[0], REFERENCE).looked)
+        for number in UNWATCHED:
+            (day, hour), days = SEASON[number], SEASON[number][0] - SEASON[0][0]
+            unseen = carried(Remembered(first, None, days), reader)
+            doubts = SeatDoubts.of(
+                [(unseen.log_probability, unseen.age_days)], field.grid, len(names), come_true=COME_TRUE
+            )
+            labels = np.asarray(farm_scene(seed, SHAPE, camera=CAMERA, day=day, hour=hour).labels)
+            wrong = float((unseen.classes()[0] != labels)[labels != UNLABELLED].mean())
+            found.setdefault(days, []).append((doubts.expected_wrong(), wrong))
+    for days, pairs in found.items():
+        expected, wrong = np.mean(pairs, axis=0)
+        each = " ".join(f"{100 * one:.1f}" for _, one in pairs)
+        what = f"{days} d without a look after April 20, pixels that are wrong, beside those that are expected"
+        yield Row(what, f"{100 * wrong:.1f} % ({each}), expected {100 * expected:.1f} %")
 
 
 def _season_score(field: Strips, quick: Sequence[Seen], share: float | None, every: int) -> float:
