@@ -20,7 +20,9 @@ from tests.house.source_tree import (
     files_by_folder,
     files_of_tests,
     imported,
+    imported_files,
     imported_in_functions,
+    module_name,
     nodes,
     public,
     shared_class_names,
@@ -142,6 +144,14 @@ def test_pipeline_opens_no_files() -> None:
 def test_no_file_imports_itself_in_a_circle() -> None:
     """Every file stands above all that it imports, within functions and for type checkers too."""
     assert circles(source()) == []
+
+
+def test_every_file_has_a_user() -> None:
+    """Another file imports it, or names it as what is loaded when it is asked for; but what others begin with."""
+    known = {module_name(path) for path in source() if path.name != "__init__.py"}
+    used = set[str]().union(*(imported_files(path, tree, known) for path, tree in source().items()))
+    named = {node.value for tree in source().values() for node in nodes(tree) if isinstance(node, ast.Constant)}
+    assert known - used - named == {"flows.cli.main", "flows.schedule.prefect_flows"}  # of the script, of deployments
 
 
 def test_files_say_at_their_heads_what_they_need() -> None:

@@ -29,7 +29,7 @@ CHANGED = "#c4262e"
 
 
 @dataclass(frozen=True)
-class EarlierLook:
+class RememberedField:
     """What a map that goes on from an earlier run remembers of it."""
 
     run: str
@@ -39,7 +39,7 @@ class EarlierLook:
     age_days: NDArray[np.float32]  # (y, x) since a pixel was looked at, NaN where it never was
 
 
-def remembered(prior: Prior | None, drawn: StageRef, receipt: Receipt) -> EarlierLook | None:
+def remembered(prior: Prior | None, drawn: StageRef, receipt: Receipt) -> RememberedField | None:
     """What is remembered, None where a map goes on from no other run or put its memory aside.
 
     ``drawn`` is the store of the class map and of what is believed.
@@ -55,11 +55,11 @@ def remembered(prior: Prior | None, drawn: StageRef, receipt: Receipt) -> Earlie
     changed = belief.changed()
     assert changed is not None
     before = read_array(open_group(prior.belief.path / "class_map.zarr"), "classes")
-    return EarlierLook(prior.run, prior.days, names[before], changed, belief.age())
+    return RememberedField(prior.run, prior.days, names[before], changed, belief.age())
 
 
 def change_pictures(
-    before: EarlierLook | None, now: NDArray[np.uint8], legend: ClassNames, patch_px: int
+    before: RememberedField | None, now: NDArray[np.uint8], legend: ClassNames, patch_px: int
 ) -> list[Picture]:
     """What changed since the run that a map goes on from, with its caption; nothing where it goes on from none.
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.publish.change_picture import EarlierLook
+from flows.publish.change_picture import RememberedField
 from flows.publish.field_map import FieldMap, SweepShown
 from flows.publish.page_places import PagePlaces, places_of_grid, places_of_pose
 from flows.publish.page_spectra import PageSpectra, page_spectra
@@ -57,7 +57,7 @@ def field_map(
     plan: FinePlan,
     glance: QuicklookData,
     spectra: PageSpectra,
-    before: EarlierLook | None,
+    before: RememberedField | None,
 ) -> FieldMap:
     """All layers that there are of a run; ``glance`` is what its quicklook shows."""
     seats = np.zeros(run.grid.seat_shape, bool)

@@ -23,7 +23,8 @@ from rich.table import Table
 import flows.tradeoff.farm
 import flows.tradeoff.plans
 import flows.tradeoff.rectify
-import flows.tradeoff.simulate  # noqa: F401 - each registers its entries
+import flows.tradeoff.simulate
+import flows.tradeoff.simulate_light  # noqa: F401 - each registers its entries
 from flows.publish.panels import INK, MUTED, save_png
 from flows.terminal.figures import format_seconds
 from flows.terminal.processes import writing
