@@ -104,6 +104,7 @@ class Receipt(TypedDict):
     plan: NotRequired[dict[str, Any]]  # how the fine pass was laid out, and what the other orientation would cost
     scans: NotRequired[dict[str, dict[str, Any]]]  # plain ones by the weights' record, where there is one
     look: NotRequired[dict[str, Any]]  # which part of a remembered field was looked at, and what was expected of it
+    kept: NotRequired[dict[str, Any]]  # only of a plain scan that is kept and read in part: seats, costs of all, asked
     memory: NotRequired[dict[str, Any]]  # what became of what was remembered, where the map goes on from an earlier run
     pointing: NotRequired[dict[str, Any]]  # only where the mirror may look beside the plan
     lines: NotRequired[dict[str, Any]]  # sweeps with lines lost, repeated, out of order, late or invalid
@@ -135,6 +136,7 @@ FINDINGS = (
     "plan",
     "scans",
     "look",
+    "kept",
     "memory",
     "pointing",
     "lines",

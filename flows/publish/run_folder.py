@@ -208,7 +208,8 @@ def quicklook_data(
         survey=run.name,
         seed=run.settings.seed,
         about=_asked_words(run),
-        policy=None if run.plan.plain else run.settings.policy,
+        policy=None if run.plan.plain and run.budget is None else run.settings.policy,
+        scan=run.plan.plain,
         raw=tuple(_calibrated(run, cube, chosen) for cube in strips),
         raw_lines=sum(cube.sweep.lines for cube in strips),
         rectified=_both_scales(run, products, chosen, coarse),
@@ -296,6 +297,8 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
             "spared_score": plan.wanted_worth - plan.worth,
         }
     found: dict[str, Any] = {"field": field_figures(run, plan), "plan": told}
+    if run.budget is not None:
+        found["kept"] = run.budget.told(plan.seats) | {"stored_bytes": _stored_detail(run, products)}
     if (memory := told_of_memory(products.of("draw_map").path)) is not None:
         found["memory"] = memory
     if run.settings.look != LOOK_WHOLE:
@@ -334,6 +337,11 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     if troubled:
         found["lines"] = troubled
     return found
+
+
+def _stored_detail(run: SurveyRun, products: Products) -> int:
+    """Bytes that coarse means and patches take as they are stored."""
+    return sum(run.archive.stored_bytes(products.of(stage)) for stage in ("rectify", "cut_patches"))
 
 
 def _pointing(ref: StageRef) -> dict[str, Any]:
