@@ -27,6 +27,16 @@ class Saving(TypedDict):
     full_is: Literal["measured", "predicted"]
 
 
+class SecondsSaved(Saving):
+    """Seconds of capture: ``full`` is the cheapest scan that is nearly as good as any, by the weights' record.
+
+    Without such a record, and in receipts of before, it is every line at the camera's exposure.
+    """
+
+    full_scan: NotRequired[str]  # in words; with a record alone
+    every_line_s: NotRequired[float]  # what ``full`` was before; with a record alone, and for one version
+
+
 class Split(Saving):
     """Multiply-adds, also told apart by what they were for."""
 
@@ -37,13 +47,13 @@ class Split(Saving):
 
 
 class Savings(TypedDict):
-    """What the run spent against the cheapest full scan."""
+    """What the run spent against every line at full resolution; seconds against a scan that is nearly as good."""
 
     lines: Saving
     samples: Saving
     bytes_raw: Saving
     bytes_stored: Saving
-    capture_s: Saving
+    capture_s: SecondsSaved
     tokens: Saving
     multiply_adds: Split
     segment_wall_s: NotRequired[dict[str, float]]

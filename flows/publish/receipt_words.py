@@ -36,13 +36,7 @@ def headline(receipt: Receipt, looked_twice: float | None = None) -> str:
         twice = (
             "" if looked_twice is None else f"The camera looked twice at {format_percent(looked_twice)} of the field. "
         )
-    everything = (
-        f"every line of {receipt['settings']['camera']['exposure_ms']:g} ms" if plain else "a scan of everything"
-    )
-    text = (
-        f"{twice}Capture took {format_seconds(capture['done'])} instead of {format_seconds(capture['full'])} "
-        f"for {everything} ({format_percent(capture['ratio'])})."
-    )
+    text = f"{twice}{_capture_words(capture, receipt['settings'], plain=plain)}"
     accuracy = receipt.get("accuracy")
     if accuracy is None:
         return f"{text} The map is not judged yet: its accuracy is added once it is." if is_pending(receipt) else text
@@ -56,6 +50,23 @@ def headline(receipt: Receipt, looked_twice: float | None = None) -> str:
         f"{text} The map scores {format_points(accuracy['miou'])} of 100 against the truth{pixels}{coarse}"
         f"{detail}. {worst_class_words(accuracy, alone=whole)}"
     ).rstrip()
+
+
+def _capture_words(capture: Mapping[str, Any], settings: Mapping[str, Any], *, plain: bool) -> str:
+    """How long capture took beside the cheapest scan of everything that is nearly as good as any.
+
+    Where the weights have no record that tells which, and in receipts of before, beside every line as long exposed as
+    the camera does.
+    """
+    done, full, share = (*map(format_seconds, (capture["done"], capture["full"])), format_percent(capture["ratio"]))
+    every = f"every line of {settings['camera']['exposure_ms']:g} ms"
+    if "every_line_s" not in capture:
+        return f"Capture took {done} instead of {full} for {every if plain else 'a scan of everything'} ({share})."
+    before = format_seconds(capture["every_line_s"])
+    return (
+        f"Capture took {done}, {share} of the {full} of the cheapest scan that is nearly as good as any "
+        f"({capture['full_scan']}); {every}, which savings were told against before, takes {before}."
+    )
 
 
 def sentences(found: Mapping[str, Any]) -> list[str]:
@@ -86,6 +97,11 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
         words.append(_unknown_words(unknown, found.get("accuracy")))
     if scans := found.get("scans"):
         words.append(_scans_words(scans))
+    elif found.get("plan"):
+        words.append(
+            "The weights have no record of plain scans, so that seconds are told beside every line at full exposure; "
+            "train --darkest-ms 3 makes one."
+        )
     for name, one in found.get("pointing", {}).items():
         if isinstance(one, Mapping) and (told := _pointing_words(name, one)):
             words.append(told)
