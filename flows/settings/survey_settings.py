@@ -34,6 +34,7 @@ from flows.settings.values import (
     Wavelengths,
     parse_tolerance,
 )
+from models.network.device import PROCESSOR, Device
 from models.policies.policies import Policy
 from models.reading.familiar import RATE
 from pipeline.geometry.camera import LineCamera
@@ -49,7 +50,7 @@ from storage.parallel.crew import Crew
 BUILT_IN_SCENES = FARM_NAMES
 USUAL_SIZE = f"{FARM_SHAPE[1]}x{FARM_SHAPE[0]}"
 RIG_FIELD = "field"  # the scene of which only the rig knows more than size and bands
-OF_THE_MACHINE = ("scheduler", "workers")  # no byte depends on them; a cluster of that day need not be there today
+OF_THE_MACHINE = ("scheduler", "workers", "device")  # what of that day need not be there today
 PLAIN = ("seconds", "bytes_raw", "goal", "scan_step")  # settings of which one asks for a plain scan
 SPARING = ("compute", "bytes_kept", "least_gain")  # by which a plain scan is kept and read in detail in part
 OF_TWO_PASSES = ("budget", "coarse_exposure_ms", "policy", "threshold", "mask", "vgg")  # and of which none may
@@ -243,6 +244,11 @@ class Settings:
         1024,
         example=2,
         why=WORKERS,
+    )
+    device: Device = stated(
+        PROCESSOR,
+        "Where the network computes; auto is cuda or mps where torch can use one here, else the processor. A map of "
+        "another device is another store: it may differ by rounding",
     )
     kernel: Kernel = stated("catmull-rom", "How lines are read between samples; nearest mixes no spectra")
     pointing_px: float = stated(

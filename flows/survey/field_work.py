@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from flows.survey.reading_costs import SHARD
 from flows.survey.run import SurveyRun
 from flows.survey.survey_model import weights_path
+from models.network.device import PROCESSOR
 from models.network.sizes import saliency_bytes
 from models.policies.policies import GLANCING_POLICIES, IMAGE_POLICIES, score_seats
 from models.policies.vgg_file import VggFile
@@ -43,6 +44,7 @@ class WeightsFile:
 
     path: Path
     key: str
+    device: str = PROCESSOR  # where the network computes
 
     reader_key: str | None = None  # of the reader of memories beside them, where there is one
 
@@ -70,7 +72,7 @@ class WeightsFile:
     @lru_cache(maxsize=1)  # noqa: B019 - the record is a value
     def load(self) -> Weights:
         """Read them, once a process. Raises WeightsError where the file has changed since."""
-        weights = load_weights(self.path)
+        weights = load_weights(self.path).on(self.device)
         if content_key(self.path) != self.key:
             raise WeightsError(f"the weights {self.path} have changed since the survey began; start it again")
         return weights
@@ -165,7 +167,7 @@ class FieldWork:
     def of(run: SurveyRun) -> FieldWork:
         """Take from a survey what the regions of its field need."""
         reader, familiar = (None if one is None else one.key for one in (run.reader, run.familiar))
-        file = WeightsFile(weights_path(run.settings).resolve(), run.weights_key, reader, familiar)
+        file = WeightsFile(weights_path(run.settings).resolve(), run.weights_key, run.device, reader, familiar)
         return FieldWork(file, plan_regions(run.grid, SHARD), run.settings.crew, run.settings.memory, run.vgg)
 
     def score(self, policy: str, mosaic: Path, report: Callable[[float], None]) -> NDArray[np.float64]:

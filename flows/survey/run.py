@@ -34,6 +34,7 @@ from flows.survey.scene import (
 from flows.survey.seat_budget import SeatBudget
 from flows.survey.survey_model import SurveyModel, vgg_file
 from flows.survey.zones import SurveyZones, open_zones, place_of_field
+from models.network.device import PROCESSOR, choose_device
 from models.policies.vgg_file import VggFile
 from models.weights.familiar_files import FamiliarFile
 from models.weights.files import Description, Weights
@@ -141,6 +142,16 @@ class SurveyRun(CaptureRun):
         return self.load()
 
     @property
+    def device(self) -> str:
+        """Where the network computes."""
+        return self.settings.device
+
+    @property
+    def model_key(self) -> dict[str, Any]:
+        """What is made with the weights depends on: these, and the device, where it is not the processor."""
+        return {"weights": self.weights_key, **({} if self.device == PROCESSOR else {"device": self.device})}
+
+    @property
     def controls(self) -> bool:
         """Whether other placements of seats are judged too; a plain scan that is read whole places none."""
         return self.settings.controls and (not self.plan.plain or self.budget is not None)
@@ -181,6 +192,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     """
     settings = for_rig(settings)
     check_scene_there(settings)
+    settings = replace(settings, device=choose_device(settings.device))
     model = SurveyModel.open(settings, planning=planning)
     described, path = model.described, model.path
     refused = farm_refusal(settings)

@@ -93,7 +93,7 @@ def evaluate(
         (path / RECORD).write_text(to_json(result), encoding="utf-8")  # no NaN, which JSON does not know
 
     params = {
-        "weights": run.weights_key,
+        **run.model_key,
         "labels": array_digest(labels),
         "controls": run.controls,
         "kernel": run.settings.kernel,

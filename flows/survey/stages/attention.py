@@ -49,7 +49,7 @@ def attend(run: SurveyRun, mosaic: StageRef) -> Wanted:
         write_table(path / "plan.json", {name: value for name, value in content.items() if name not in absent})
 
     params = {
-        "weights": run.weights_key,
+        **run.model_key,
         "grid": asdict(run.grid),
         "policy": settings.policy,
         "seed": settings.seed if settings.policy in SEEDED_POLICIES else None,
