@@ -20,6 +20,7 @@ from flows.training.measure_familiar import FamiliarRequest, run_measure_familia
 from flows.training.remember import JUDGED_LANDS, LANDS, MemoryRequest, run_remember
 from flows.training.train_command import asked_command, run_train, usual_crop
 from flows.training.train_scenes import TrainRequest
+from models.network.device import PROCESSOR, Device
 from models.training.memory import MemoryTraining
 from models.training.train import TrainingSettings
 from pipeline.errors import SettingsError
@@ -78,6 +79,7 @@ def train(
     crop: int | None = None,
     batch: int = 4,
     darkest_ms: float = 100.0,
+    device: Device = PROCESSOR,
     labels: str | None = None,
     bands: str | None = None,
     wavelengths: str | None = None,
@@ -150,6 +152,9 @@ def train(
     darkest_ms
         Shortest exposure that the weights are to read: crops are shown with exposures from here to 100 ms, and lines 1,
         2 or 4 px apart; the file then has a record of plain scans, by which `survey --seconds` plans.
+    device
+        Where the network computes: `cpu`, `cuda`, `mps`, or `auto`, the first of the last two that torch can use here,
+        else the processor.
     labels
         For one scene: the file of its labels.
     bands
@@ -201,6 +206,7 @@ def train(
         settings=TrainingSettings(
             steps=steps, minutes=minutes, seed=seed, crop=size, batch=batch, darkest_ms=darkest_ms
         ),
+        device=device,
     )
     record = run_train(request, stderr)
     if as_json:
@@ -230,6 +236,7 @@ def evaluate(
     bands: str | None = None,
     wavelengths: str | None = None,
     controls: bool | None = None,
+    device: Device = PROCESSOR,
     as_json: AsJson = False,
 ) -> int:
     """Judge WEIGHTS on the frames of DATASET that they were not trained on: accuracy, intervals, placement, costs.
@@ -284,6 +291,9 @@ def evaluate(
         For one scene: numbers of the bands to use, from 0, with commas.
     wavelengths
         For one scene: wavelengths of its bands [nm], with commas.
+    device
+        Where the networks of WEIGHTS compute: `cpu`, `cuda`, `mps`, or `auto`, the first of the last two that torch can
+        use here, else the processor. Those of --control compute on the processor.
     controls
         For a run: also judge other placements of the same number of seats; as its survey was asked for by default.
     """
@@ -316,6 +326,7 @@ def evaluate(
         equal_time,
         pooled,
         choices,
+        device,
     )
     run_evaluate(request, stderr, as_json=as_json)
     return 0

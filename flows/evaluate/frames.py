@@ -19,6 +19,7 @@ from flows.survey.scene import check_labels, judged_labels
 from flows.training.data import TrainingData, farm_test_data, only_class, open_training_data
 from flows.training.look import observe_scene
 from models.evaluation.bootstrap import DRAWS
+from models.network.device import PROCESSOR
 from models.network.spectral import patches_of
 from models.policies.policies import NETWORK_POLICIES, POLICIES
 from models.reading.inference import CoarseLook, Glance, glance_of_columns
@@ -57,6 +58,7 @@ class EvaluateRequest:
     equal_time: bool = False
     pooled: bool = True
     choices: dict[str, Any] = field(default_factory=dict)  # of load_data_set: labels, bands, wavelengths
+    device: str = PROCESSOR  # where the networks of surveys compute; or auto
 
 
 def checked_request(request: EvaluateRequest) -> EvaluateRequest:

@@ -30,6 +30,7 @@ from flows.evaluate.series import Record
 from flows.terminal.figures import format_seconds
 from flows.terminal.processes import writing
 from flows.training.data import TrainingData
+from models.network.device import PROCESSOR, choose_device
 from models.weights.files import AnyWeights, Weights, load_any_weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.planning.line_blocks import WIDTHS
@@ -95,6 +96,7 @@ class Work:
     ) -> None:
         self.request, self.data, self.candidates, self.controls = request, data, candidates, controls
         self.camera: LineCamera = candidates[0].camera
+        self.device = choose_device(request.device)
         self.trial = Trial(request.shares, request.policies, request.seed)
         self.kept = KeptResults(None if request.out is None else request.out / "frames")
         self._weights: dict[str, AnyWeights] = {}
@@ -185,6 +187,7 @@ class Work:
             "labels": labels,
             "camera": asdict(self.camera),
             **asdict(self.trial),
+            **({} if self.device == PROCESSOR else {"device": self.device}),
         }
         if task.kind in ("capture", "rig", "equal"):
             own["cost"] = asdict(COST)
@@ -238,5 +241,6 @@ class Work:
 
     def _load(self, one: Candidate) -> AnyWeights:
         if one.key not in self._weights:
-            self._weights[one.key] = load_any_weights(one.path)
+            found = load_any_weights(one.path)
+            self._weights[one.key] = found.on(self.device) if isinstance(found, Weights) else found
         return self._weights[one.key]

@@ -43,7 +43,7 @@ class QuicklookData:
     survey: str
     seed: int
     about: str  # how it was looked at
-    policy: str | None  # that chose the seats; None of a plain scan, which shows all of them
+    policy: str | None  # that chose the seats; None of a plain scan of which all are read
     raw: tuple[NDArray[np.generic], ...]  # sweeps as they came, calibrated, (line, sample, band) each, by strip
     raw_lines: int  # captured in them; a large sweep shows every n-th
     rectified: NDArray[np.floating]  # (y, x, band), NaN where nothing was captured
@@ -60,6 +60,7 @@ class QuicklookData:
     pixel_mrad: float = 0.105714
     along: Axis = "x"  # of the scene along which the raw lines lie
     note: str = ""  # at the end of the title line, such as the accuracy
+    scan: bool = False  # a plain scan, which looked nowhere twice
 
 
 def draw_quicklook(path: str | Path, panels: QuicklookData) -> None:
@@ -131,7 +132,7 @@ def _draw_raw(axes: Axes, data: QuicklookData) -> None:
         left += one.shape[1] + gap
     _show(axes, image if data.along == "x" else image.swapaxes(0, 1))
     axes.set_aspect("auto")
-    count, kind = len(data.raw), "sweep" if data.policy is None else "coarse sweep"
+    count, kind = len(data.raw), "sweep" if data.policy is None or data.scan else "coarse sweep"
     words = f"{count} {kind}{'s' if count != 1 else ''}, {data.raw_lines} lines as they came"
     _caption(axes, "1  Raw lines", words)
 
@@ -182,8 +183,10 @@ def _draw_attention(axes: Axes, data: QuicklookData) -> None:
         axes.add_collection(LineCollection(segments, colors=colour, linewidths=thickness, capstyle="projecting"))
     _frame(axes, (height, width))
     _heat_key(axes, heat)
-    words = f"{len(data.seats)} seats chosen by {data.policy} (cyan); captured in detail (dashed)"
-    _caption(axes, "2  Where it looked twice", words)
+    words = f"{len(data.seats)} seats chosen by {data.policy} (cyan)"
+    if data.scan:
+        return _caption(axes, "2  What is kept in detail", words)
+    return _caption(axes, "2  Where it looked twice", f"{words}; captured in detail (dashed)")
 
 
 def _score_range(score: NDArray[np.floating]) -> tuple[NDArray[np.float64], float, float]:

@@ -27,6 +27,16 @@ class Saving(TypedDict):
     full_is: Literal["measured", "predicted"]
 
 
+class SecondsSaved(Saving):
+    """Seconds of capture: ``full`` is the cheapest scan that is nearly as good as any, by the weights' record.
+
+    Without such a record, and in receipts of before, it is every line at the camera's exposure.
+    """
+
+    full_scan: NotRequired[str]  # in words; with a record alone
+    every_line_s: NotRequired[float]  # what ``full`` was before; with a record alone, and for one version
+
+
 class Split(Saving):
     """Multiply-adds, also told apart by what they were for."""
 
@@ -37,13 +47,13 @@ class Split(Saving):
 
 
 class Savings(TypedDict):
-    """What the run spent against the cheapest full scan."""
+    """What the run spent against every line at full resolution; seconds against a scan that is nearly as good."""
 
     lines: Saving
     samples: Saving
     bytes_raw: Saving
     bytes_stored: Saving
-    capture_s: Saving
+    capture_s: SecondsSaved
     tokens: Saving
     multiply_adds: Split
     segment_wall_s: NotRequired[dict[str, float]]
@@ -104,6 +114,7 @@ class Receipt(TypedDict):
     plan: NotRequired[dict[str, Any]]  # how the fine pass was laid out, and what the other orientation would cost
     scans: NotRequired[dict[str, dict[str, Any]]]  # plain ones by the weights' record, where there is one
     look: NotRequired[dict[str, Any]]  # which part of a remembered field was looked at, and what was expected of it
+    kept: NotRequired[dict[str, Any]]  # only of a plain scan that is kept and read in part: seats, costs of all, asked
     memory: NotRequired[dict[str, Any]]  # what became of what was remembered, where the map goes on from an earlier run
     pointing: NotRequired[dict[str, Any]]  # only where the mirror may look beside the plan
     lines: NotRequired[dict[str, Any]]  # sweeps with lines lost, repeated, out of order, late or invalid
@@ -135,6 +146,7 @@ FINDINGS = (
     "plan",
     "scans",
     "look",
+    "kept",
     "memory",
     "pointing",
     "lines",

@@ -34,6 +34,10 @@ def cost_rows(savings: Savings) -> list[dict[str, Any]]:
         {**entries[name], "label": label, "done": show(entries[name]["done"]), "full": show(entries[name]["full"])}
         for name, (label, show) in COST_LABELS.items()
     ]
+    if (before := entries["capture_s"].get("every_line_s")) is not None:
+        capture = entries["capture_s"]
+        told = {"full": format_seconds(before), "ratio": capture["done"] / before if before else None}
+        rows.insert(1, {**rows[0], **told, "label": "beside every line at full exposure, as before"})
     if "segment_wall_s" in savings:
         done, full = savings["segment_wall_s"]["done"], savings["segment_wall_s"]["full"]
         times = {"done": format_seconds(done), "full": format_seconds(full), "full_is": "measured"}

@@ -36,25 +36,37 @@ def headline(receipt: Receipt, looked_twice: float | None = None) -> str:
         twice = (
             "" if looked_twice is None else f"The camera looked twice at {format_percent(looked_twice)} of the field. "
         )
-    everything = (
-        f"every line of {receipt['settings']['camera']['exposure_ms']:g} ms" if plain else "a scan of everything"
-    )
-    text = (
-        f"{twice}Capture took {format_seconds(capture['done'])} instead of {format_seconds(capture['full'])} "
-        f"for {everything} ({format_percent(capture['ratio'])})."
-    )
+    text = f"{twice}{_capture_words(capture, receipt['settings'], plain=plain)}"
     accuracy = receipt.get("accuracy")
     if accuracy is None:
         return f"{text} The map is not judged yet: its accuracy is added once it is." if is_pending(receipt) else text
-    every = None if plain else accuracy["all"]["miou"]
-    coarse = "" if plain else f"; the coarse look alone gives {format_points(accuracy['none']['miou'])}"
+    whole = plain and "kept" not in receipt  # of which everything is read
+    every = None if whole else accuracy["all"]["miou"]
+    coarse = "" if whole else f"; the coarse look alone gives {format_points(accuracy['none']['miou'])}"
     detail = "" if every is None else f", detail everywhere {format_points(every)}"
     right = accuracy.get("overall_accuracy")
     pixels = "" if right is None else f" ({format_points(right)} % of its pixels are right)"
     return (
         f"{text} The map scores {format_points(accuracy['miou'])} of 100 against the truth{pixels}{coarse}"
-        f"{detail}. {worst_class_words(accuracy, alone=plain)}"
+        f"{detail}. {worst_class_words(accuracy, alone=whole)}"
     ).rstrip()
+
+
+def _capture_words(capture: Mapping[str, Any], settings: Mapping[str, Any], *, plain: bool) -> str:
+    """How long capture took beside the cheapest scan of everything that is nearly as good as any.
+
+    Where the weights have no record that tells which, and in receipts of before, beside every line as long exposed as
+    the camera does.
+    """
+    done, full, share = (*map(format_seconds, (capture["done"], capture["full"])), format_percent(capture["ratio"]))
+    every = f"every line of {settings['camera']['exposure_ms']:g} ms"
+    if "every_line_s" not in capture:
+        return f"Capture took {done} instead of {full} for {every if plain else 'a scan of everything'} ({share})."
+    before = format_seconds(capture["every_line_s"])
+    return (
+        f"Capture took {done}, {share} of the {full} of the cheapest scan that is nearly as good as any "
+        f"({capture['full_scan']}); {every}, which savings were told against before, takes {before}."
+    )
 
 
 def sentences(found: Mapping[str, Any]) -> list[str]:
@@ -77,12 +89,19 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
             words.append(_sentence(plan["orientation"]["sentence"]))
     if look := found.get("look"):
         words.append(_look_words(look))
+    if kept := found.get("kept"):
+        words.append(_kept_words(kept, found.get("accuracy")))
     if memory := found.get("memory"):
         words.append(_memory_words(memory))
     if unknown := found.get("unknown"):
         words.append(_unknown_words(unknown, found.get("accuracy")))
     if scans := found.get("scans"):
         words.append(_scans_words(scans))
+    elif found.get("plan"):
+        words.append(
+            "The weights have no record of plain scans, so that seconds are told beside every line at full exposure; "
+            "train --darkest-ms 3 makes one."
+        )
     for name, one in found.get("pointing", {}).items():
         if isinstance(one, Mapping) and (told := _pointing_words(name, one)):
             words.append(told)
@@ -140,6 +159,22 @@ def _look_words(look: Mapping[str, Any]) -> str:
     if look.get("due_left"):
         text += f" {format_count(look['due_left'])} of {format_count(look['due'])} seats that were due had to wait."
     return text
+
+
+def _kept_words(kept: Mapping[str, Any], accuracy: Mapping[str, Any] | None) -> str:
+    """What part of a plain scan is kept and read in detail, what that takes, and what it cost the map."""
+    read, stored = (kept[name]["done"] / kept[name]["everything"] for name in ("multiply_adds", "bytes"))
+    seats = kept["seats"] / kept["of_seats"] if kept["of_seats"] else 0.0
+    text = (
+        f"{format_percent(seats)} of the seats are kept and read in detail, for {format_percent(read)} of the "
+        f"multiply-adds of reading everything and {format_percent(stored)} of the bytes of keeping it."
+    )
+    every = accuracy["all"]["miou"] if accuracy and accuracy.get("all") else None
+    if accuracy is None or every is None or accuracy["miou"] is None:
+        return text
+    lost = every - accuracy["miou"]
+    by = "cost" if lost >= 0 else "gained"
+    return f"{text} That {by} {format_points(abs(lost))} points of mIoU: everything read scores {format_points(every)}."
 
 
 MOST_CHANGES = 4  # told in words

@@ -17,11 +17,13 @@ from pydantic import Field, PlainValidator, TypeAdapter, ValidationError
 
 from flows.settings.survey_settings import (
     BUILT_IN_SCENES,
+    OF_CHOOSING,
     OF_TWO_PASSES,
     PATHS,
     PLAIN,
     REPLACED,
     RIG_FIELD,
+    SPARING,
     MapChoice,
     Settings,
 )
@@ -243,7 +245,8 @@ def anchor_paths(table: dict[str, object], folder: Path) -> dict[str, object]:
 def _contradictions(given: set[str], origin: Mapping[str, str]) -> Iterator[str]:
     """Settings of a plain scan beside some of a survey in two passes, or those that choose it beside it itself."""
     plain = [place_of(key, origin.get(key)) for key in PLAIN if key in given]
-    passes = [place_of(key, origin.get(key)) for key in OF_TWO_PASSES if key in given]
+    chosen = OF_CHOOSING if given & set(SPARING) else ()
+    passes = [place_of(key, origin.get(key)) for key in OF_TWO_PASSES if key in given and key not in chosen]
     if plain and passes:
         yield (
             f"{plain[0]} asks for one plain scan of the field, and {passes[0]} is for a survey that looks twice; leave "
@@ -266,6 +269,7 @@ def _wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]:
     yield from _scene_wrongs(settings, origin)
     yield from _rig_wrongs(settings)
     yield from _look_wrongs(settings, origin)
+    yield from _sparing_wrongs(settings, origin)
 
 
 def _policy_wrongs(settings: Settings) -> Iterator[str]:
@@ -341,6 +345,25 @@ def _look_wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]
     if settings.refresh is not None and settings.look == LOOK_WHOLE:
         place = place_of("refresh", origin.get("refresh"))
         yield f"{place} says how old a place may become of which a visit looks at a part: give --look part too"
+
+
+def _sparing_wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]:
+    """Budgets of seats where none are chosen: in two passes seconds buy them, and of a part all is read."""
+    given = [place_of(name, origin.get(name)) for name in SPARING if getattr(settings, name) is not None]
+    if given and not settings.plain:
+        yield (
+            f"{given[0]} is for a plain scan, of which a part is kept and read in detail: give --seconds or --scan-step"
+            " too; what a survey in two passes looks at in detail, its --budget says"
+        )
+    if given and settings.look != LOOK_WHOLE:
+        place = place_of("look", origin.get("look"))
+        yield f"{given[0]} chooses among the seats of a whole field, and {place} looks at a part: leave one of them out"
+    if settings.least_gain is not None and settings.policy not in IN_NAT:
+        place = place_of("least_gain", origin.get("least_gain"))
+        yield (
+            f"{place} is a gain [nat], and policy {settings.policy!r} scores in a unit of its own: leave it out, or "
+            f"take --policy {' or '.join(IN_NAT)}"
+        )
 
 
 def place_of(key: str, origin: str | None) -> str:

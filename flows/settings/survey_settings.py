@@ -18,6 +18,8 @@ from flows.settings.values import (
     Bands,
     Budget,
     Bytes,
+    BytesKept,
+    Compute,
     Effects,
     Goal,
     Look,
@@ -32,6 +34,7 @@ from flows.settings.values import (
     Wavelengths,
     parse_tolerance,
 )
+from models.network.device import PROCESSOR, Device
 from models.policies.policies import Policy
 from models.reading.familiar import RATE
 from pipeline.geometry.camera import LineCamera
@@ -47,10 +50,13 @@ from storage.parallel.crew import Crew
 BUILT_IN_SCENES = FARM_NAMES
 USUAL_SIZE = f"{FARM_SHAPE[1]}x{FARM_SHAPE[0]}"
 RIG_FIELD = "field"  # the scene of which only the rig knows more than size and bands
-OF_THE_MACHINE = ("scheduler", "workers")  # no byte depends on them; a cluster of that day need not be there today
+OF_THE_MACHINE = ("scheduler", "workers", "device")  # what of that day need not be there today
 PLAIN = ("seconds", "bytes_raw", "goal", "scan_step")  # settings of which one asks for a plain scan
+SPARING = ("compute", "bytes_kept", "least_gain")  # by which a plain scan is kept and read in detail in part
 OF_TWO_PASSES = ("budget", "coarse_exposure_ms", "policy", "threshold", "mask", "vgg")  # and of which none may
+OF_CHOOSING = ("policy", "mask", "vgg")  # but for these where a part of the scan is chosen
 PATHS = ("scene", "labels", "out", "mask", "vgg", "weights", "zones.area", "zones.no_go", "zones.plots")
+ALL_OF_IT = "leave it out to keep and read all of the scan"
 INSTEAD = "leave it out for a survey in two passes"
 WORKERS = "one process or thread each; leave it out for one a core"
 EPSG = "the number after EPSG:, such as 32632"
@@ -162,6 +168,30 @@ class Settings:
     scan_exposure_ms: float | None = stated(
         None, "Exposure of that scan's lines; by default the camera's", "ms", 0.5, 10_000, example=25.0, why=INSTEAD
     )
+    compute: Compute | None = stated(
+        None,
+        "Of a plain scan read in detail what promises most for so much of the multiply-adds of reading everything, "
+        "25%, or for so many, 4e9; the rest is read from its coarse means",
+        example="25%",
+        why=ALL_OF_IT,
+    )
+    bytes_kept: BytesKept | None = stated(
+        None,
+        "Of a plain scan keep in detail what promises most within so much of the bytes of all its pixels and coarse "
+        "means, 40%, or within so many before compression, 500MB",
+        example="40%",
+        why=ALL_OF_IT,
+    )
+    least_gain: float | None = stated(
+        None,
+        "Of a plain scan keep and read in detail only seats that promise at least so much, for the policies gain and "
+        "entropy",
+        "nat per px",
+        0,
+        100,
+        example=0.02,
+        why=ALL_OF_IT,
+    )
     coarse_exposure_ms: float | None = stated(
         None, "Exposure of a coarse line; by default the camera's", "ms", 0.5, 10_000, example=25.0
     )
@@ -215,6 +245,11 @@ class Settings:
         example=2,
         why=WORKERS,
     )
+    device: Device = stated(
+        PROCESSOR,
+        "Where the network computes; auto is cuda or mps where torch can use one here, else the processor. A map of "
+        "another device is another store: it may differ by rounding",
+    )
     kernel: Kernel = stated("catmull-rom", "How lines are read between samples; nearest mixes no spectra")
     pointing_px: float = stated(
         0.0, "How far off the mirror may point; above 0 sweeps overlap, seams are registered", "px", 0, 300
@@ -256,6 +291,11 @@ class Settings:
     def plain(self) -> bool:
         """Whether the field is scanned once, whole, in the place of a coarse and a fine pass."""
         return any(getattr(self, name) is not None for name in PLAIN)
+
+    @property
+    def sparing(self) -> bool:
+        """Whether a part of a plain scan alone is kept and read in detail."""
+        return any(getattr(self, name) is not None for name in SPARING)
 
     @property
     def unknown_rate(self) -> float | None:

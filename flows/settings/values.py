@@ -91,6 +91,44 @@ def parse_bytes(value: object) -> int:
     return count
 
 
+def parse_compute(value: object) -> str:
+    """A share of what reading everything takes, such as 25%, or a number of multiply-adds such as 4e9."""
+    percent = _parse_percent(value)
+    number = None if isinstance(value, str) and value.strip().endswith("%") else _to_float(value)
+    if percent is None and (number is None or not number >= 1):
+        hint = f"; for {100 * number:g} % write {100 * number:g}%" if number is not None and 0 < number < 1 else ""
+        raise BudgetError(
+            "must be a share of the multiply-adds of reading everything, above 0% and at most 100%, such as 25%, or a "
+            f"number of them such as 4e9; got {value!r}{hint}"
+        )
+    return percent or f"{number!r}"
+
+
+def parse_bytes_kept(value: object) -> str:
+    """A share of the bytes of keeping everything, such as 40%, or bytes, before compression, such as 500MB."""
+    try:
+        return _parse_percent(value) or str(parse_bytes(value))
+    except ValueError:
+        raise BudgetError(
+            "must be a share of the bytes of keeping everything, above 0% and at most 100%, such as 40%, or bytes with "
+            f"a unit such as 500MB; got {value!r}"
+        ) from None
+
+
+def _parse_percent(value: object) -> str | None:
+    """Text such as 25% of a share above 0 and at most all; None of anything else."""
+    text = value.strip() if isinstance(value, str) else ""
+    percent = _to_float(text.removesuffix("%")) if text.endswith("%") else None
+    return f"{percent!r}%".replace(".0%", "%") if percent is not None and 0 < percent <= 100 else None
+
+
+def limit_of(text: str | None, whole: float) -> float:
+    """The number that a limit comes to: that share of the whole, or what it says itself; no end where it is None."""
+    if text is None:
+        return math.inf
+    return float(text.removesuffix("%")) / 100 * whole if text.endswith("%") else float(text)
+
+
 def parse_memory(value: object) -> int:
     """Bytes that a process can do with, as `parse_bytes` reads them."""
     count = parse_bytes(value)
@@ -310,6 +348,8 @@ SceneName = Annotated[str, PlainValidator(parse_scene)]
 Budget = Annotated[float, PlainValidator(parse_budget)]
 Unknown = Annotated[str, PlainValidator(parse_unknown)]
 Goal = Annotated[str, PlainValidator(parse_goal)]
+Compute = Annotated[str, PlainValidator(parse_compute)]
+BytesKept = Annotated[str, PlainValidator(parse_bytes_kept)]
 Bytes = Annotated[int, PlainValidator(parse_bytes)]
 Memory = Annotated[int, PlainValidator(parse_memory)]
 Scheduler = Annotated[str, PlainValidator(parse_scheduler)]

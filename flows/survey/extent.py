@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from math import ceil
 from typing import Any
@@ -12,14 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.survey.field_work import SHARD
+from flows.survey.reading_costs import SHARD, ReadingCosts
 from flows.survey.run import SurveyRun
 from flows.survey.stage import Unit
 from flows.survey.survey import STAGES
 from models.network.cost import MultiplyAdds, multiply_adds
 from models.network.sizes import SegmenterConfig
-from models.policies.policies import IMAGE_POLICIES, NETWORK_POLICIES, SEEING_POLICIES, score_multiply_adds
-from models.reading.regions import Region, plan_regions, whole_field
+from models.reading.regions import plan_regions, whole_field
 from pipeline.errors import PipelineError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
@@ -121,36 +120,26 @@ class Extent:
 def work_done(run: SurveyRun, seats: NDArray[np.integer]) -> MultiplyAdds:
     """Count the scores of the field, and the map drawn with fine patches at these seats.
 
-    Stages keep nothing of the model for each other, so that each reads the coarse look anew: ``glance`` holds what map
-    and scores took for it.
+    Where everything is seen and read nothing is scored.
     """
-    policy, regions = run.settings.policy, plan_regions(run.grid, SHARD)
-    drawn = work_of_map(run, seats)
+    costs = reading_costs(run)
+    chosen = not run.plan.plain or run.budget is not None
+    done = costs.with_scores(seats, run.settings.policy) if chosen else costs.of_map(seats)
     if run.prior is not None and run.reader is not None:
         recalled = run.reader.sizes.multiply_adds(run.grid.height * run.grid.width)
-        drawn = replace(drawn, decode=drawn.decode + recalled)
-    if run.plan.plain:  # where everything is seen nothing is scored
-        return drawn
-    looks = 2 if policy in SEEING_POLICIES and policy not in NETWORK_POLICIES else 1
-    scored = [whole_field(run.grid)] if policy in IMAGE_POLICIES else regions
-    score = sum(_of_region(run, region, 0, policy).score for region in scored)
-    return replace(drawn, glance=looks * drawn.glance, score=score)
+        done = replace(done, decode=done.decode + recalled)
+    return done
 
 
 def work_of_map(run: SurveyRun, seats: NDArray[np.integer]) -> MultiplyAdds:
     """Count the map drawn with fine patches at these seats of the field."""
-    regions = plan_regions(run.grid, SHARD)
-    counts = [int(np.count_nonzero(region.numbers_here(seats) >= 0)) for region in regions]
-    parts = [astuple(_of_region(run, region, count, None)) for region, count in zip(regions, counts, strict=True)]
-    return MultiplyAdds(*(sum(part) for part in zip(*parts, strict=True)))
+    return reading_costs(run).of_map(seats)
 
 
-def _of_region(run: SurveyRun, region: Region, seats: int, policy: str | None) -> MultiplyAdds:
+def reading_costs(run: SurveyRun) -> ReadingCosts:
+    """What it takes to read the field of a survey."""
     channels = 3 if run.vgg is None else run.vgg.channels
-    bands = len(run.scene.wavelength_nm)
-    config = run.described.config
-    score = 0 if policy is None else score_multiply_adds(policy, config, region.grid, channels=channels)
-    return multiply_adds(config, region.grid, seats, bands, score=score)
+    return ReadingCosts(run.described.config, run.grid, len(run.scene.wavelength_nm), channels)
 
 
 MOST_RECORDS = 5  # of a stage that are looked into

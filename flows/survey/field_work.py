@@ -14,10 +14,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flows.survey.reading_costs import SHARD
 from flows.survey.run import SurveyRun
 from flows.survey.survey_model import weights_path
+from models.network.device import PROCESSOR
 from models.network.sizes import saliency_bytes
-from models.policies.policies import IMAGE_POLICIES, NETWORK_POLICIES, score_seats
+from models.policies.policies import GLANCING_POLICIES, IMAGE_POLICIES, score_seats
 from models.policies.vgg_file import VggFile
 from models.reading.familiar import Familiar
 from models.reading.inference import CoarseLook, Glance, look_coarsely, read_glance
@@ -28,7 +30,6 @@ from models.weights.memory_files import load_memory, memory_key, memory_path
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.readings import beyond_range, readings_alone
-from storage.arrays.layout import SHARD_COLUMNS, SHARD_ROWS
 from storage.arrays.mosaics import PATCHES_A_SHARD, PatchStore, mosaic_strips, mosaic_wavelengths
 from storage.arrays.tile_work import RESERVED_BYTES, let_tiles_go
 from storage.parallel.crew import Crew, run_blocks
@@ -43,6 +44,7 @@ class WeightsFile:
 
     path: Path
     key: str
+    device: str = PROCESSOR  # where the network computes
 
     reader_key: str | None = None  # of the reader of memories beside them, where there is one
 
@@ -70,7 +72,7 @@ class WeightsFile:
     @lru_cache(maxsize=1)  # noqa: B019 - the record is a value
     def load(self) -> Weights:
         """Read them, once a process. Raises WeightsError where the file has changed since."""
-        weights = load_weights(self.path)
+        weights = load_weights(self.path).on(self.device)
         if content_key(self.path) != self.key:
             raise WeightsError(f"the weights {self.path} have changed since the survey began; start it again")
         return weights
@@ -90,10 +92,10 @@ class Scoring:
         let_tiles_go()
         weights = self.weights.load()
         look = look_at(weights, self.mosaic, region)
-        if self.policy in IMAGE_POLICIES + NETWORK_POLICIES:  # nothing but the coarse image is asked for
-            seen = Glance(look.grid, look.columns, np.empty((0, 0, 0), np.float32), origin=look.origin)
-        else:
+        if self.policy in GLANCING_POLICIES:
             seen = read_glance(weights, look)
+        else:  # nothing but the coarse image is asked for
+            seen = Glance(look.grid, look.columns, np.empty((0, 0, 0), np.float32), origin=look.origin)
         network = None if self.vgg is None else self.vgg.saliency(weights)
         return region.crop_seats(score_seats(self.policy, seen, network=network))
 
@@ -143,7 +145,6 @@ def seat_columns(
     return seats[:kept], columns[:kept]
 
 
-SHARD = (SHARD_ROWS, SHARD_COLUMNS)
 IMAGE_BYTES = 128  # a coarse pixel, of what a policy of the whole image holds at once beside the columns
 
 
@@ -166,7 +167,7 @@ class FieldWork:
     def of(run: SurveyRun) -> FieldWork:
         """Take from a survey what the regions of its field need."""
         reader, familiar = (None if one is None else one.key for one in (run.reader, run.familiar))
-        file = WeightsFile(weights_path(run.settings).resolve(), run.weights_key, reader, familiar)
+        file = WeightsFile(weights_path(run.settings).resolve(), run.weights_key, run.device, reader, familiar)
         return FieldWork(file, plan_regions(run.grid, SHARD), run.settings.crew, run.settings.memory, run.vgg)
 
     def score(self, policy: str, mosaic: Path, report: Callable[[float], None]) -> NDArray[np.float64]:

@@ -18,6 +18,7 @@ from flows.survey.beyond_training import beyond_training
 from flows.survey.capture_plan import CapturePlan, plan_capture
 from flows.survey.look_choice import LookChoice, choose_look
 from flows.survey.memory import AUTO, NONE, Prior, find_prior
+from flows.survey.reading_costs import ReadingCosts
 from flows.survey.scan_choice import ScanChoice, choose_plain_scan
 from flows.survey.scene import (
     FieldSource,
@@ -30,8 +31,10 @@ from flows.survey.scene import (
     judged_labels,
     open_scene,
 )
+from flows.survey.seat_budget import SeatBudget
 from flows.survey.survey_model import SurveyModel, vgg_file
 from flows.survey.zones import SurveyZones, open_zones, place_of_field
+from models.network.device import PROCESSOR, choose_device
 from models.policies.vgg_file import VggFile
 from models.weights.familiar_files import FamiliarFile
 from models.weights.files import Description, Weights
@@ -125,6 +128,7 @@ class SurveyRun(CaptureRun):
     plan: CapturePlan
     scans: ScanChoice
     zones: SurveyZones  # what the survey keeps to, and plots
+    budget: SeatBudget | None = None  # of seats of a plain scan, where a part of them alone is kept and read
     look: LookChoice | None = None  # the part of a remembered field that is looked at, where one was chosen
     prior: Prior | None = None  # the run whose belief is gone on from
     reader: ReaderFile | None = None  # the reader of memories beside the weights, where there is one
@@ -138,9 +142,19 @@ class SurveyRun(CaptureRun):
         return self.load()
 
     @property
+    def device(self) -> str:
+        """Where the network computes."""
+        return self.settings.device
+
+    @property
+    def model_key(self) -> dict[str, Any]:
+        """What is made with the weights depends on: these, and the device, where it is not the processor."""
+        return {"weights": self.weights_key, **({} if self.device == PROCESSOR else {"device": self.device})}
+
+    @property
     def controls(self) -> bool:
-        """Whether other placements of seats are judged too; a plain scan places none."""
-        return self.settings.controls and not self.plan.plain
+        """Whether other placements of seats are judged too; a plain scan that is read whole places none."""
+        return self.settings.controls and (not self.plan.plain or self.budget is not None)
 
     @cached_property
     def labels(self) -> NDArray[np.uint8] | None:
@@ -178,6 +192,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     """
     settings = for_rig(settings)
     check_scene_there(settings)
+    settings = replace(settings, device=choose_device(settings.device))
     model = SurveyModel.open(settings, planning=planning)
     described, path = model.described, model.path
     refused = farm_refusal(settings)
@@ -203,6 +218,9 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     settings, look, look_notes = choose_look(settings, prior, described, path, model.reader, grid, zones.shown)
     settings, scans = choose_plain_scan(settings, described, path, grid, len(scene.wavelength_nm), zones.shown)
     plan = plan_capture(settings, grid, zones.shown)
+    channels = 3 if model.vgg is None else model.vgg.channels
+    costs = ReadingCosts(described.config, grid, len(scene.wavelength_nm), channels)
+    budget = SeatBudget.asked(settings, costs, None if zones.shares is None else zones.shares > 0)
     simulated, planned = make_source(scene, settings), (*plan.coarse, *plan.full)
     source = field_source(scene, settings, simulated, planned)
     check_memory(settings, simulated, grid, plan)
@@ -225,6 +243,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
         plan=plan,
         scans=scans,
         zones=zones,
+        budget=budget,
         look=look,
         prior=prior,
         reader=model.reader,

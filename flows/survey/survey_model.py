@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
 from flows.settings.values import UNKNOWN_AUTO, UNKNOWN_OFF
+from models.network.device import choose_device
 from models.policies.vgg_file import VggFile
 from models.weights.familiar_files import FamiliarFile, describe_familiar, familiar_path, load_familiar
 from models.weights.files import (
@@ -45,10 +46,10 @@ class SurveyModel:
         """Open those that the settings name; unless for ``planning`` all tensors are read.
 
         Raises WeightsError: what is missing, does not go together, or is not as it was written; SettingsError: no
-        weights are named, and none come with the house for the scene.
+        weights are named, and none come with the house for the scene, or the machine lacks the device.
         """
         path = weights_path(settings)
-        described, load = describe_weights(path), Once(lambda: load_weights(path))
+        described, load = describe_weights(path), Once(lambda: load_weights(path).on(choose_device(settings.device)))
         check_two_scale(described.config, path)
         key = content_key(path)
         reader, familiar = describe_reader(path, described), describe_familiar(path, described, key)

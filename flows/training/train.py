@@ -12,6 +12,7 @@ from flows.training.data import Report, TrainingData, either_mask, open_training
 from flows.training.familiarity import SeenScenes, measured_calibration, save_beside, trained_on
 from flows.training.figures import judge_scans, validate
 from flows.training.train_scenes import About, TrainRequest, as_read, network_config, observe_all, question_labels
+from models.network.device import choose_device
 from models.network.segmenter import Segmenter
 from models.network.sizes import Preset, SegmenterConfig
 from models.network.spectral import Normalisation
@@ -35,11 +36,13 @@ def train_weights(
     """Train, validate and save; give the record that stands in the file. ``tell`` is told what was left out.
 
     Raises SceneError: no labels, one class only, or scenes whose bands or classes differ; SettingsError: a folder to
-    write to that does not exist, a folder in the place of a file, or sizes that do not fit.
+    write to that does not exist, a folder in the place of a file, sizes that do not fit, or a device that the machine
+    lacks.
     """
     checkpoint = request.out.with_name(request.out.name + ".checkpoint")
     _check_places(request.out, checkpoint)
     read_checkpoint(checkpoint)  # refuses a damaged one before minutes are spent
+    device = choose_device(request.device)
     start = open_start(request.init, request.tokens, request.preset)
     data = open_training_data(
         request.dataset,
@@ -70,6 +73,7 @@ def train_weights(
         "settings": asdict(request.settings),
         "camera": asdict(request.camera),
         "training": summary,
+        "device": device,
         **_figures(weights, frames, lesson.looks, request.settings.seed, report),
         **({} if lesson.begun is None else {"begun_from": lesson.begun.record}),
     }
@@ -126,6 +130,7 @@ def _learned(
         start=None if lesson.begun is None else lesson.begun.state,
         looks=lesson.looks,
         checkpoint=checkpoint,
+        device=choose_device(request.device),
     )
     about = lesson.about
     return AnyWeights(model, about.basis, lesson.normalisation, about.names, about.colours), summary

@@ -55,11 +55,11 @@ def oracle_gain(
     model, first = weights.segmenter.eval(), 0
     with torch.inference_mode():
         (reading,) = readings_of(weights, [seen])
-        numbers = torch.from_numpy(seats)
+        numbers = torch.from_numpy(seats).to(model.device)
         for after in model.read_fine_packed([reading], [patches], [numbers], [origin_of(seen)]):
             some = seats[first : first + len(after)]
             before = model.seat_windows(reading.logits, numbers[first : first + len(after)][None])
-            lower = _losses(before.numpy(), truth[some]) - _losses(after.numpy(), truth[some])
+            lower = _losses(before.cpu().numpy(), truth[some]) - _losses(after.cpu().numpy(), truth[some])
             gain[some] = lower.sum(axis=(1, 2)) / p**2
             first += len(after)
     return np.clip(gain, -MOST_GAIN, MOST_GAIN)

@@ -73,6 +73,11 @@ class Segmenter(nn.Module):
         self.fine_classes = nn.Conv2d(config.width, config.classes, 1)
         self.scorer = SeatScorer(config)
 
+    @property
+    def device(self) -> torch.device:
+        """Where its numbers lie, and it computes."""
+        return self.scale_code.device
+
     def forward(
         self, coarse: Tensor, fine: Tensor, seats: Tensor, origin: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
@@ -93,7 +98,7 @@ class Segmenter(nn.Module):
 
     def code_coarse(self, tokens: Tensor, rows: int, columns: int, origin: Tensor | None = None) -> Tensor:
         """Tokens of ``rows`` x ``columns`` coarse patches a scene, (B * P, m^2, d), with codes, (B, P m^2, d)."""
-        cells = torch.cartesian_prod(torch.arange(rows), torch.arange(columns)).to(tokens.device)
+        cells = torch.cartesian_prod(torch.arange(rows), torch.arange(columns))
         patches = tokens.view(-1, rows * columns, *tokens.shape[1:])
         return self._coded(patches, cells.expand(len(patches), -1, -1), columns, origin, fine=False)
 
@@ -132,6 +137,8 @@ class Segmenter(nn.Module):
         if not images:
             return []
         p = self.config.patch
+        images = [image.to(self.device) for image in images]
+        living = [None if alive is None else alive.to(self.device) for alive in living]
         sizes = [(image.shape[2] // p, image.shape[3] // p) for image in images]
         counts = [rows * columns for rows, columns in sizes]
         patches = torch.cat([cut(image, p)[0] for image in images])
@@ -166,9 +173,10 @@ class Segmenter(nn.Module):
         Of each scene: its reading, patches (K, p, p, J), in which what is not finite counts as 0, the median, and the
         numbers (K,) int64 of their seats.
         """
-        described = [self.fine_stem(chunk) for chunk in _chunks(patches)]
+        described = [self.fine_stem(chunk.to(self.device)) for chunk in _chunks(patches)]
         if not described:
             return
+        seats = [own.to(self.device) for own in seats]
         tokens = torch.split(torch.cat([token for _, token in described]), [len(own) for own in seats])
         coded = [
             self.code_fine(token[None], own[None], reading.columns, origin)[0]
@@ -194,15 +202,17 @@ class Segmenter(nn.Module):
         ``places`` (B, P, 2) are rows and columns of patches: of seats where ``fine``, else of coarse patches.
         """
         side, step = self.config.token_side, 1 if fine else self.config.factor
-        within = (torch.arange(side, device=places.device).double() + 0.5) / side
+        exact = torch.device("cpu") if tokens.device.type == "mps" else tokens.device  # that knows no float64
+        places, origin = places.to(exact), None if origin is None else origin.to(exact)
+        within = (torch.arange(side, device=exact).double() + 0.5) / side
         inside = torch.cartesian_prod(within, within).view(-1, 2)
         yx = (places.double()[:, :, None] + inside) * step  # centres in seat units, (B, P, m^2, 2)
         if self.config.positions == "paper":
-            scale = torch.full(yx.shape[:-1], 0.0 if fine else 1.0, device=yx.device)
+            scale = torch.full(yx.shape[:-1], 0.0 if fine else 1.0, device=exact)
             code = code_1d(paper_numbers(yx, scale, columns, self.config.factor), self.config.dim)
         else:
             code = code_2d(yx if origin is None else yx + origin[:, None, None].double(), self.config.dim)
-        coded: Tensor = tokens + code + self.scale_code[int(fine)]
+        coded: Tensor = tokens + code.to(tokens.device) + self.scale_code[int(fine)]
         return coded.flatten(1, 2)
 
     def canvas_windows(self, canvas: Tensor, seats: Tensor) -> Tensor:

@@ -232,6 +232,7 @@ NetworkScore = Callable[[CoarseLook], NDArray[np.float64]]  # (y, x) of the padd
 NETWORK_POLICIES = ("vgg-static", "vgg-trained")  # by the coarse image alone, through a network of the user's
 # by what lies around each pixel: a large field may be scored in parts
 SEEING_POLICIES = ("gain", "self-attention", *_PIXEL_SCORES, *NETWORK_POLICIES)
+GLANCING_POLICIES = ("gain", "self-attention", "entropy", "margin")  # those that ask what the network made of it
 IMAGE_POLICIES = tuple(_IMAGE_SCORES)  # by the coarse image of the whole field at once; the glance is not needed
 SEEDED_POLICIES = ("random", "stratified")
 

@@ -173,23 +173,23 @@ def read_glance(weights: Weights, look: CoarseLook, *, precision: Precision = "f
 def glance_batch(weights: Weights, looks: Sequence[CoarseLook], *, precision: Precision = "float32") -> list[Glance]:
     """Read coarse looks of any sizes, each alone, their patches packed; as ``read_glance`` one by one, but faster."""
     seen: list[Glance] = []
-    with torch.inference_mode(), _computing_in(precision):
+    with torch.inference_mode(), _computing_in(precision, weights):
         for part in packs([_patches_in(look) for look in looks]):
             with queries_kept() as queries:
                 readings = _read_coarse(weights, looks[part])
             asked = torch.split(queries[-1], [reading.memory[-1][0].shape[2] for reading in readings], dim=2)
             for look, reading, own in zip(looks[part], readings, asked, strict=True):
-                keys = reading.memory[-1][0][0].float().numpy()
+                keys = reading.memory[-1][0][0].float().cpu().numpy()
                 seen.append(
                     Glance(
                         look.grid,
                         look.columns,
-                        np.ascontiguousarray(reading.logits[0].float().softmax(dim=0).permute(1, 2, 0).numpy()),
+                        np.ascontiguousarray(reading.logits[0].float().softmax(dim=0).permute(1, 2, 0).cpu().numpy()),
                         origin=look.origin,
                         living=look.living,
-                        gain=weights.segmenter.score(reading)[0].float().numpy(),
+                        gain=weights.segmenter.score(reading)[0].float().cpu().numpy(),
                         read=Read(weights.segmenter, look.columns, look.origin, reading, precision, look.living),
-                        tokens=TokenReading(own[0].float().numpy(), keys, weights.config.token_side, look.living),
+                        tokens=TokenReading(own[0].float().cpu().numpy(), keys, weights.config.token_side, look.living),
                     )
                 )
     return seen
@@ -232,7 +232,7 @@ def segment_batch(
         numbers = np.asarray(given, np.int64)
         check_patches(own, numbers, look.grid, weights.config)
         scenes.append((look, *captured(own, numbers)))
-    with torch.inference_mode(), _computing_in(precision):
+    with torch.inference_mode(), _computing_in(precision, weights):
         counts = [_patches_in(look) + len(numbers) for look, _, numbers in scenes]
         return [drawn for part in packs(counts) for drawn in _draw_pack(weights, scenes[part], precision, every_class)]
 
@@ -247,7 +247,7 @@ def _draw_pack(
     looks = [look for look, _, _ in pack]
     readings = readings_of(weights, looks, precision=precision)
     padded = [
-        draw_coarse(_tempered(reading.logits.float(), weights), look.grid, every_class=every_class)
+        draw_coarse(_tempered(reading.logits.float().cpu(), weights), look.grid, every_class=every_class)
         for reading, look in zip(readings, looks, strict=True)
     ]
     places = (
@@ -258,7 +258,7 @@ def _draw_pack(
     parts = [own for _, own, _ in pack], [torch.from_numpy(seats) for *_, seats in pack]
     p = weights.config.patch
     for read in weights.segmenter.eval().read_fine_packed(readings, *parts, [origin_of(look) for look in looks]):
-        logits = _tempered(read.float(), weights)
+        logits = _tempered(read.float().cpu(), weights)
         confidence, classes = (part.numpy() for part in decide(logits, dim=1))
         every = logits.log_softmax(dim=1).permute(0, 2, 3, 1).numpy() if every_class else confidence
         for sure, values, own, (drawn, (y, x)) in zip(confidence, classes, every, places, strict=False):
@@ -310,11 +310,11 @@ def _patches_in(look: CoarseLook) -> int:
 
 
 @contextmanager
-def _computing_in(precision: Precision) -> Iterator[None]:
+def _computing_in(precision: Precision, weights: Weights) -> Iterator[None]:
     if precision == "float32":
         yield
         return
-    with torch.autocast("cpu", dtype=torch.bfloat16), warnings.catch_warnings():
+    with torch.autocast(weights.segmenter.device.type, dtype=torch.bfloat16), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Mismatch dtype between input and weight")  # slower, not less exact
         yield
 

@@ -116,6 +116,10 @@ class Batch:
     labels: Tensor  # (B, y, x) int64
     origin: Tensor  # (B, 2) random offsets of the places [seats]
 
+    def on(self, device: str) -> Batch:
+        """The same where a device computes."""
+        return Batch(*(one.to(device) for one in (self.coarse, self.fine, self.labels, self.origin)))
+
 
 class CropSampler:
     """Draws random crops: place, flips, transposition, brightness and noise all come from the given generator."""

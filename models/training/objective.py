@@ -100,7 +100,7 @@ def control_loss(model: Control, batch: Batch, weight: Tensor, rng: np.random.Ge
         seats = draw_paper_seats(batch.coarse, every, model.config, rng)
         fine = batch.fine.gather(1, seats[:, :, None, None, None].expand(-1, -1, *batch.fine.shape[2:]))
     else:
-        seats, fine = torch.arange(every).expand(count, -1), batch.fine
+        seats, fine = torch.arange(every, device=batch.fine.device).expand(count, -1), batch.fine
     logits = model.draw(batch.coarse, fine, seats, batch.origin)
     return map_loss(logits, pixel_losses(logits, batch.labels), batch.labels, weight, soft_dice=soft_dice)
 
@@ -113,7 +113,7 @@ def draw_paper_seats(coarse: Tensor, every: int, config: SegmenterConfig, rng: n
     """
     shares, odds = zip(*SHARES, strict=True)
     share = 0.0 if rng.random() < WITHOUT_SEATS else float(rng.choice(shares, p=odds))
-    worth = torch.from_numpy(rng.random((len(coarse), every))).float()
+    worth = torch.from_numpy(rng.random((len(coarse), every))).float().to(coarse.device)
     if rng.random() < 0.5:
         down = coarse.new_tensor([[-1.0, -2.0, -1.0], [0.0, 0.0, 0.0], [1.0, 2.0, 1.0]])
         brightness = F.pad(coarse.mean(dim=1, keepdim=True), (1, 1, 1, 1), mode="replicate")
@@ -133,7 +133,7 @@ def draw_seats(
     """
     shares, odds = zip(*SHARES, strict=True)
     count = max(1, round(float(rng.choice(shares, p=odds)) * score.shape[1]))
-    chance = torch.from_numpy(rng.random(score.shape)).to(score.dtype)
+    chance = torch.from_numpy(rng.random(score.shape)).to(score.dtype).to(score.device)
     placed = rng.choice(3, p=(phase.random, phase.entropy, phase.gain))
     if placed == 1:
         entropy = torch.special.entr(glance.float().softmax(dim=1)).sum(dim=1)

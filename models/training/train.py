@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from models.network.controls import Network, build_network
+from models.network.device import PROCESSOR
 from models.network.process import keep_freed_memory
 from models.network.sizes import SegmenterConfig
 from models.training.examples import Batch, CropSampler, Example
@@ -84,8 +85,9 @@ class Trainer:
         settings: TrainingSettings,
         start: Mapping[str, Tensor] | None = None,
         looks: Looks | None = None,
+        device: str = PROCESSOR,
     ) -> None:
-        self.settings, self.gain_shift = settings, gain_shift
+        self.settings, self.gain_shift, self.device = settings, gain_shift, device
         self.rng = np.random.default_rng([settings.seed, 0x7EA])
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(settings.seed)
@@ -94,7 +96,7 @@ class Trainer:
             strange = self.model.load_state_dict(start, strict=False).unexpected_keys
             if strange:
                 raise WeightsError(f"{config.preset} has no place for {len(strange)} tensors, the first {strange[0]}")
-        self.model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.model.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.averaged = copy.deepcopy(self.model).eval()
         parameters = list(self.model.parameters())  # matrices and kernels decay, gains and shifts do not
         groups: list[dict[str, object]] = [
@@ -108,7 +110,7 @@ class Trainer:
             self.samplers[larger] = CropSampler(
                 examples, config.patch, config.factor, crop, noise=settings.noise, looks=looks
             )
-        self.weight = class_weights(examples, config.classes, settings.weight_cap)
+        self.weight = class_weights(examples, config.classes, settings.weight_cap).to(device)
         self.course = Course()
         self.batch: Batch | None = None  # of the last step
         self._started, self._worked = time.monotonic(), time.process_time()
@@ -131,7 +133,7 @@ class Trainer:
         sampler = self.samplers[phase.larger]
         fewer = phase.larger if sampler.size > self.samplers[1].size else 1  # small scenes have no larger crops
         count = max(1, self.settings.batch // fewer)
-        self.batch = batch = sampler.draw(count, self.rng, self.gain_shift)
+        self.batch = batch = sampler.draw(count, self.rng, self.gain_shift).on(self.device)
         if not (batch.labels != UNLABELLED).any():  # nothing to learn; decay and momentum would move the weights
             course.step, course.unlabelled = course.step + 1, course.unlabelled + 1
             return
@@ -220,6 +222,7 @@ def train(
     looks: Looks | None = None,
     checkpoint: Path | None = None,
     keep_every_s: float = KEEP_EVERY_S,
+    device: str = PROCESSOR,
 ) -> tuple[Network, dict[str, float | int]]:
     """Train the network that ``config`` names; give its averaged weights and a summary (steps, last loss, seconds).
 
@@ -227,13 +230,14 @@ def train(
     to rounding only: sums differ in their last bit with where memory lies, and ``minutes`` may end the run elsewhere.
 
     ``start``: Named tensors that the network begins with; others are drawn. ``checkpoint``: File that the state is kept
-    in; a killed run of the same settings and examples goes on from it.
+    in; a killed run of the same settings and examples goes on from it. ``device``: where it computes, by
+    `models.network.device.choose_device`; the network that is given lies in the processor's memory again.
 
     Raises TrainingError where: the loss or its gradient was not finite three steps in a row; the last batch is kept
     beside the checkpoint. WeightsError : a tensor of ``start`` that the network has no place for.
     """
     keep_freed_memory()
-    trainer = Trainer(config, examples, gain_shift, settings, start, looks)
+    trainer = Trainer(config, examples, gain_shift, settings, start, looks, device)
     identity = run_identity(config, examples, settings, start)
     if checkpoint is not None:
         trainer.go_on(checkpoint, identity)
@@ -251,7 +255,7 @@ def train(
         if checkpoint is not None and time.monotonic() - kept >= keep_every_s:
             trainer.keep(checkpoint, identity)
             kept = time.monotonic()
-    return trainer.averaged, trainer.summary()
+    return trainer.averaged.to(PROCESSOR), trainer.summary()
 
 
 def run_identity(

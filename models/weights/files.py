@@ -104,6 +104,11 @@ class Weights(AnyWeights):
 
     network: Segmenter
 
+    def on(self, device: str) -> Weights:
+        """The same where it computes on a device of this machine, by `models.network.device.choose_device`."""
+        self.network.to(device)
+        return self
+
     @property
     def segmenter(self) -> Segmenter:
         """The network."""

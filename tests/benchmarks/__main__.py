@@ -34,7 +34,9 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("names", nargs="*", help="benchmarks to run, as in bench_NAME.py; all where none is given")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the table as Markdown as well")
     asked = parser.parse_args(arguments)
-    there = sorted(path.stem.removeprefix("bench_") for path in HERE.glob("bench_*.py"))
+    found = list(HERE.glob("**/bench_*.py"))
+    sys.path[:0] = sorted({str(path.parent) for path in found})
+    there = sorted(path.stem.removeprefix("bench_") for path in found)
     unknown = sorted(set(asked.names) - set(there))
     if unknown:
         parser.error(f"no benchmark {', '.join(unknown)}; there are: {', '.join(there)}")

@@ -65,7 +65,7 @@ def rows() -> list[Row]:
         found.append((_seconds(one), Row(name, _figure(one), goal, _mean(one) >= best - slack)))
 
     for seconds in SECONDS:
-        scan = _chosen(SHAPE, seconds)
+        scan = chosen_scan(SHAPE, seconds)
         judged = [_plain(seed, scan.step, scan.exposure_ms, SHAPE) for seed in SEEDS]
         beside(f"survey --seconds {seconds:g}: {_promise(scan)}", judged, SLACK)
     for budget in BUDGETS:
@@ -78,20 +78,20 @@ def rows() -> list[Row]:
 def large_rows(shape: tuple[int, int], goals: dict[float, float]) -> Iterator[Row]:
     """The map of `survey --seconds` on farms of (y, x) px, for each of the seconds, beside a goal in mIoU."""
     for seconds, goal in goals.items():
-        scan = _chosen(shape, seconds)
+        scan = chosen_scan(shape, seconds)
         judged = [_plain(seed, scan.step, scan.exposure_ms, shape) for seed in SEEDS]
         met = _mean(judged) >= goal
         yield Row(f"--seconds {seconds:g}: {_promise(scan)}", _figure(judged), f">= {goal}", met)
 
 
 @cache
-def _weights() -> Weights:
+def shipped() -> Weights:
     return load_weights(WEIGHTS)
 
 
-def _chosen(shape: tuple[int, int], seconds: float) -> PlainScan:
+def chosen_scan(shape: tuple[int, int], seconds: float) -> PlainScan:
     """The scan that a survey of so many seconds takes."""
-    weights = _weights()
+    weights = shipped()
     grid = SceneGrid(*shape, weights.config.patch, weights.config.factor)
     along, _, _ = cheapest_full(grid, CAMERA, COST)
     record = ScanRecord.read(weights.record["scans"])
@@ -120,7 +120,7 @@ def _figure(judged: Judged) -> str:
 @cache
 def _plain(seed: int, step: int, exposure_ms: float, shape: tuple[int, int]) -> tuple[float, float]:
     """Seconds of the camera and mIoU of the map of a plain scan."""
-    weights = _weights()
+    weights = shipped()
     scene, rig = farm_scene(seed, shape, camera=CAMERA), Rig(CAMERA)
     grid = SceneGrid(*shape, weights.config.patch, weights.config.factor)
     along, _, _ = cheapest_full(grid, CAMERA, COST)

@@ -21,7 +21,8 @@ from rich.console import Console
 
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
-from flows.survey.field_work import SHARD, FieldWork, WeightsFile
+from flows.survey.field_work import FieldWork, WeightsFile
+from flows.survey.reading_costs import SHARD
 from flows.survey.run import SurveyRun, open_run
 from models.evaluation.metrics import confusion, mean_iou
 from models.network.process import use_one_thread

@@ -219,7 +219,7 @@ def check_python(program: str, given: list[str], place: str) -> None:
     assert (ROOT / given[0]).exists(), f"{place}: there is no {given[0]}"
     if program == "python" and given[0] == "tests/benchmarks":
         asked = {word for word in given[1:] if not word.startswith("-") and word.islower()}
-        there = {path.stem.removeprefix("bench_") for path in (ROOT / given[0]).glob("bench_*.py")}
+        there = {path.stem.removeprefix("bench_") for path in (ROOT / given[0]).glob("**/bench_*.py")}
         assert asked <= there, f"{place}: no benchmark {asked - there}"
 
 

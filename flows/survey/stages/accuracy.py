@@ -47,6 +47,7 @@ from storage.archive.keys import StageRef, array_digest
 from storage.archive.manifests import read_table
 from storage.archive.whole_files import to_json
 from storage.arrays.class_maps import load_class_map
+from storage.arrays.mosaics import open_patches
 
 RECORD = "accuracy.json"
 ACCURACY = Product("evaluate", version=9, files=(RECORD,), by_weights=True)
@@ -92,7 +93,7 @@ def evaluate(
         (path / RECORD).write_text(to_json(result), encoding="utf-8")  # no NaN, which JSON does not know
 
     params = {
-        "weights": run.weights_key,
+        **run.model_key,
         "labels": array_digest(labels),
         "controls": run.controls,
         "kernel": run.settings.kernel,
@@ -135,7 +136,7 @@ def _controls(
 ) -> dict[str, Any]:
     columns = columns_of_all_seats(
         run.simulated,
-        run.plan.full,
+        run.plan.coarse if run.plan.plain else run.plan.full,
         run.grid,
         run.weights,
         memory=run.settings.memory,
@@ -151,7 +152,14 @@ def _controls(
 
     among = None if run.zones.shares is None else run.zones.shares > 0
     controls = run_controls(
-        run.weights, seen, columns, labels, share=CONTROL_SHARE, seed=run.settings.seed, among=among, report=report
+        run.weights,
+        seen,
+        columns,
+        labels,
+        share=_control_share(run, patches),
+        seed=run.settings.seed,
+        among=among,
+        report=report,
     )
     figures = _figures(run, controls.every)
     return {
@@ -163,18 +171,29 @@ def _controls(
     }
 
 
+def _control_share(run: SurveyRun, patches: StageRef) -> float:
+    """Share of the valid seats that other placements get; of a plain scan as many as were kept of it."""
+    if run.budget is None:
+        return CONTROL_SHARE
+    return len(open_patches(patches.path / "patches.zarr").seats) / len(run.budget.seats)
+
+
 def _controls_mode(run: SurveyRun, seen: Glance, controls: Controls) -> dict[str, Any]:
     """What the controls' seats are, and what those of most gain would cost the rig: seats are not lines."""
     grid, share, shares = run.grid, run.grid.valid_share().ravel(), run.zones.shares
     seats = frame_seats(score_seats("gain", seen), controls.share, (share if shares is None else shares) > 0).seats
     fine = share[seats].sum() * grid.patch**2  # samples beside the scene do not count
-    price = price_of_seats(grid, run.camera, run.settings.cost, run.plan.along, seats)
-    coarse_lines, full_lines = count_lines(run.plan.coarse), count_lines(run.plan.full)
-    return {
+    mode = {
         "mode": "frame",
         "share_of_seats": controls.share,
         "seats": controls.seats,
         "share_of_samples": (fine + np.prod(grid.coarse_shape)) / (grid.height * grid.width),
+    }
+    if run.plan.plain:  # whose lines are those of every placement
+        return mode
+    price = price_of_seats(grid, run.camera, run.settings.cost, run.plan.along, seats)
+    coarse_lines, full_lines = count_lines(run.plan.coarse), count_lines(run.plan.full)
+    return mode | {
         "share_of_lines": (coarse_lines + price.lines) / full_lines,
         "share_of_seconds": (run.plan.coarse_s + price.seconds) / run.plan.full_s,
     }

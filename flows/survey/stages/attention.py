@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flows.settings.survey_settings import SPARING
 from flows.settings.values import LOOK_WHOLE
 from flows.survey.field_work import FieldWork, region_params
 from flows.survey.run import SurveyRun
+from flows.survey.seat_budget import SeatBudget
 from flows.survey.stage import Product, Wanted, stage
 from models.policies.policies import IMAGE_POLICIES, SEEDED_POLICIES, SEEING_POLICIES, score_seats
 from models.reading.inference import Glance
@@ -36,7 +38,7 @@ def attend(run: SurveyRun, mosaic: StageRef) -> Wanted:
     def build(path: Path) -> None:
         """Write every seat's score and rank, and the plan of sweeps; refuse a map that does not fit."""
         work = FieldWork.of(run)
-        scores, plan = _whole_field(run) if run.plan.plain else _scored(run, work, mosaic)
+        scores, plan = _planned(run, work, mosaic)
         work.crew_for(plan.seats, len(run.scene.wavelength_nm))  # refuses what does not fit before the rig goes back
         rank = np.full(scores.shape, -1, np.int32)
         rank[plan.seats[np.argsort(-scores[plan.seats], kind="stable")]] = np.arange(len(plan.seats))
@@ -47,7 +49,7 @@ def attend(run: SurveyRun, mosaic: StageRef) -> Wanted:
         write_table(path / "plan.json", {name: value for name, value in content.items() if name not in absent})
 
     params = {
-        "weights": run.weights_key,
+        **run.model_key,
         "grid": asdict(run.grid),
         "policy": settings.policy,
         "seed": settings.seed if settings.policy in SEEDED_POLICIES else None,
@@ -62,19 +64,22 @@ def attend(run: SurveyRun, mosaic: StageRef) -> Wanted:
         **({} if run.vgg is None else {"vgg": run.vgg.key}),
         **({} if settings.threshold is None else {"threshold": settings.threshold}),
         **({"plain": True} if run.plan.plain else {}),
+        **({} if run.budget is None else {"seats": {name: getattr(settings, name) for name in SPARING}}),
         **run.zones.key,
     }
     return Wanted(build, params, [mosaic])
 
 
-def _scored(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> tuple[NDArray[np.float64], FinePlan]:
-    """Scores of the seats, and the runs of lines that show most of them in the time left.
+def _planned(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> tuple[NDArray[np.float64], FinePlan]:
+    """Scores of the seats where some are chosen, and what is seen of the field in detail."""
+    if not run.plan.plain:
+        return _scored(run, work, mosaic)
+    return _whole_field(run) if run.budget is None else _part_of_scan(run, run.budget, work, mosaic)
 
-    A seat counts by the share of it that zones leave; what is seen of the others beside it is not asked for.
-    """
-    scores, shares = _scores(run, work, mosaic), run.zones.shares
-    if shares is not None:
-        scores = np.where(shares > 0, scores, 0.0) * shares
+
+def _scored(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> tuple[NDArray[np.float64], FinePlan]:
+    """Scores of the seats, and the runs of lines that show most of them in the time left."""
+    scores = _scores_within_zones(run, work, mosaic)
     plan = plan_fine(
         run.grid,
         run.camera,
@@ -93,6 +98,31 @@ def _kept_seats(run: SurveyRun, plan: FinePlan) -> FinePlan:
     """The plan with the seats alone of which zones leave something."""
     shares = run.zones.shares
     return plan if shares is None else replace(plan, seats=plan.seats[shares[plan.seats] > 0])
+
+
+def _part_of_scan(
+    run: SurveyRun, budget: SeatBudget, work: FieldWork, mosaic: StageRef
+) -> tuple[NDArray[np.float64], FinePlan]:
+    """Scores of the seats, and those of a plain scan that the budget pays for: all were seen, some are kept."""
+    scores, every = _scores_within_zones(run, work, mosaic), _whole_field(run)[1]
+    bought = budget.choose(scores)
+    s = run.grid.factor
+    reason = (
+        f"{every.reason}; {len(bought)} of {len(budget.seats)} seats are kept and read in detail, the others as means "
+        f"of {s} x {s} px"
+    )
+    told = np.where(np.isfinite(scores), scores, 0.0)
+    worth, wanted = float(told[bought].sum()), float(np.maximum(told, 0.0).sum())
+    return scores, replace(every, seats=np.sort(bought), reason=reason, worth=worth, wanted_worth=wanted)
+
+
+def _scores_within_zones(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> NDArray[np.float64]:
+    """(seat,) worth of a fine look at each seat, by the share of it that zones leave.
+
+    What is seen of the others beside it is not asked for.
+    """
+    scores, shares = _scores(run, work, mosaic), run.zones.shares
+    return scores if shares is None else np.where(shares > 0, scores, 0.0) * shares
 
 
 def _whole_field(run: SurveyRun) -> tuple[NDArray[np.float64], FinePlan]:
@@ -155,6 +185,8 @@ def compare_turned(run: SurveyRun, mosaic: StageRef, attention: StageRef) -> Wan
     def build(path: Path) -> None:
         """Write what the plan would be with turned lines, and the sentence that tells of it."""
         scores = load_attention(attention.path / "attention.zarr").score.ravel()
+        if run.plan.plain:  # whose seats are chosen free of lines
+            scores = np.zeros_like(scores)
         rows = find_rows(mosaic_brightness(mosaic.path / "mosaic.zarr"))
         turned = compare_orientations(
             run.grid,

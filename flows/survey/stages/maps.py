@@ -66,13 +66,7 @@ def draw_map(run: SurveyRun, mosaic: StageRef, patches: StageRef) -> Wanted:
         (path / LEFT_OUT).unlink(missing_ok=True)
 
     prior, unknown = run.prior, _unknown_rule(run)
-    params = {
-        "weights": run.weights_key,
-        "grid": asdict(run.grid),
-        **region_params(run.grid),
-        **run.place_key,
-        **run.zones.key,
-    }
+    params = {**run.model_key, "grid": asdict(run.grid), **region_params(run.grid), **run.place_key, **run.zones.key}
     if run.familiar is not None and unknown is not None:
         params["unknown"] = {"familiar": run.familiar.key, **asdict(unknown)}
     if run.settings.look != LOOK_WHOLE:

@@ -269,7 +269,7 @@ def cut_patches(
             grid=run.angular_grid(),
         )
         cache = LineCache(run.settings.memory // CACHE_SHARE)
-        if run.plan.plain:
+        if run.plan.plain and len(ordered):
             _cut_everything(run, sighted(run, raw, _only(registration)), writer, ordered, cache)
             return
         sweeps = [one.placed(run.camera) for one in sighted(run, raw, _only(registration))]

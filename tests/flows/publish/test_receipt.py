@@ -272,3 +272,24 @@ def test_page_has_the_figures():
     Page(page)
     assert "How good the map is" not in page
     assert "field $title" in page
+
+
+def test_seconds_stand_beside_the_cheapest_good_scan_and_beside_every_line_as_before():
+    """With a record both are told, on a line of the table each; without one the old comparison alone."""
+    receipt = make_receipt()
+    assert "at full exposure" not in _printed(receipt, 200)
+    receipt["savings"]["capture_s"] |= {
+        "done": 30.0,
+        "full": 40.0,
+        "ratio": 0.75,
+        "full_scan": "every line, 17 ms",
+        "every_line_s": 200.0,
+    }
+    text = headline(receipt)
+    assert "Capture took 30 s, 75 % of the 40 s of the cheapest scan that is nearly as good as any" in text
+    assert "(every line, 17 ms); every line of 100 ms, which savings were told against before, takes 200 s." in text
+    now, before = (
+        line.split() for line in _printed(receipt, 200).splitlines() if "30 s" in line and "predicted" in line
+    )
+    assert now[-3:-1] == ["75", "%"]
+    assert before[-3:-1] == ["15", "%"]

@@ -101,12 +101,13 @@ def _run(side: int, policy: str, *, plain: bool = False) -> SurveyRun:
         settings=SimpleNamespace(policy=policy),
         plan=SimpleNamespace(plain=plain),
         prior=None,
+        budget=None,
     )
     return cast("SurveyRun", made)
 
 
 @pytest.mark.parametrize(
-    ("policy", "looks"), [("gain", 2), ("sobel", 2), ("random", 1), ("saliency", 1), ("vgg-static", 1)]
+    ("policy", "looks"), [("gain", 2), ("entropy", 2), ("sobel", 1), ("random", 1), ("saliency", 1), ("vgg-static", 1)]
 )
 def test_a_policy_that_asks_the_glance_reads_the_coarse_look_once_more(policy: str, looks: int) -> None:
     """The map reads it anyway, from what is stored; scores of the glance read it before that."""

@@ -13,7 +13,8 @@ import pytest
 from flows.settings.load import load_settings
 from flows.survey.drawing import Drawing, draw_field
 from flows.survey.field_memory import FieldMemory
-from flows.survey.field_work import SHARD, FieldWork, Scoring, WeightsFile, region_params
+from flows.survey.field_work import FieldWork, Scoring, WeightsFile, region_params
+from flows.survey.reading_costs import SHARD
 from flows.survey.run import SurveyRun, open_run
 from models.reading.regions import Region, plan_regions, whole_field
 from pipeline.errors import SettingsError, WeightsError

@@ -17,7 +17,8 @@ from flows.publish.receipt_words import sentences
 from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings, parse_settings
-from flows.survey.field_work import SHARD, FieldWork
+from flows.survey.field_work import FieldWork
+from flows.survey.reading_costs import SHARD
 from flows.survey.run import open_run
 from flows.survey.stages.attention import attend
 from models.network.sizes import saliency_multiply_adds

@@ -1,0 +1,55 @@
+"""Multiply-adds of reading a field: of its map with fine patches at some seats, and of the scores of its seats."""
+
+from __future__ import annotations
+
+from dataclasses import astuple, dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.network.cost import MultiplyAdds, multiply_adds
+from models.network.sizes import SegmenterConfig
+from models.policies.policies import GLANCING_POLICIES, IMAGE_POLICIES, score_multiply_adds
+from models.reading.regions import Region, plan_regions, whole_field
+from pipeline.geometry.grid import SceneGrid
+from storage.arrays.layout import SHARD_COLUMNS, SHARD_ROWS
+
+SHARD = (SHARD_ROWS, SHARD_COLUMNS)  # of what is written at once: regions hold whole ones
+
+
+@dataclass(frozen=True)
+class ReadingCosts:
+    """What it takes to read one field by one network, region by region as surveys do."""
+
+    config: SegmenterConfig
+    grid: SceneGrid
+    bands: int
+    vgg_channels: int = 3  # that a policy of VGG19 reads
+
+    @cached_property
+    def _regions(self) -> list[Region]:
+        return plan_regions(self.grid, SHARD)
+
+    def of_map(self, seats: NDArray[np.integer]) -> MultiplyAdds:
+        """Count the map drawn with fine patches at these seats of the field."""
+        counts = [int(np.count_nonzero(region.numbers_here(seats) >= 0)) for region in self._regions]
+        parts = [
+            astuple(multiply_adds(self.config, region.grid, count, self.bands))
+            for region, count in zip(self._regions, counts, strict=True)
+        ]
+        return MultiplyAdds(*(sum(part) for part in zip(*parts, strict=True)))
+
+    def with_scores(self, seats: NDArray[np.integer], policy: str) -> MultiplyAdds:
+        """Count the same and what the policy takes to score all seats.
+
+        Stages keep nothing of the model for each other, so that each reads the coarse look anew: ``glance`` holds what
+        map and scores took for it.
+        """
+        drawn = self.of_map(seats)
+        looks = 2 if policy in GLANCING_POLICIES else 1
+        scored = [whole_field(self.grid)] if policy in IMAGE_POLICIES else self._regions
+        score = sum(
+            score_multiply_adds(policy, self.config, region.grid, channels=self.vgg_channels) for region in scored
+        )
+        return replace(drawn, glance=looks * drawn.glance, score=score)

@@ -1,0 +1,63 @@
+"""The device that networks compute on, as a setting of surveys, trainings and evaluations."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from flows.evaluate.command import evaluate_weights
+from flows.evaluate.frames import EvaluateRequest
+from flows.settings.load import load_settings
+from flows.survey.run import SurveyRun
+from flows.survey.survey_model import shipped_weights
+from flows.training.train import train_weights
+from flows.training.train_scenes import TrainRequest
+from pipeline.errors import SettingsError
+from tests.conftest import Survey
+
+REFUSED = "--device mps: torch can use none on this machine; there is .*: give that, or auto"
+
+
+@pytest.fixture(autouse=True)
+def _no_such_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch.backends.mps.is_available", lambda: False)
+
+
+def test_a_survey_on_a_device_that_is_not_there_is_refused(survey_png: Survey, tmp_path: Path) -> None:
+    """Before anything is captured or stored."""
+    with pytest.raises(SettingsError, match=REFUSED):
+        survey_png(tmp_path / "out", device="mps")
+    assert not (tmp_path / "out").exists()
+
+
+def test_trainings_and_evaluations_refuse_it_too(tmp_path: Path) -> None:
+    """Before a scene is looked at."""
+    with pytest.raises(SettingsError, match=REFUSED):
+        train_weights(TrainRequest("farm", tmp_path / "w.safetensors", device="mps"))
+    with pytest.raises(SettingsError, match=REFUSED):
+        evaluate_weights(EvaluateRequest("farm", (shipped_weights(),), device="mps"))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_no_device_is_refused_with_those_that_are() -> None:
+    """As any setting of some words."""
+    with pytest.raises(SettingsError, match="--device must be one of auto, cpu, cuda, mps; got 'gpu'"):
+        load_settings(None, {"device": "gpu"})
+
+
+def test_a_map_of_another_device_is_another_store() -> None:
+    """Its last bits may differ; stores of the processor keep the keys that they had."""
+    keys = [
+        SurveyRun.model_key.fget(SimpleNamespace(device=name, weights_key="w"))  # type: ignore[attr-defined]
+        for name in ("cpu", "cuda")
+    ]
+    assert keys == [{"weights": "w"}, {"weights": "w", "device": "cuda"}]
+
+
+def test_auto_tells_what_it_came_to(survey_png: Survey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A receipt names the device that computed."""
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    published = survey_png(tmp_path, device="auto")
+    assert published.receipt["settings"]["device"] == "cpu"
