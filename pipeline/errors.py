@@ -107,3 +107,14 @@ class WorkerError(PipelineError, RuntimeError):
 
 class BoundError(PipelineError, ArithmeticError):
     """A simulated effect, left out or cheapened, changes light by more than its bound says."""
+
+
+class NothingToMend(Exception):  # noqa: N818 - no error: a survey that ends well without a look
+    """A field is remembered so surely that nobody has to look; ``run`` is the one whose map stands."""
+
+    def __init__(self, run: str, expected_wrong: float, asked: float) -> None:
+        super().__init__(
+            f"nothing is looked at: {expected_wrong:.1%} of what is remembered is expected to be wrong, and a look is"
+            f" asked for from {asked:.1%} on; the map of {run} stands"
+        )
+        self.run = run

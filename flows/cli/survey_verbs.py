@@ -15,6 +15,7 @@ from flows.settings.documents import flag_help
 from flows.settings.load import SURVEY, TABLES, load_settings
 from flows.settings.survey_settings import REPLACED
 from flows.terminal.progress import print_json
+from pipeline.errors import NothingToMend
 from pipeline.lazy import deferred
 from pipeline.rig.device_settings import SurveyRig
 
@@ -86,8 +87,14 @@ def survey(settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_js
         A survey's TOML file; flags win over it. Without one, flags and defaults alone.
     """
     asked = load_settings(settings, by_setting(flags))
-    with rig_to_oneself(asked, "a survey by hand"):
-        published = survey_command.run_survey(asked, stderr)
+    try:
+        with rig_to_oneself(asked, "a survey by hand"):
+            published = survey_command.run_survey(asked, stderr)
+    except NothingToMend as said:
+        if as_json:
+            print_json({"looked": False, "run": said.run, "why": str(said)})
+        stderr.print(f"{said}", markup=False, soft_wrap=True)
+        return 0
     if as_json:
         print_json(published.receipt)
     return 0

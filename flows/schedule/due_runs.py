@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 
 from flows.schedule.field_schedule import Ending, FieldSchedule, moment_words, read_moment, read_state
 from flows.schedule.rig_lock import RigLock
-from pipeline.errors import PipelineError, SettingsError
+from pipeline.errors import NothingToMend, PipelineError, SettingsError
 
 Survey = Callable[[str, datetime], Path]  # field and due time in, the folder of the published run out
 Tell = Callable[[str], None]  # one line for the operator
@@ -75,6 +75,8 @@ def _survey(schedule: FieldSchedule, due: datetime, survey: Survey) -> Outcome:
     started = schedule.clock.now()
     try:
         folder = survey(schedule.field, due)
+    except NothingToMend as said:
+        return _end(schedule, due, "done", str(said), run=f"runs/{said.run}", seconds=0.0)
     except PipelineError as error:
         return _end(schedule, due, "failed", str(error), error=error)
     except OSError as error:

@@ -27,7 +27,7 @@ from flows.schedule.times import WallClock
 from flows.schedule.watcher import LIMIT, REPROCESS_LOCK, SKIPPED
 from flows.terminal.processes import FAILED, PARTLY
 from flows.terminal.progress import on_stderr
-from pipeline.errors import PipelineError, RigError
+from pipeline.errors import NothingToMend, PipelineError, RigError
 from pipeline.lazy import deferred
 from storage.archive.staging import take_lock
 from storage.remote.opening import open_archive
@@ -94,6 +94,8 @@ def _by_hand(one: ServedField, request: ServeRequest) -> State:
         raise RigError(f"the rig is in use by {lock.holder()}; run again when that survey has ended")
     try:
         folder = _survey(one, datetime.now(UTC).replace(microsecond=0), request)
+    except NothingToMend as said:
+        return Completed(message=str(said))
     finally:
         lock.release()
     return Completed(message=f"runs/{folder.name}")

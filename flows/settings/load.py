@@ -342,6 +342,9 @@ def _look_wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]
             f"{place_of('look', origin.get('look'))}: a mirror that may look beside the plan (pointing_px = "
             f"{settings.pointing_px:g}) ties its sweeps by what they share, so that none is left out; leave it out"
         )
+    if settings.doubt is not None and settings.look == LOOK_WHOLE:
+        place = place_of("doubt", origin.get("doubt"))
+        yield f"{place} says how sure a memory may be so that nothing is looked at: give --look part too"
     if settings.refresh is not None and settings.look == LOOK_WHOLE:
         place = place_of("refresh", origin.get("refresh"))
         yield f"{place} says how old a place may become of which a visit looks at a part: give --look part too"

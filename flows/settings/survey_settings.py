@@ -20,6 +20,7 @@ from flows.settings.values import (
     Bytes,
     BytesKept,
     Compute,
+    Doubt,
     Effects,
     Goal,
     Look,
@@ -131,6 +132,12 @@ class Settings:
         "is looked at before all else",
         "d",
         example="14d",
+    )
+    doubt: Doubt | None = stated(
+        None,
+        "With --look part: look at nothing, and leave the map as it is, where less than this share of what is "
+        "remembered is expected to be wrong, and nothing is too old",
+        example="2%",
     )
     scene: SceneName = stated(
         "farm", "`farm` (built in; `farm@2`), or a file: PNG, JPEG, GeoTIFF, .npy, .npz, .mat, ENVI, Zarr"

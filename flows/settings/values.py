@@ -343,6 +343,21 @@ def parse_unknown(value: object) -> str:
     return f"{percent:g}%"
 
 
+LEAST_DOUBT, MOST_DOUBT = 0.001, 0.5
+
+
+def parse_doubt(value: object) -> float:
+    """Share of what is remembered, from a number or text such as 2%."""
+    word = str(value).strip()
+    number = None if isinstance(value, bool) else _to_float(word.removesuffix("%"))
+    share = None if number is None else number / 100 if word.endswith("%") else number
+    if share is None or not LEAST_DOUBT <= share <= MOST_DOUBT:
+        raise ValueError(
+            f"must be {LEAST_DOUBT:.1%} to {MOST_DOUBT:.0%} of what is remembered, such as 2%; got {value!r}"
+        )
+    return share
+
+
 Name = Annotated[str, PlainValidator(parse_name)]
 SceneName = Annotated[str, PlainValidator(parse_scene)]
 Budget = Annotated[float, PlainValidator(parse_budget)]
@@ -358,4 +373,5 @@ Effects = Annotated[str, PlainValidator(parse_effects)]
 Bands = Annotated[tuple[int, ...], PlainValidator(parse_bands)]
 Look = Annotated[str, PlainValidator(parse_look)]
 Refresh = Annotated[float, PlainValidator(parse_refresh)]
+Doubt = Annotated[float, PlainValidator(parse_doubt)]
 Wavelengths = Annotated[tuple[float, ...], PlainValidator(parse_wavelengths)]

@@ -17,7 +17,7 @@ from models.reading.doubts import SeatDoubts
 from models.reading.remembered import COME_TRUE, Belief, Remembered, carried, in_classes
 from models.weights.files import Description
 from models.weights.memory_files import ReaderFile, load_memory
-from pipeline.errors import BudgetError, SettingsError, WeightsError
+from pipeline.errors import BudgetError, NothingToMend, SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.area_cover import seats_shown
 from pipeline.planning.part_looks import PartLook, SeatRows, cheapest_row_seconds, part_look, sweeps_of_runs
@@ -88,8 +88,9 @@ def choose_look(
     """Settings with the lines that a visit takes of a field that is remembered, the choice, and what to say of it.
 
     Lines are wanted of the ``shown`` (seat,) seats, of all where it is None. Without a memory the whole field is looked
-    at. Raises WeightsError: the weights have no record of scans; BudgetError: no line of any scan ends in time, with
-    the least that does; PoseError: the field is beyond the mirror's range.
+    at. Raises NothingToMend: it is remembered as surely as was asked for, and nothing is due; WeightsError: the weights
+    have no record of scans; BudgetError: no line of any scan ends in time, with the least that does; PoseError: the
+    field is beyond the mirror's range.
     """
     if settings.look != LOOK_PART:
         return settings, None, ()
@@ -107,6 +108,8 @@ def choose_look(
     wanted = LookWorth(
         ScanRecord.read(content), weights.class_names, doubts, there & _is_due(settings, prior, doubts), there
     )
+    if settings.doubt is not None and doubts.expected_wrong() < settings.doubt and not wanted.due.any():
+        raise NothingToMend(prior.run, doubts.expected_wrong(), settings.doubt)
     step, exposure_ms, look = _best_look(settings, grid, wanted, shown)
     chosen = replace(settings, look=look_words(look.runs), scan_step=step, scan_exposure_ms=exposure_ms)
     sweeps = sweeps_of_runs(lay_out_sweeps(replace(chosen, look=LOOK_WHOLE), grid, shown)[1], look.runs)

@@ -188,7 +188,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
 
     With ``planning`` a scene that this machine cannot hold is no error: ``refused`` of the run says so. Without an
     ``archive`` that of the settings is opened. Raises PipelineError: the first thing that cannot be used; see
-    `pipeline.errors` for the kinds.
+    `pipeline.errors` for the kinds; NothingToMend: what is remembered is sure enough.
     """
     settings = for_rig(settings)
     check_scene_there(settings)
@@ -211,6 +211,8 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     if settings.mask is not None:
         check_mask(settings.mask, scene.shape)
     name, found = settings.name or Path(scene.name).stem, None
+    if planning:  # what a look would be, were there one
+        settings = replace(settings, doubt=None)
     if settings.look == LOOK_PART:  # what is remembered says where to look: nothing else is asked for so early
         archive = open_archive(settings.out) if archive is None and is_archive(settings.out) else archive
         found = (None, ()) if archive is None else find_prior(archive, settings, name, grid, described.class_names)

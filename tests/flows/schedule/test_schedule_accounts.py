@@ -111,6 +111,21 @@ def test_a_run_skipped_as_it_was_to_begin_says_why(tmp_path: Path) -> None:
     )
 
 
+def test_a_visit_that_looks_at_nothing_is_done(tmp_path: Path) -> None:
+    """It is accounted for by the run whose map stands, with the reason."""
+    (clock, schedule), lock = opened(tmp_path), RigLock(tmp_path / "rig.lock")
+    clock.moment = FIRST
+
+    def survey(*given: object) -> Path:
+        raise NothingToMend("20260601T110000-north", 0.012, 0.02)
+
+    outcome = run_due(schedule, FIRST, lock, survey)
+    assert (outcome.ending, outcome.run) == ("done", "runs/20260601T110000-north")
+    line = schedule.state().ended[FIRST]
+    assert line["seconds"] == 0
+    assert "1.2% of what is remembered is expected to be wrong" in line["reason"]
+
+
 def test_a_run_that_another_process_ended_is_told_as_that(tmp_path: Path) -> None:
     """Done by another is done, with its folder; nothing is surveyed again."""
     (clock, schedule), lock = opened(tmp_path), RigLock(tmp_path / "rig.lock")

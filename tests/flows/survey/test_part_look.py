@@ -18,7 +18,7 @@ from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
 from flows.settings.load import load_settings
 from flows.survey.look_choice import LookWorth
 from models.reading.doubts import SeatDoubts
-from pipeline.errors import BudgetError, PipelineError, SettingsError, WeightsError
+from pipeline.errors import BudgetError, NothingToMend, PipelineError, SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.plain_scans import ScanRecord
 from storage.archive.records import read_run
@@ -141,6 +141,22 @@ def test_what_is_due_is_looked_at_first(visited: Path, visits: Any, survey_png: 
     assert f"{look['due'] - look['due_left']} of the {look['due']} seats that were due are among them" in notes
     page = " ".join((part.folder / "report.html").read_text(encoding="utf-8").split())
     assert f"{look['due_left']} of {look['due']} seats that were due had to wait" in page
+
+
+def test_of_what_is_sure_enough_nothing_is_looked_at(visited: Path, survey_png: Survey, recorded: Path) -> None:
+    """Said with the run whose map stands; nothing is captured or published, and a look is planned nevertheless."""
+    runs = sorted(visited.glob("runs/*"))
+    flags = {**PART, "visit": LAST, "weights": str(recorded)}
+    with pytest.raises(NothingToMend, match=f"the map of {runs[-1].name} stands"):
+        survey_png(visited, **{**flags, "doubt": "50%"})
+    assert sorted(visited.glob("runs/*")) == runs
+    assert survey_png(visited, **{**flags, "doubt": "0.1%"}).receipt["settings"]["doubt"] == 0.001
+
+
+def test_what_is_too_old_is_looked_at_however_sure_it_is(visited: Path, survey_png: Survey, recorded: Path) -> None:
+    """What is due comes before what is doubted."""
+    part = survey_png(visited, **PART, visit=LAST, weights=str(recorded), doubt="50%", refresh="4d")
+    assert part.receipt["look"]["due"] > 0
 
 
 def test_nothing_is_worth_more_than_what_is_due() -> None:
