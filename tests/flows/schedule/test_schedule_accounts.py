@@ -10,6 +10,7 @@ import pytest
 from flows.schedule.due_runs import run_due
 from flows.schedule.field_schedule import moment_words
 from flows.schedule.rig_lock import RigLock
+from pipeline.errors import NothingToMend
 from tests.flows.schedule.schedule_days import NOON, HandClock, accounted, field_schedule, opened
 
 FIRST, SECOND, THIRD = (NOON + timedelta(minutes=20 * number) for number in (1, 2, 3))
