@@ -184,7 +184,7 @@ def cleared_facts(before: Mapping[str, Any], sha256: str) -> dict[str, Any]:
     """
     kept = {name: value for name, value in before.items() if name not in ("files", "format", "seal")}
     at = datetime.now(UTC).isoformat(timespec="milliseconds")
-    entry = {"at": at, "bytes_before": listed_bytes(before), "manifests": [*cleared_from(before), sha256]}
+    entry = {"at": at, "bytes_before": listed_bytes(before), "manifests": [sha256]}
     return kept | {CLEARED: entry}
 
 

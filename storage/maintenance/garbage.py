@@ -127,10 +127,7 @@ def plan_clearance(
     removals += [
         Removal(uri, "files", store.size, "they can be made again")
         for uri, store in catalogue.stores.items()
-        if not obstacle
-        and uri in named
-        and _age_days(store, moment) >= keep_days
-        and _can_be_made_again(catalogue, store, made_again)
+        if not obstacle and _age_days(store, moment) >= keep_days and _can_be_made_again(catalogue, store, made_again)
     ]
     uploads = [
         Removal(uri, "upload", size, "it was never published") for uri, size in archive.leftovers(keep_days).items()

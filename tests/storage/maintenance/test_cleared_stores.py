@@ -44,6 +44,8 @@ def test_the_files_go_and_the_manifest_stays(archive: Archive) -> None:
     assert archive.stored_bytes(small.mosaic) == size > read_store(small.mosaic).size == 0
     assert problems(archive) == []
     assert cleared(archive) == []
+    assert archive.clear(small.mosaic)  # once more
+    assert archive.stored_bytes(small.mosaic) == size
     assert archive.find("capture", small.raw.key) is not None
 
 
