@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+SIGMA_OF_MEDIAN = 1.4826  # standard deviation of a normal law over its median absolute deviation
+
 MOST_VALUE = 1e9  # in any unit that scenes come in; what is larger is to be given in a larger unit
 MOST_STEPS = 65535  # that a camera tells apart: raw lines hold 16 bits
 

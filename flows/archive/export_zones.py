@@ -35,8 +35,16 @@ from storage.arrays.class_maps import ClassNames
 from storage.arrays.ground_maps import open_image
 from storage.arrays.mosaics import mosaic_brightness
 from storage.export.qgis_styles import NONE, REDS, STYLE, Entry, ramp_colour, write_polygon_style
-from storage.export.task_data import DEGREE_DIGITS, TaskGrid, TaskWords, write_task_data
-from storage.export.vector_files import GEOJSON, GEOPACKAGE, SHAPEFILE, write_geojson, write_geopackage, write_shapefile
+from storage.export.task_data import TaskGrid, TaskWords, write_task_data
+from storage.export.vector_files import (
+    DEGREE_DIGITS,
+    GEOJSON,
+    GEOPACKAGE,
+    SHAPEFILE,
+    write_geojson,
+    write_geopackage,
+    write_shapefile,
+)
 
 IN_DEGREES = {"proj:code": "EPSG:4326"}
 NEEDS_PLACE = "the run does not say where on earth it was; survey with a [pose], or a scene with a CRS"

@@ -26,7 +26,7 @@ from flows.evaluate.frames import (
 from flows.evaluate.rows import design_of, known_or_none, open_controls
 from flows.evaluate.series import REFERENCE, Record, seeds_of
 from flows.evaluate.summary import summarise, summarise_equal_time, summarise_rig
-from flows.evaluate.table import print_evaluation
+from flows.evaluate.table import SHOWN_SHARE, print_evaluation
 from flows.evaluate.work import Made, Work
 from flows.terminal.processes import writing
 from flows.terminal.progress import StageProgress, on_stdout
@@ -164,9 +164,6 @@ def _of_frame(row: Record) -> Record:
         "per_class_iou": [known_or_none(iou) for iou in iou_per_class(counts)],
         "false_pixels": false_pixels(counts).tolist(),
     }
-
-
-SHOWN_SHARE = 0.10  # of the seats, or the nearest one tried: what the pictures show
 
 
 def publish_evaluation(work: Work, content: dict[str, Any], runs: list[list[Record]], show: Show) -> list[str]:

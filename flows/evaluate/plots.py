@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from flows.evaluate.frames import Look
 from flows.evaluate.rows import Trial, placings
-from flows.publish.panels import INK, MUTED, class_palette, class_rgb, outline
+from flows.publish.panels import GRID, INK, MUTED, PAPER, class_palette, class_rgb, outline
 from flows.terminal.figures import format_percent
 from models.evaluation.metrics import confusion, mean_iou, overall_accuracy
 from models.reading.inference import segment
@@ -24,7 +24,6 @@ from pipeline.planning.selection import frame_seats
 from storage.arrays.quicklooks import choose_bands, stretch
 
 _COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#882255", "#332288", "#999933")
-PAPER, GRID = "#fbfaf7", "#e3e1d8"
 
 
 def evaluation_figure(content: dict[str, Any]) -> Figure:

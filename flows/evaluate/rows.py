@@ -164,6 +164,7 @@ def known_or_none(value: float) -> float | None:
     return None if np.isnan(value) else float(value)
 
 
+ENDS = ("none", "all")  # of a scale: no seat, every seat
 DENSE = "dense"  # the control that may be the baseline
 BUYS_SEATS = "paper"
 POLICY = "sobel"  # of the paper's network

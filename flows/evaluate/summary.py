@@ -9,7 +9,7 @@ import numpy as np
 
 from flows.evaluate.costs import Prices, row_cost
 from flows.evaluate.rig_plans import BUDGETS, PLANNED, RANDOM, UNIFORM, plan_name
-from flows.evaluate.rows import DENSE, ORACLE, POOLED_MARK, is_pooled, own_policy, pooled_policies
+from flows.evaluate.rows import DENSE, ENDS, ORACLE, POOLED_MARK, is_pooled, own_policy, pooled_policies
 from flows.evaluate.series import (
     Record,
     Row,
@@ -41,7 +41,6 @@ from models.evaluation.metrics import (
 from models.evaluation.placement import captured_gain
 
 Key = tuple[str, float]
-ENDS = ("none", "all")
 
 
 def summarise(

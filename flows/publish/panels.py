@@ -23,6 +23,7 @@ from storage.arrays.quicklooks import stretch
 GROUND_IN, GROUND_DPI, GROUND_MOST_PX = 9.0, 130, 1200
 INK = "#22241f"
 MUTED = "#6a6d64"
+PAPER, GRID = "#fbfaf7", "#e3e1d8"  # of plots
 STYLE: Any = {
     "font.size": 12,
     "text.parse_math": False,  # names of surveys and classes may hold dollar signs

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from flows.publish.ground_findings import ground_words
+from flows.publish.ground_findings import MOST_CHANGES, ground_words
 from flows.publish.receipt import Receipt, is_pending
 from flows.publish.zone_findings import zone_words
 from flows.survey.scores import worst_class_words
@@ -175,9 +175,6 @@ def _kept_words(kept: Mapping[str, Any], accuracy: Mapping[str, Any] | None) -> 
     lost = every - accuracy["miou"]
     by = "cost" if lost >= 0 else "gained"
     return f"{text} That {by} {format_points(abs(lost))} points of mIoU: everything read scores {format_points(every)}."
-
-
-MOST_CHANGES = 4  # told in words
 
 
 def _memory_words(memory: Mapping[str, Any]) -> str:

@@ -25,7 +25,7 @@ import flows.tradeoff.plans
 import flows.tradeoff.rectify
 import flows.tradeoff.simulate
 import flows.tradeoff.simulate_light  # noqa: F401 - each registers its entries
-from flows.publish.panels import INK, MUTED, save_png
+from flows.publish.panels import GRID, INK, MUTED, PAPER, save_png
 from flows.terminal.figures import format_seconds
 from flows.terminal.processes import writing
 from flows.tradeoff.entries import Point, Result, cheapest_within, find_tradeoffs, measure_tradeoff, registered
@@ -118,7 +118,6 @@ _BEATEN: Any = {"marker": "o", "color": MUTED, "markersize": 9, "fillstyle": "no
 _LEVELS = ("#D55E00", "#A23B72")
 _FAMILIES = ("#0072B2", "#007A5A", "#8a6d00", "#D55E00", "#A23B72")
 _FLOOR = "#007A5A"
-_PAPER, _GRID = "#fbfaf7", "#e3e1d8"
 _ACROSS = 3  # panels in a row
 _UNITS = ((1e6, "ms"), (1e3, "µs"), (1.0, "ns"))
 _SAME = 8  # pixels of the figure apart: a mark lies on another
@@ -134,7 +133,7 @@ def tradeoff_figure(results: Sequence[Result]) -> Figure:
     """Give a figure of one panel for each trade-off: points that no other beats filled and joined, others hollow."""
     across = min(_ACROSS, len(results))
     down = -(-len(results) // across)
-    figure = Figure(figsize=(6.0 * across, 4.9 * down + 0.5), dpi=120, layout="constrained", facecolor=_PAPER)
+    figure = Figure(figsize=(6.0 * across, 4.9 * down + 0.5), dpi=120, layout="constrained", facecolor=PAPER)
     figure.get_layout_engine().set(w_pad=0.12, h_pad=0.12)  # type: ignore[union-attr, call-arg]
     panels = figure.subplots(down, across, squeeze=False).ravel()
     for axes, result in zip(panels, results, strict=False):
@@ -175,7 +174,7 @@ def _draw_tradeoff(axes: Axes, result: Result) -> None:
             color=INK,
             size=10.5,
             zorder=4,
-            path_effects=[withStroke(linewidth=3, foreground=_PAPER)],
+            path_effects=[withStroke(linewidth=3, foreground=PAPER)],
         )
     return _finish(axes, result, "seconds by the cost model" if modelled else f"{unit} / {result.unit}")
 
@@ -199,7 +198,7 @@ def _draw_families(axes: Axes, result: Result, placed: Sequence[tuple[tuple[floa
                 color=colour,
                 size=8.5,
                 zorder=4,
-                path_effects=[withStroke(linewidth=2.5, foreground=_PAPER)],
+                path_effects=[withStroke(linewidth=2.5, foreground=PAPER)],
             )
     axes.legend(frameon=False, labelcolor="linecolor", fontsize=10)
     return _finish(axes, result, "seconds by the cost model")
@@ -210,8 +209,8 @@ def _finish(axes: Axes, result: Result, across: str) -> None:
     axes.set_title(f"{result.stage}: {result.knob}", loc="left", weight="bold", color=INK, size=13)
     axes.set_xlabel(across, color=INK)
     axes.set_ylabel(result.error, color=INK)
-    axes.set_facecolor(_PAPER)
-    axes.grid(visible=True, which="major", color=_GRID, linewidth=0.8)
+    axes.set_facecolor(PAPER)
+    axes.grid(visible=True, which="major", color=GRID, linewidth=0.8)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
 
@@ -271,7 +270,7 @@ def _draw_memory_floor(axes: Axes, floor: float) -> None:
         xycoords=blended_transform_factory(axes.transData, axes.transAxes),
         color=_FLOOR,
         size=9,
-        path_effects=[withStroke(linewidth=3, foreground=_PAPER, alpha=0.8)],
+        path_effects=[withStroke(linewidth=3, foreground=PAPER, alpha=0.8)],
     )
 
 

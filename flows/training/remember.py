@@ -6,7 +6,7 @@ would have shown it, and read by the weights that the memory is for. Other lands
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 from flows.terminal.progress import one_after_the_other
+from flows.training.data import Report
 from flows.training.look import observe_finely
 from models.evaluation.metrics import confusion, mean_iou
 from models.network.spectral import patches_of
@@ -44,7 +45,6 @@ DARKEST_MS, BRIGHTEST_MS = 3.0, 50.0
 LOOKS = 2  # of each visit
 JUDGED_DAY, JUDGED_AFTER, JUDGED_LANDS = 172, (1, 3, 7), 3
 BEFORE, NOW = (1, 25.0), (2, 5.0)  # step and exposure [ms] of the looks that are judged
-Report = Callable[[str, float, str], None]
 
 
 @dataclass(frozen=True)

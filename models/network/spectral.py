@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import WavelengthError
-from pipeline.readings import MOST_STEPS
+from pipeline.readings import MOST_STEPS, SIGMA_OF_MEDIAN
 
 REACH = 1.5  # a column is reached by a band within this many column spacings of its centre
 LONGEST_NM, SHORTEST_NM = 3000.0, 200.0
@@ -146,7 +146,7 @@ class Normalisation:
         """
         exact = sample.astype(np.float64)
         centre = np.median(exact, axis=0)
-        spread = 1.4826 * np.median(np.abs(exact - centre), axis=0)
+        spread = SIGMA_OF_MEDIAN * np.median(np.abs(exact - centre), axis=0)
         spread = np.maximum(spread, SPREAD_FLOOR * (float(np.median(spread)) or 1.0))
         scaled = np.clip((exact - centre) / spread, -10, 10)
         scaled -= scaled.mean(axis=0)

@@ -11,7 +11,7 @@ import numpy as np
 
 from models.reading.familiar import Familiar, Limits
 from models.weights.files import Description, content_key, unusable
-from models.weights.sealed_files import changed_tensor, key_of_sealed, open_sealed, write_sealed
+from models.weights.sealed_files import beside, changed_tensor, key_of_sealed, open_sealed, write_sealed
 from models.weights.trained_on import TrainedOn
 from pipeline.errors import WeightsError
 from pipeline.lazy import deferred
@@ -48,7 +48,7 @@ class FamiliarFile:
 
 def familiar_path(weights: Path) -> Path:
     """Where what is familiar to some weights lies: beside them, by their name."""
-    return weights.with_name(weights.name.removesuffix(".safetensors") + SUFFIX)
+    return beside(weights, SUFFIX)
 
 
 def save_familiar(made: FamiliarWeights, path: Path) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from models.network.sizes import MemorySizes
 from models.weights.files import Description, unusable
-from models.weights.sealed_files import changed_tensor, key_of_sealed, open_sealed, write_sealed
+from models.weights.sealed_files import beside, changed_tensor, key_of_sealed, open_sealed, write_sealed
 from pipeline.errors import WeightsError
 from pipeline.lazy import deferred
 
@@ -61,7 +61,7 @@ def describe_reader(weights: Path, described: Description) -> ReaderFile | None:
 
 def memory_path(weights: Path) -> Path:
     """Where the reader of memories that goes with some weights lies: beside them, by their name."""
-    return weights.with_name(weights.name.removesuffix(".safetensors") + SUFFIX)
+    return beside(weights, SUFFIX)
 
 
 def save_memory(memory: MemoryWeights, path: Path) -> None:

@@ -37,6 +37,11 @@ CHECKPOINT, UNSEALED_CHECKPOINT = "spectralzoom-checkpoint/2", "spectralzoom-che
 Checkpoint = tuple[dict[str, Any], "dict[str, Tensor]"]
 
 
+def beside(weights: Path, suffix: str) -> Path:
+    """Where a file that goes with some weights lies: beside them, by their name."""
+    return weights.with_name(weights.name.removesuffix(".safetensors") + suffix)
+
+
 def write_sealed(path: Path, about: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
     """Write the file by a temporary name and a rename, so that it is whole or absent. Raises OSError."""
     whole = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pipeline.errors import PoseError, ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import RIM_SLACK, direction_to_scene, position_to_direction
+from pipeline.readings import SIGMA_OF_MEDIAN
 
 STANDING_STEPS = 1e-3  # a mirror that moves less than this stands still
 DWELL_STEPS = 0.25  # lines closer than this show the same place
@@ -17,7 +18,6 @@ GAP_STEPS = 1.5  # a wider distance misses a line; a smaller step back is noise
 NOISE_SIGMAS = 6.0  # nor does a path turn that goes back by less than this much of its own noise
 EVEN_STEPS = 1e-7  # a path this straight and even is looked up in closed form
 
-SIGMA_OF_MEDIAN = 1.4826  # of a normal law, from the median of its absolute values
 
 Floats = NDArray[np.float64]
 

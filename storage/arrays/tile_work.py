@@ -6,7 +6,7 @@ of its own: whoever makes it writes files that nobody else touches.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -23,11 +23,9 @@ from pipeline.rectify.line_numbers import LineNumbers, number_lines
 from pipeline.rectify.placed import PixelGrid, Placed, place
 from pipeline.rectify.region import Reaches, Tile, cache_bytes, column_reach, mosaic_tile, plan_tiles, tile_bytes
 from pipeline.rectify.registration.alignment import SweepShift, no_shifts
-from pipeline.rectify.tie_points import TieTable
-from pipeline.rectify.tracks import Track
 from storage.archive.manifests import read_table
 from storage.arrays.cubes import RawCube, open_raw_cube
-from storage.arrays.lookups import open_lookup
+from storage.arrays.lookups import Tables, open_lookup
 from storage.arrays.mosaics import MosaicWriter
 from storage.parallel.crew import THREADS, Crew, run_blocks
 
@@ -79,8 +77,6 @@ def sight_sweeps(cubes: Sequence[RawCube], registration: Path | None, camera: Li
         for cube, frame_s in zip(cubes, frames_s, strict=True)
     ]
 
-
-Tables = Mapping[str, Sequence[tuple[Track, TieTable]]]
 
 ROWS_OF_MEANS = 8  # of a mosaic whose pixels are means, rectified at once
 RESERVED_BYTES = 512 * 2**20  # a process before its first tile: interpreter, torch, zarr

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError
 from storage.archive.whole_files import written_aside
+from storage.export.vector_files import DEGREE_DIGITS
 
 FOLDER, XML, NUMBERS = "TASKDATA", "TASKDATA.XML", "GRD00000.bin"
 DESIGNATOR = 32  # letters of a name
 MOST_NUMBER = 2**31 - 1
-DEGREE_DIGITS = 9
 TREATED, UNTREATED = 1, 0  # codes of treatment zones: 0 where there is no cell, no signal, or outside of the field
 
 

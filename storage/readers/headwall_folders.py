@@ -23,13 +23,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from pipeline.rig.camera.camera_texts import LONGEST_LINE, FrameIndex, LineTimes, parse_frame_index, times_of_lines
+from pipeline.rig.camera.camera_texts import (
+    FRAME_INDEX,
+    LONGEST_LINE,
+    FrameIndex,
+    LineTimes,
+    parse_frame_index,
+    times_of_lines,
+)
 from storage.readers.cube_sources import MOST_MISSING, Bands, CubeSource, LineFacts
 from storage.readers.envi_cubes import EnviCube, find_envi_pair, open_envi_cube
 from storage.readers.raster_tags import bad_bands, place_of_envi
 
 _PART = re.compile(r"raw_(\d{1,12})(\.[A-Za-z]{1,4})?", re.IGNORECASE)
-_INDEX = re.compile(r"frameindex_(\d{1,12})\.txt", re.IGNORECASE)
 _EXPOSURE = "exposure (ms)"  # a setting in the comments of Headwall's headers
 
 
@@ -82,7 +88,9 @@ def open_headwall_cube(folder: Path) -> CubeSource:
     parts = _placed(opened, notes)
     lines = parts[-1].stop + _lost_at_end(parts, notes)
     found = {
-        int(match[1]): file for file in folder.iterdir() if file.is_file() and (match := _INDEX.fullmatch(file.name))
+        int(match[1]): file
+        for file in folder.iterdir()
+        if file.is_file() and (match := FRAME_INDEX.fullmatch(file.name))
     }
     used = {number: found[number] for number in opened if number in found}
     told_by_name = any(before.stop != after.start for before, after in pairwise(parts))

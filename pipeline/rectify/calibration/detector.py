@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from pipeline.errors import RigError, ShapeError
+from pipeline.readings import SIGMA_OF_MEDIAN
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-TO_SIGMA = 1.4826  # of a normal distribution, from the median absolute deviation
 LEAST_NOISE_DN = 1.0  # dark frames are whole numbers: below one step a spread means nothing
 BANDS_FOR_COLUMN = 8  # fewer cannot tell an odd element from an odd column
 
@@ -65,7 +65,7 @@ def find_bad_elements(
         bad |= high >= saturated_dn
     low = np.where(bad, np.nan, low)
     above = low - _median(low, axis=0)
-    noise = np.maximum(TO_SIGMA * _median(np.abs(above), axis=0), LEAST_NOISE_DN)
+    noise = np.maximum(SIGMA_OF_MEDIAN * _median(np.abs(above), axis=0), LEAST_NOISE_DN)
     bad |= above > limits.hot_sigmas * noise
     bad |= _off_neighbours(np.where(bad, np.nan, high - low), noise, limits)
     if np.count_nonzero(bad) > max(limits.most * bad.size, bad.shape[1]):
@@ -89,7 +89,7 @@ def _off_neighbours(response: Floats, noise: Floats, limits: BadElementCriteria)
     off = np.where(dead, np.nan, relative - 1)
     if response.shape[1] >= BANDS_FOR_COLUMN:
         off -= _median(off, axis=1)
-    spread = TO_SIGMA * _median(np.abs(off), axis=0)
+    spread = SIGMA_OF_MEDIAN * _median(np.abs(off), axis=0)
     if len(response) < limits.near:
         return dead
     # Beyond the nearest neighbours as well; two that stand out side by side do not hide each other.

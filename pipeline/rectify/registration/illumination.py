@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
 from pipeline.geometry.camera import LineCamera
+from pipeline.readings import SIGMA_OF_MEDIAN
 from pipeline.rectify.placed import PixelGrid, Placed
 from pipeline.rectify.region import mosaic_tile
 from pipeline.rectify.registration.overlaps import Window
@@ -18,7 +19,6 @@ Floats = NDArray[np.float64]
 
 ORDER = 3  # of the polynomial in wavelength: daylight drifts by colour, not by line
 ERROR_FLOOR = 1e-3  # of a log ratio
-SIGMA_OF_MEDIAN = 1.4826  # standard deviation of a normal law over its median absolute deviation
 MEDIAN_LOSS = 1.2533  # standard error of a median over that of a mean
 PROBE_ROWS = 96  # at the middle of every window
 GROUP_PX = 16  # side of the squares whose sums are compared: some periods of crop rows

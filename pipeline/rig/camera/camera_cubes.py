@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import RigError, SceneError, ShapeError
-from pipeline.rectify.calibration.detector import TO_SIGMA, find_bad_elements
-from pipeline.rig.camera.camera_texts import LineTimes, parse_frame_index, split_header, times_of_lines
+from pipeline.readings import SIGMA_OF_MEDIAN
+from pipeline.rectify.calibration.detector import find_bad_elements
+from pipeline.rig.camera.camera_texts import FRAME_INDEX, LineTimes, parse_frame_index, split_header, times_of_lines
 from pipeline.source import References
 
 _PART = re.compile(r"raw_(\d{1,12})", re.IGNORECASE)
-_INDEX = re.compile(r"frameindex_(\d{1,12})\.txt", re.IGNORECASE)
 _REFERENCE = re.compile(r"(dark|white)[A-Za-z_]*", re.IGNORECASE)
 MOST_MISSING = 100_000  # lines between two parts; more means that the names are wrong
 MOST_NUMBERS = 1 << 26  # of a line: a hundred times those of any such camera
@@ -202,7 +202,7 @@ def _placed(parts: list[tuple[int, CubeLines]], notes: list[str]) -> list[tuple[
 
 def _times(by_name: Mapping[str, str], first: int, cube: CubeLines, read: Read, notes: list[str]) -> LineTimes | None:
     """What the part's index says of its lines; None where there is none that can be read."""
-    name = next((name for name in by_name if (match := _INDEX.fullmatch(name)) and int(match[1]) == first), None)
+    name = next((name for name in by_name if (match := FRAME_INDEX.fullmatch(name)) and int(match[1]) == first), None)
     if name is None:
         notes.append(f"there is no frame index for raw_{first}")
         return None
@@ -320,7 +320,7 @@ def _strays(lines: NDArray[np.integer]) -> tuple[NDArray[np.bool_], tuple[int, .
     blocks = [slice(start, start + _SAMPLES) for start in range(0, samples, _SAMPLES)]
     middle = [np.median(lines[:, block], axis=0) for block in blocks]
     sigma = [
-        TO_SIGMA / np.sqrt(2) * np.median(np.abs(np.diff(lines[:, block].astype(np.int32), axis=0)), axis=0)
+        SIGMA_OF_MEDIAN / np.sqrt(2) * np.median(np.abs(np.diff(lines[:, block].astype(np.int32), axis=0)), axis=0)
         for block in blocks
     ]
     least = max(float(np.median(np.concatenate(sigma))), LEAST_SIGMA_DN)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 
+FRAME_INDEX = re.compile(r"frameindex_(\d{1,12})\.txt", re.IGNORECASE)  # names of its files
 UNBALANCED = "opens more braces than it closes"
 MOST_UNBALANCED = 16  # values that open more braces than they close: looking for each one's end reads the rest
 NANOMETRES = {"nm", "nanometer", "nanometers", "nanometre", "nanometres"}

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import RigError, ShapeError
+from pipeline.readings import SIGMA_OF_MEDIAN
 
 Floats = NDArray[Any]  # float64
 Ints = NDArray[np.int64]
@@ -24,7 +25,6 @@ StampAt = Literal["start", "middle", "end"]
 MOST_DRIFT_PPM = 1000.0  # of two quartz clocks, generously; more means that the wrong events were matched
 LEAST_SCALE_S = 1e-6  # stamps are whole microseconds
 _TUKEY = 4.685  # 95 % efficient where the errors are normal
-_TO_SIGMA = 1.4826
 _ROUNDS = 30
 _NEAR = 64  # edges around a hint
 _BLOCK = 256  # frames matched before the offset is looked at again
@@ -136,7 +136,7 @@ def fit_clocks(stamp_us: Ints, mirror_s: Floats) -> ClockFit:
     for _ in range(_ROUNDS):
         off = mirror_s - camera - (offset + slope * camera)
         before = weight
-        scale = max(_TO_SIGMA * float(np.median(np.abs(off))), LEAST_SCALE_S)
+        scale = max(SIGMA_OF_MEDIAN * float(np.median(np.abs(off))), LEAST_SCALE_S)
         weight = np.clip(1 - (off / (_TUKEY * scale)) ** 2, 0, None) ** 2
         slope, offset = _weighted_line(camera, mirror_s - camera, weight)
         if np.allclose(weight, before, rtol=0, atol=1e-9):

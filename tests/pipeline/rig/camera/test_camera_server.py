@@ -15,8 +15,8 @@ from pipeline.rig.camera.camera_files import KeptInMemory, RemoteFile, fetch_fil
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.device_settings import CameraAddress, ControlPatience, FileServer
 from pipeline.rig.devices import SYSTEM_CLOCK, DeviceGone, DeviceRefused
-from pipeline.rig.emulator.camera_device import CameraDevice, CameraUnit, FrameClock, IndexLayout
-from pipeline.rig.emulator.camera_server import CameraServer
+from pipeline.rig.emulator.camera_device import MOST_LINE, CameraDevice, CameraUnit, FrameClock, IndexLayout
+from pipeline.rig.emulator.camera_server import CameraConnection, CameraServer
 from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults
 from pipeline.rig.transports import SocketTransport
 from tests.pipeline.rig.camera.camera_line import LinesOf, wait_for
@@ -41,6 +41,13 @@ def camera(
         driver = HeadwallCamera.at(CameraAddress(served.host, served.port), files, clock=clock)
         yield driver, device, lines
         driver.close()
+
+
+def test_whoever_never_ends_a_command_is_hung_up_on() -> None:
+    """Up to the longest command is waited for its end, and no byte more is kept."""
+    talk = CameraConnection(CameraDevice(LinesOf(), ManualClock()))
+    assert talk.feed(b"x" * MOST_LINE) == ([], True)
+    assert talk.feed(b"x") == ([], False)
 
 
 @pytest.mark.parametrize("layout", [IndexLayout("\t", "\n"), IndexLayout(" ", "\r\n", restarts=True)])
