@@ -25,7 +25,7 @@ from flows.survey.scan_choice import ScanChoice, as_told
 from flows.survey.stage import Stage, Wanted
 from flows.survey.stages.attention import load_plan
 from flows.survey.survey import STAGES, judge, survey
-from flows.terminal.figures import format_bytes, format_points, format_seconds
+from flows.terminal.figures import format_bytes, format_percent, format_points, format_seconds
 from flows.terminal.processes import DONE
 from flows.terminal.progress import put_out
 from pipeline.errors import IncompleteStoreError, PipelineError
@@ -105,6 +105,7 @@ class Forecast:
     refused: str | None = None
     scans: ScanChoice = field(default_factory=ScanChoice)
     figures: Mapping[str, Any] = field(default_factory=dict)  # see `flows.archive.field_figures`
+    kept: Mapping[str, Any] | None = None  # of a plain scan that is kept and read in part: at most, as receipts tell it
 
 
 def forecast(settings: Settings, preview: Path | None = None) -> Forecast:
@@ -127,7 +128,8 @@ def forecast(settings: Settings, preview: Path | None = None) -> Forecast:
             shown = plan_preview.PlanPicture(run, fine, _last_map(run, catalogue), figure_lines(figures))
             with refusals(preview.parent, "write the preview"):
                 plan_preview.draw_preview(preview, shown)
-    return Forecast(planner.rows, run.refused, run.scans, figures)
+    kept = None if run.budget is None else run.budget.told(run.budget.most_seats)
+    return Forecast(planner.rows, run.refused, run.scans, figures, kept)
 
 
 def _planned_fine(attention: StageRef | None) -> FinePlan | None:
@@ -248,6 +250,7 @@ def plan_content(settings: Settings, preview: Path | None = None) -> dict[str, A
         "refused": found.refused,
         "scans": scans_content(found.scans),
         "field": found.figures,
+        **({} if found.kept is None else {"kept": found.kept}),
         **({} if preview is None else {"preview": str(preview)}),
     }
 
@@ -290,6 +293,8 @@ def show_plan(content: dict[str, Any], console: Console) -> None:
     console.print(table)
     for line in figure_lines(content["field"]):
         console.print(escape(line), soft_wrap=True)
+    if "kept" in content:
+        console.print(escape(kept_words(content["kept"])), soft_wrap=True)
     console.print(escape(_sentence(content)), soft_wrap=True)
     if content["scans"]["frontier"]:
         _show_scans(content["scans"], console)
@@ -297,6 +302,15 @@ def show_plan(content: dict[str, Any], console: Console) -> None:
         console.print(f"preview: {escape(content['preview'])}", soft_wrap=True)
     if content["refused"] is not None:
         console.print(f"[yellow]refused here[/]: {escape(content['refused'])}", soft_wrap=True)
+
+
+def kept_words(kept: Mapping[str, Any]) -> str:
+    """How much of a plain scan the budgets pay for at most."""
+    read, stored = (kept[name]["done"] / kept[name]["everything"] for name in ("multiply_adds", "bytes"))
+    return (
+        f"detail: at most {kept['seats']} of {kept['of_seats']} seats, for {format_percent(read)} of the multiply-adds "
+        f"of reading everything and {format_percent(stored)} of the bytes of keeping it"
+    )
 
 
 def _show_scans(scans: dict[str, Any], console: Console) -> None:

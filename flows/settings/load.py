@@ -155,7 +155,13 @@ def load_settings(
             origin[key] = "flag"
     for wrong in _contradictions({key for key, value in table.items() if value is not None}, origin):
         raise SettingsError(wrong)
-    return parse_settings({**(usual or {}), **table}, origin)
+    return parse_settings({**_usual_policy(table), **(usual or {}), **table}, origin)
+
+
+def _usual_policy(table: Mapping[str, object]) -> dict[str, object]:
+    """Where multiply-adds are short, the policy whose scores take hardly any; a least gain needs scores in nat."""
+    short = table.get("compute") is not None and table.get("least_gain") is None
+    return {"policy": CHEAP_POLICY} if short and table.get("policy") is None else {}
 
 
 def parse_settings(table: Mapping[str, object], origin: Mapping[str, str] | None = None) -> Settings:
@@ -259,6 +265,7 @@ def _contradictions(given: set[str], origin: Mapping[str, str]) -> Iterator[str]
         yield f"{by_hand[0]} is for a plain scan: give --scan-step too (1 for every line), or --coarse-exposure-ms"
 
 
+CHEAP_POLICY = "sobel"  # of the coarse image alone: gain would have the network read it twice
 IN_NAT = ("gain", "entropy")  # policies whose scores are gains, or the most that these can be
 _VGG_FROM = {"vgg-static": VGG_FROM, "vgg-trained": TRAINED_VGG_FROM}  # policies that read a file of VGG19
 

@@ -92,6 +92,11 @@ class SeatBudget:
         kept = bisect_right(counts, self._most_bytes, key=self.bytes_of)
         return ranked[: min(read, kept)]
 
+    @property
+    def most_seats(self) -> NDArray[np.intp]:
+        """As many seats as the limits pay for, whatever they promise."""
+        return self.choose(np.full(math.prod(self.grid.seat_shape), np.inf))
+
     def told(self, seats: NDArray[np.integer]) -> dict[str, Any]:
         """What these seats take beside reading and keeping everything, for a receipt."""
         whole = {"multiply_adds": self.everything, "bytes": self.every_byte}

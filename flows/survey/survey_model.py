@@ -109,12 +109,13 @@ def weights_path(settings: Settings) -> Path:
             f"--weights is missing: the weights that come with SpectralZoom know the built-in farm only;"
             f" train some for {settings.scene} with: spectralzoom train DATASET -o my.safetensors"
         )
-    return shipped_weights()
+    return shipped_weights(sparing=settings.sparing)
 
 
-def shipped_weights() -> Path:
-    """The weights that come with the house."""
-    return Path(str(resources.files("models") / "shipped" / "farm.safetensors"))
+def shipped_weights(*, sparing: bool = False) -> Path:
+    """The weights that come with the house; ``sparing`` ones read coarse means of 2 x 2 px, for seats bought singly."""
+    name = "farm-sparing.safetensors" if sparing else "farm.safetensors"
+    return Path(str(resources.files("models") / "shipped" / name))
 
 
 def vgg_file(settings: Settings) -> VggFile | None:

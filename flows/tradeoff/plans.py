@@ -1,13 +1,19 @@
-"""The trade-off of the whole: what a map is worth against the camera's seconds, for plain scans and for two passes."""
+"""The trade-off of the whole: what a map is worth against the camera's seconds, for plain scans and for two passes.
+
+Parts of a scan take the seconds of all of it, and less of the network's multiply-adds, which stand beside.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flows.settings.load import CHEAP_POLICY
+from flows.survey.reading_costs import ReadingCosts
+from flows.survey.seat_budget import SeatBudget
 from flows.survey.stages.accuracy import columns_of_all_seats
 from flows.survey.survey_model import shipped_weights
 from flows.tradeoff.entries import Setting, Tradeoff, register_all
@@ -18,7 +24,7 @@ from models.reading.inference import DrawnMap, Glance, glance, glance_of_columns
 from models.weights.files import Weights, load_weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import CostModel, Sweep
+from pipeline.geometry.scan import Axis, CostModel, Sweep
 from pipeline.planning.coverage import cheapest_full, coarse_sweeps, plain_sweeps
 from pipeline.planning.fine_pass import plan_fine
 from pipeline.planning.plain_scans import scan_words
@@ -31,6 +37,8 @@ from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 SHAPE = (384, 512)
 SCANS = {scan_words(step, ms): (step, ms) for step in (1, 2, 4) for ms in (100.0, 50.0, 25.0, 12.0, 6.0)}
 BUDGETS = {f"two passes, budget {budget:g}": budget for budget in (0.8, 0.65, 0.5, 0.4)}
+PART_OF = (1, 25.0)  # step and exposure [ms] of the scan of which parts are read in detail
+PARTS = {f"{scan_words(*PART_OF)} in part, {share} of the multiply-adds": share for share in ("50%", "35%", "25%")}
 MEMORY = 2**30  # bytes that rectifying may take
 Columns = NDArray[np.float32]
 
@@ -44,15 +52,14 @@ class PlannedLook:
     columns: Columns  # (seat, p, p, column)
     seconds: float
     bytes_raw: int
+    weights: Weights  # that read it
 
 
 @dataclass(frozen=True)
 class PlannedField:
     """A farm that training never saw, by every plan."""
 
-    weights: Weights
     labels: NDArray[np.uint8]
-    grid: SceneGrid
     bands: int
     looks: Mapping[Setting, PlannedLook]
 
@@ -68,8 +75,16 @@ def plain_look(
     small = cells.swapaxes(1, 2).reshape(down * p // s, across * p // s, -1)
     seats, size = grid.valid_seats(), raw_bytes(sweeps, camera, len(source.wavelength_nm))
     return PlannedLook(
-        glance_of_columns(weights, small, grid), seats, columns[seats], cost.seconds(sweeps, camera), size
+        glance_of_columns(weights, small, grid), seats, columns[seats], cost.seconds(sweeps, camera), size, weights
     )
+
+
+def part_of(look: PlannedLook, bands: int, compute: str) -> PlannedLook:
+    """The same scan with the seats alone that edges promise most of, for a share of the multiply-adds."""
+    costs = ReadingCosts(look.weights.config, look.seen.grid, bands)
+    budget = SeatBudget(costs, look.seats, CHEAP_POLICY, compute)
+    kept = np.sort(budget.choose(score_seats(CHEAP_POLICY, look.seen)))
+    return replace(look, seats=kept, columns=look.columns[np.searchsorted(look.seats, kept)])
 
 
 def _prepare(seed: int) -> PlannedField:
@@ -79,11 +94,13 @@ def _prepare(seed: int) -> PlannedField:
     source, bands = SimulatedSource(scene, Rig(camera), seed), len(scene.wavelength_nm)
     along, full, full_s = cheapest_full(grid, camera, cost)
     looks: dict[Setting, PlannedLook] = {
-        words: plain_look(
-            weights, source, plain_sweeps(grid, camera, along, step=step, exposure_ms=exposure_ms), grid, cost
-        )
+        words: plain_look(weights, source, _sweeps_of(grid, camera, along, step, exposure_ms), grid, cost)
         for words, (step, exposure_ms) in SCANS.items()
     }
+    sparing = load_weights(shipped_weights(sparing=True))
+    finer, sweeps = replace(grid, factor=sparing.config.factor), _sweeps_of(grid, camera, along, *PART_OF)
+    whole = plain_look(sparing, source, sweeps, finer, cost)
+    looks |= {words: part_of(whole, bands, share) for words, share in PARTS.items()}
     coarse, every = coarse_sweeps(grid, camera, along), looks[scan_words(1, camera.exposure_ms)]
     rows = mosaic_rows([SimulatedSweep(source, sweep) for sweep in coarse], camera, grid, rows=64)
     seen = glance(weights, np.concatenate([values for _, values, _ in rows]), scene.wavelength_nm, grid)
@@ -92,21 +109,26 @@ def _prepare(seed: int) -> PlannedField:
         plan = plan_fine(grid, camera, cost, along, scores, budget_s=budget * full_s - coarse_s, full=full)
         columns = every.columns[np.searchsorted(every.seats, plan.seats)]
         size = raw_bytes([*coarse, *plan.sweeps], camera, bands)
-        looks[words] = PlannedLook(seen, plan.seats, columns, coarse_s + plan.seconds, size)
-    return PlannedField(weights, np.asarray(scene.labels, np.uint8), grid, bands, looks)
+        looks[words] = PlannedLook(seen, plan.seats, columns, coarse_s + plan.seconds, size, weights)
+    return PlannedField(np.asarray(scene.labels, np.uint8), bands, looks)
+
+
+def _sweeps_of(grid: SceneGrid, camera: LineCamera, along: Axis, step: int, exposure_ms: float) -> list[Sweep]:
+    return plain_sweeps(grid, camera, along, step=step, exposure_ms=exposure_ms)
 
 
 def _read(field: PlannedField, plan: Setting) -> DrawnMap:
     look = field.looks[plan]
-    return segment(field.weights, look.seen, look.columns, look.seats)
+    return segment(look.weights, look.seen, look.columns, look.seats)
 
 
-def _miss(field: PlannedField, _plan: Setting, drawn: DrawnMap) -> float:
-    return 1 - mean_iou(confusion(field.labels, drawn.classes, field.weights.config.classes))
+def _miss(field: PlannedField, plan: Setting, drawn: DrawnMap) -> float:
+    return 1 - mean_iou(confusion(field.labels, drawn.classes, field.looks[plan].weights.config.classes))
 
 
 def _billion_operations(field: PlannedField, plan: Setting, _drawn: DrawnMap) -> float:
-    return multiply_adds(field.weights.config, field.grid, len(field.looks[plan].seats), field.bands).total / 1e9
+    look = field.looks[plan]
+    return multiply_adds(look.weights.config, look.seen.grid, len(look.seats), field.bands).total / 1e9
 
 
 PLAN = Tradeoff(
@@ -114,8 +136,8 @@ PLAN = Tradeoff(
     knob="plan",
     error="1 - mIoU",
     unit="scene px",
-    reference=f"labels of a farm of {SHAPE[1]} x {SHAPE[0]} px; two passes by policy gain",
-    settings=(*SCANS, *BUDGETS),
+    reference=f"labels of a farm of {SHAPE[1]} x {SHAPE[0]} px; two passes by policy gain, parts by edges",
+    settings=(*SCANS, *PARTS, *BUDGETS),
     prepare=_prepare,
     run=_read,
     judge=_miss,

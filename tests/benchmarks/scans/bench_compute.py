@@ -9,22 +9,23 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
-from bench_frontier import BANDS, CAMERA, COST, SEEDS, SHAPE, chosen_scan, shipped
+from bench_frontier import BANDS, CAMERA, COST, SEEDS, SHAPE, chosen_scan
 from measure import Row
 from numpy.typing import NDArray
 
+from flows.settings.load import CHEAP_POLICY
 from flows.survey.reading_costs import ReadingCosts
 from flows.survey.seat_budget import SeatBudget
+from flows.survey.survey_model import shipped_weights
 from flows.tradeoff.plans import plain_look
 from flows.training.look import chosen_effects
 from models.evaluation.metrics import confusion, mean_iou
 from models.evaluation.placement import oracle_gain
 from models.policies.policies import score_seats
 from models.reading.inference import Glance, glance_of_columns, segment
-from models.weights.files import Weights
+from models.weights.files import Weights, load_weights
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.coverage import cheapest_full, plain_sweeps
 from pipeline.simulator.rig_model import Rig
@@ -62,10 +63,9 @@ def judged(labels: NDArray[np.uint8], classes: NDArray[np.uint8], weights: Weigh
     return 100 * mean_iou(confusion(labels, classes, weights.config.classes))
 
 
-@cache
-def scanned(seed: int) -> tuple[Columns, NDArray[np.uint8]]:
-    """Columns of all seats of a farm's scan, (seat, p, p, column), and its labels."""
-    weights, scan = shipped(), chosen_scan(SHAPE, SECONDS)
+def field_of(weights: Weights, seed: int) -> ReadField:
+    """Read all of a farm's scan by some weights."""
+    scan = chosen_scan(SHAPE, SECONDS)
     scene, rig = farm_scene(seed, SHAPE, camera=CAMERA), Rig(CAMERA)
     grid = SceneGrid(*SHAPE, weights.config.patch, weights.config.factor)
     along, _, _ = cheapest_full(grid, CAMERA, COST)
@@ -74,17 +74,10 @@ def scanned(seed: int) -> tuple[Columns, NDArray[np.uint8]]:
     source = SimulatedSource(scene, rig, seed, chosen_effects(scene, rig, sweeps), clock=clock)
     look = plain_look(weights, source, sweeps, grid, COST)  # the grid holds whole cells: every seat is valid
     assert scene.labels is not None
-    return look.columns, scene.labels
-
-
-def field_of(weights: Weights, seed: int) -> ReadField:
-    """Read a farm by some weights; those with other columns than the shipped ones cannot."""
-    columns, labels = scanned(seed)
-    grid = SceneGrid(*SHAPE, weights.config.patch, weights.config.factor)
-    seen = glance_of_columns(weights, means(picture(columns, grid), grid.factor), grid)
-    drawn = segment(weights, seen, columns, grid.valid_seats())
-    every, oracle = judged(labels, drawn.classes, weights), oracle_gain(weights, seen, columns, labels)
-    return ReadField(seen, columns, labels, ReadingCosts(weights.config, grid, BANDS), every, oracle)
+    drawn = segment(weights, look.seen, look.columns, look.seats)
+    oracle = oracle_gain(weights, look.seen, look.columns, scene.labels)
+    every, costs = judged(scene.labels, drawn.classes, weights), ReadingCosts(weights.config, grid, BANDS)
+    return ReadField(look.seen, look.columns, scene.labels, costs, every, oracle)
 
 
 def picture(columns: Columns, grid: SceneGrid) -> Columns:
@@ -101,16 +94,22 @@ def means(image: Columns, step: int) -> Columns:
 
 
 def rows() -> list[Row]:
-    """What budgets lose, the policies beside chance and the oracle; then reading all of the field less finely."""
-    weights = shipped()
-    fields = [field_of(weights, seed) for seed in SEEDS]
-    found = [Row("everything kept and read", _figure([field.every for field in fields]))]
-    none = [field.miou(weights, field.seen.grid.valid_seats()[:0]) - field.every for field in fields]
-    found.append(Row("coarse means alone", _figure(none)))
-    return [*found, *_budget_rows(weights, fields), *_price_rows(weights, fields), *_less_fine_rows(weights, fields)]
+    """What budgets lose by the weights of scans that are read whole, then by those that surveys with budgets take."""
+    found = []
+    for sparing in (False, True):
+        path = shipped_weights(sparing=sparing)
+        weights = load_weights(path)
+        fields = [field_of(weights, seed) for seed in SEEDS]
+        s = weights.config.factor
+        none = [field.miou(weights, field.seen.grid.valid_seats()[:0]) - field.every for field in fields]
+        found.append(Row(f"{path.stem}: everything kept and read", _figure([field.every for field in fields])))
+        found.append(Row(f"means of {s} x {s} px alone", _figure(none)))
+        found += [*_budget_rows(weights, fields, sparing), *_price_rows(weights, fields)]
+        found += [] if sparing else _less_fine_rows(weights, fields)
+    return found
 
 
-def _budget_rows(weights: Weights, fields: Sequence[ReadField]) -> Iterator[Row]:
+def _budget_rows(weights: Weights, fields: Sequence[ReadField], sparing: bool) -> Iterator[Row]:
     for compute, kept in BUDGETS:
         for policy in (*POLICIES, "oracle"):
             losses, shares = [], []
@@ -119,7 +118,7 @@ def _budget_rows(weights: Weights, fields: Sequence[ReadField]) -> Iterator[Row]
                 bought = budget.choose(_scores(field, policy, seed))
                 losses.append(field.miou(weights, bought) - field.every)
                 shares.append(_shares(budget, bought))
-            most = GOALS.get((compute, kept)) if policy == "gain" else None
+            most = GOALS.get((compute, kept)) if sparing and policy == CHEAP_POLICY else None
             goal = "" if most is None else f">= -{most:g}"
             met = None if most is None else float(np.mean(losses)) >= -most
             yield Row(f"--compute {compute} --bytes-kept {kept}, {policy}", _figure(losses), goal, met, shares[0])
@@ -169,8 +168,8 @@ def _scores(field: ReadField, policy: str, seed: int) -> NDArray[np.float64]:
 
 
 def _counted(policy: str) -> str:
-    """The oracle is counted as the policy that it is set beside."""
-    return "gain" if policy == "oracle" else policy
+    """The oracle's scores are counted as those of the usual policy."""
+    return CHEAP_POLICY if policy == "oracle" else policy
 
 
 def _shares(budget: SeatBudget, seats: NDArray[np.integer]) -> str:

@@ -13,19 +13,31 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from flows.settings.load import parse_settings
+from flows.archive.plan_command import kept_words, plan_content
+from flows.settings.load import load_settings, parse_settings
 from flows.survey.reading_costs import ReadingCosts
 from flows.survey.seat_budget import SeatBudget
+from flows.survey.survey_model import shipped_weights, weights_path
 from models.network.sizes import SegmenterConfig
+from models.weights.files import describe_weights, save_weights
 from pipeline.errors import BudgetError, SettingsError
 from pipeline.geometry.grid import SceneGrid
-from tests.conftest import Survey
+from pipeline.planning.plain_scans import ScanRecord
+from tests.conftest import RGB_NM, Survey, random_weights
 
 COSTS = ReadingCosts(SegmenterConfig(classes=5), SceneGrid(192, 256, 16, 4), 30)
 SEATS = 12 * 16
 SCAN: dict[str, Any] = {"budget": None, "scan_step": "2", "scan_exposure_ms": "25"}
 shares = st.floats(5, 100).map(lambda percent: f"{percent!r}%")
 scores = st.integers(0, 2**32 - 1).map(lambda seed: np.random.default_rng(seed).normal(0.1, 0.1, SEATS))
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Tiny weights."""
+    path = tmp_path_factory.mktemp("weights") / "weights.safetensors"
+    save_weights(random_weights(RGB_NM), path)
+    return path
 
 
 def _asked(shown: NDArray[np.bool_] | None = None, **limits: object) -> SeatBudget | None:
@@ -178,6 +190,40 @@ def test_a_budget_is_refused_before_anything_is_captured(survey_png: Survey, tmp
     with pytest.raises(BudgetError, match=r"--compute 1% does not pay for the coarse look"):
         survey_png(tmp_path / "out", **SCAN, compute="1%")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_plan_tells_what_the_budgets_pay_for(scene_files: Path, tiny: Path, tmp_path: Path) -> None:
+    """Before the first line: the most seats, and what they take."""
+    given_settings = {"scene": str(scene_files / "scene.png"), "weights": str(tiny), "out": str(tmp_path)}
+    content = plan_content(load_settings(None, {**given_settings, "scan_step": "1", "bytes_kept": "50%"}))
+    assert 0.49 < content["kept"]["bytes"]["done"] / content["kept"]["bytes"]["everything"] <= 0.5
+    assert f"detail: at most {content['kept']['seats']} of 192 seats" in kept_words(content["kept"])
+
+
+@pytest.mark.parametrize(
+    ("asked", "policy"),
+    [
+        ({}, "gain"),
+        ({"compute": "25%"}, "sobel"),
+        ({"compute": "25%", "policy": "entropy"}, "entropy"),
+        ({"compute": "25%", "least_gain": "0.1"}, "gain"),
+        ({"bytes_kept": "40%"}, "gain"),
+    ],
+)
+def test_scores_are_cheap_where_multiply_adds_are_short(asked: dict[str, str], policy: str) -> None:
+    """By default; who names a policy gets it, and a least gain is asked of scores that are gains."""
+    assert load_settings(None, {"seconds": "5", **asked}).policy == policy
+
+
+def test_the_house_has_weights_for_budgets() -> None:
+    """Whose coarse pixels are 2 px wide, with a record of scans; of a scan that is read whole those for all surveys."""
+    asked = parse_settings({"scan_step": 1, "compute": "25%"})
+    assert weights_path(asked) == shipped_weights(sparing=True)
+    assert weights_path(replace(asked, compute=None)) == shipped_weights() != shipped_weights(sparing=True)
+    described = describe_weights(shipped_weights(sparing=True))
+    assert described.config.factor == 2
+    assert described.class_names == describe_weights(shipped_weights()).class_names
+    assert ScanRecord.read(described.record["scans"]).steps == (1, 2)
 
 
 def test_scores_without_a_glance_cost_no_glance() -> None:
