@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.simulator.effects.probe import second_difference, steepest_difference
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, RasterScene, to_bands
 
 Light = NDArray[np.float32]
@@ -19,12 +20,16 @@ _ROWS_AT_ONCE = 64
 
 @dataclass(frozen=True)
 class WideLight:
-    """Means of several pixels of a scene: their ends (band,) [e-] and derivatives (2, band) [e-/px, e-/px^2]."""
+    """Means of several pixels of a scene: their ends (band,) [e-] and derivatives (2, band) [e-/px, e-/px^2].
+
+    ``spectral`` (2, band) are the greatest divided differences over wavelength [e-/nm, e-/nm^2].
+    """
 
     low: Light
     high: Light
     slope: Light
     curvature: Light
+    spectral: Light
 
 
 def seen_widely(scene: RasterScene, exposure_ms: float) -> WideLight:
@@ -36,7 +41,11 @@ def seen_widely(scene: RasterScene, exposure_ms: float) -> WideLight:
     bands = len(scene.wavelength_nm)
     low, high = np.full(bands, np.inf, np.float32), np.full(bands, -np.inf, np.float32)
     slope, curvature, window = np.zeros(bands, np.float32), np.zeros(bands, np.float32), 2 * BLOCK_PX
+    nm, spectral = np.asarray(scene.wavelength_nm, np.float64), np.zeros((2, bands), np.float32)
     for means in _means(scene, spectra):
+        if bands > 1 and means.size:
+            differences = steepest_difference(means, nm), np.abs(second_difference(means, nm))
+            spectral = np.maximum(spectral, [one.max(axis=(0, 1)) for one in differences])
         low, high = np.minimum(low, means.min(axis=(0, 1))), np.maximum(high, means.max(axis=(0, 1)))
         for axis in (0, 1):
             ahead, middle, behind = _thirds(means, axis)
@@ -44,7 +53,7 @@ def seen_widely(scene: RasterScene, exposure_ms: float) -> WideLight:
             slope = np.maximum(slope, np.abs(ahead - middle).max(axis=(0, 1), initial=0.0))
             curvature = np.maximum(curvature, np.abs(bent).max(axis=(0, 1), initial=0.0))
     steep, bent = np.stack([slope] * 2) / np.float32(window), np.stack([curvature] * 2) / np.float32(window**2)
-    return WideLight(low, high, steep, bent)
+    return WideLight(low, high, steep, bent, spectral)
 
 
 def _means(scene: RasterScene, spectra: Light) -> Iterator[Light]:

@@ -11,7 +11,14 @@ from hypothesis import strategies as st
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, scene_to_sweep
-from pipeline.simulator.effects.probe import Detail, Probe
+from pipeline.simulator.effects.probe import (
+    Detail,
+    Probe,
+    lights_within,
+    second_difference,
+    spectral_differences_between,
+    steepest_difference,
+)
 from pipeline.simulator.rig_model import Optics, Rig
 from pipeline.simulator.selection.line_means import line_means
 from pipeline.simulator.selection.reached_cells import reached_cells
@@ -75,6 +82,44 @@ def test_bounds_hold_where_little_is_seen(number: int) -> None:
     assert broken == []
 
 
+@pytest.mark.parametrize(
+    ("number", "effect", "lines"),
+    [
+        (134, "path-radiance", range(156, 158)),  # a dark band among bright ones, under a bright sky
+        (164, "response", None),  # a field in one band of twelve, beside a lone sweep
+    ],
+)
+def test_bounds_hold_where_bands_differ(number: int, effect: str, lines: range | None) -> None:
+    """Each band counts with its own least light, and by what its neighbours bring from beside that it does not."""
+    found = list(trials(replace(sparse_case(number), looked=lines), (1, 2 + number % 7), effect))
+    assert found
+    assert [one for one in found if one.is_broken] == []
+
+
+def test_least_light_of_a_dark_band_is_that_of_its_group() -> None:
+    """Of thirteen even bands, every second of them dark, the dark ones are not taken to be as bright as the others."""
+    values = np.ones((60, 80, 13))
+    values[..., ::2] = 0.1
+    scene = image_scene(values, CAMERA, np.linspace(400, 1000, 13))
+    probe = probe_scene(scene, SHARP, [Sweep("s", "fine", "x", 0.0, -32.0, 64)])
+    low, high = lights_within(probe, SHARP)
+    light = (scene.planes * scene.electrons)[0, 0]
+    assert (low <= 1.001 * light).all()
+    assert (high >= 0.999 * light).all()
+
+
+@given(st.integers(2, 6), st.integers(0, 2**32 - 1))
+def test_no_spectrum_between_two_is_steeper_than_said(bands: int, seed: int) -> None:
+    """Of light that is not looked at only its ends are known: differences over wavelength are within theirs."""
+    rng = np.random.default_rng(seed)
+    nm = 400 + np.cumsum(rng.uniform(0.1, 20, bands))
+    ends = np.sort(rng.uniform(0, 100, (2, bands)), axis=0)
+    spectra = np.concatenate([rng.uniform(*ends, (50, bands)), np.where(rng.random((50, bands)) < 0.5, *ends)])
+    steep, bent = spectral_differences_between(ends, nm)
+    assert (steepest_difference(spectra, nm) <= steep + 1e-9).all()
+    assert (np.abs(second_difference(spectra, nm)) <= bent + 1e-9).all()
+
+
 @given(
     st.integers(20, 300),
     st.integers(20, 300),
@@ -121,8 +166,8 @@ def test_covered_scene_has_nothing_beside() -> None:
 def beside_probe(far: float) -> Probe:
     """An even scene, and detail from 2 px beside the sweeps on."""
     none, some, both = np.zeros(1), np.full(1, far), np.full((2, 1), far)
-    details = (Detail(2.0, none, np.zeros((2, 1)), np.zeros((2, 1))), Detail(24.0, some, both, both))
-    afar = Detail(np.inf, some, both / 8, both / 64)
+    details = (Detail(2.0, none, *[np.zeros((2, 1))] * 3), Detail(24.0, some, both, both, both))
+    afar = Detail(np.inf, some, both / 8, both / 64, both)
     return replace(steep_probe((0.0, 0.0), span=0.0), beside=details, afar=afar, anywhere=some)
 
 
