@@ -103,9 +103,18 @@ def _rank(ranking: Ranking, strip: _Strip, light: Light, optics: PixelOptics, ti
 def _offer(
     ranking: Ranking, kind: tuple[int, int], worth: Light, taken: NDArray[np.bool_], first: int, tile: int
 ) -> None:
+    """Offer the greatest of every tile and band; worth (row, column, band) of the strip that begins at a row."""
+    columns = worth.shape[1]
+    shown = np.where(taken[..., None], worth, np.float32(-np.inf))
+    rows = shown.argmax(axis=0)  # (column, band)
+    ridge = np.take_along_axis(shown, rows[None], axis=0)[0]
+    ridge = np.pad(ridge, [(0, -columns % tile), (0, 0)], constant_values=-np.inf).reshape(-1, tile, worth.shape[2])
+    within = ridge.argmax(axis=1)  # (tile, band)
+    column = np.minimum(within + np.arange(len(ridge))[:, None] * tile, columns - 1)
+    greatest = np.take_along_axis(ridge, within[:, None], axis=1)[:, 0]
+    row = first + np.take_along_axis(rows, column, axis=0)
     for band in range(worth.shape[2]):
-        shown = np.where(taken, worth[..., band], -np.inf)
-        ranking.offer((*kind, band), _tile_maxima(shown, first, tile))
+        ranking.offer((*kind, band), greatest[:, band], row[:, band], column[:, band])
 
 
 def telling_bands(spectra: Light) -> NDArray[np.intp]:
@@ -148,14 +157,3 @@ def _check_finite(scene: RasterScene, planes: Light, first: int) -> None:
         f"scene {scene.name} is not finite at row {row}, column {column}, component {component};"
         " fill such pixels before it is simulated"
     )
-
-
-def _tile_maxima(worth: Light, first: int, tile: int) -> list[tuple[float, int, int]]:
-    columns = worth.shape[1]
-    best_row = worth.argmax(axis=0)
-    ridge = worth[best_row, np.arange(columns)]
-    found = []
-    for start in range(0, columns, tile):
-        column = start + int(ridge[start : start + tile].argmax())
-        found.append((float(ridge[column]), first + int(best_row[column]), column))
-    return found

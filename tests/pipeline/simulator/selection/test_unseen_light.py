@@ -20,13 +20,15 @@ from pipeline.simulator.effects.probe import (
     steepest_difference,
 )
 from pipeline.simulator.rig_model import Optics, Rig
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, to_bands
 from pipeline.simulator.selection.line_means import line_means
 from pipeline.simulator.selection.reached_cells import reached_cells
+from pipeline.simulator.selection.surroundings import seen_widely
 from pipeline.simulator.selection.survey_probe import probe_scene
 from tests.pipeline.simulator.bound_trials import trials
 from tests.pipeline.simulator.made_up_effects import steep_probe
 from tests.pipeline.simulator.random_cases import Case
-from tests.pipeline.simulator.small_scenes import image_scene
+from tests.pipeline.simulator.small_scenes import image_scene, made_scene
 from tests.pipeline.simulator.sparse_cases import sparse_case
 
 CAMERA = LineCamera(samples=96)
@@ -118,6 +120,20 @@ def test_no_spectrum_between_two_is_steeper_than_said(bands: int, seed: int) -> 
     steep, bent = spectral_differences_between(ends, nm)
     assert (steepest_difference(spectra, nm) <= steep + 1e-9).all()
     assert (np.abs(second_difference(spectra, nm)) <= bent + 1e-9).all()
+
+
+@pytest.mark.parametrize("components", [None, 2])
+def test_wide_spectra_are_those_of_means(components: int | None) -> None:
+    """Of planes of bands, or of components that mix spectra: the greatest differences of 8 x 8 px, a block apart."""
+    rng, nm = np.random.default_rng(3), np.array([400.0, 410.0, 440.0, 500.0])
+    planes = rng.uniform(0, 1, (24, 16, components or 4)).astype(np.float32)
+    scene = made_scene(planes, rng.uniform(100, 900, (components, 4) if components else 4), nm)
+    found = seen_widely(scene, DEFAULT_EXPOSURE_MS)
+    blocks = np.pad(to_bands(planes, scene.electrons), [(16, 16), (16, 16), (0, 0)], mode="edge")
+    blocks = blocks.reshape(14, 4, 12, 4, 4).mean(axis=(1, 3))
+    means = (blocks[1:, 1:] + blocks[1:, :-1] + blocks[:-1, 1:] + blocks[:-1, :-1]) / 4
+    expected = steepest_difference(means, nm), np.abs(second_difference(means, nm))
+    np.testing.assert_allclose(found.spectral, [one.max(axis=(0, 1)) for one in expected], rtol=1e-4)
 
 
 @given(
