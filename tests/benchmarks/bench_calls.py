@@ -119,7 +119,7 @@ def _scenes(folder: Path) -> dict[str, tuple[list[str], Path | None]]:
     """Words of the command for each scene, and the folder that it needs where that is not there."""
     frames, pines = data_folder("cwfid") / "images" / FRAMES[0], data_folder("indian_pines")
     cube = pines / "Indian_pines_corrected.npy"
-    made = {"bare field": _bare_field(), "night": _night()}
+    made = {"bare field": bare_field(), "night": night()}
     nm = ",".join(f"{one:.1f}" for one in np.linspace(400, 1000, BANDS))
     found: dict[str, tuple[list[str], Path | None]] = {
         "farm 1280 x 1024": (["farm"], None),
@@ -132,7 +132,7 @@ def _scenes(folder: Path) -> dict[str, tuple[list[str], Path | None]]:
     return found
 
 
-def _bare_field() -> NDArray[np.float32]:
+def bare_field() -> NDArray[np.float32]:
     """Soil without an edge: moister and drier over 20 px and more, by 3 % (sd)."""
     rng = np.random.default_rng(0)
     moist = gaussian_filter(rng.standard_normal(SHAPE), 20.0)
@@ -140,7 +140,7 @@ def _bare_field() -> NDArray[np.float32]:
     return np.asarray(spectrum * (1 + 0.03 * moist / moist.std())[..., None], np.float32)
 
 
-def _night() -> NDArray[np.float32]:
+def night() -> NDArray[np.float32]:
     """Dark land, a five hundredth of the lamps that stand on it as small glows of a few px."""
     rng = np.random.default_rng(1)
     glow = np.zeros(SHAPE)
