@@ -104,16 +104,15 @@ def _offer(
     ranking: Ranking, kind: tuple[int, int], worth: Light, taken: NDArray[np.bool_], first: int, tile: int
 ) -> None:
     """Offer the greatest of every tile and band; worth (row, column, band) of the strip that begins at a row."""
-    columns = worth.shape[1]
-    shown = np.where(taken[..., None], worth, np.float32(-np.inf))
-    rows = shown.argmax(axis=0)  # (column, band)
-    ridge = np.take_along_axis(shown, rows[None], axis=0)[0]
-    ridge = np.pad(ridge, [(0, -columns % tile), (0, 0)], constant_values=-np.inf).reshape(-1, tile, worth.shape[2])
+    _, columns, bands = worth.shape
+    shown = worth if taken.all() else np.where(taken[..., None], worth, np.float32(-np.inf))
+    ridge = np.pad(shown.max(axis=0), [(0, -columns % tile), (0, 0)], constant_values=-np.inf)
+    ridge = ridge.reshape(-1, tile, bands)
     within = ridge.argmax(axis=1)  # (tile, band)
     column = np.minimum(within + np.arange(len(ridge))[:, None] * tile, columns - 1)
     greatest = np.take_along_axis(ridge, within[:, None], axis=1)[:, 0]
-    row = first + np.take_along_axis(rows, column, axis=0)
-    for band in range(worth.shape[2]):
+    row = first + shown[:, column, np.arange(bands)].argmax(axis=0)
+    for band in range(bands):
         ranking.offer((*kind, band), greatest[:, band], row[:, band], column[:, band])
 
 
