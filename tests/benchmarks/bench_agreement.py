@@ -34,9 +34,9 @@ def rows() -> list[Row]:
 
 
 def _of_seed(seed: int) -> list[Row]:
-    exact, _ = _mapped(seed, effects="all")
-    auto, auto_miou = _mapped(seed, effects="auto", tol=str(TOLERANCE))
-    drawn_alike, miou = _mapped(seed, effects="auto", tol=NOISE_ALONE)
+    exact, _ = mapped(seed, effects="all")
+    auto, auto_miou = mapped(seed, effects="auto", tol=str(TOLERANCE))
+    drawn_alike, miou = mapped(seed, effects="auto", tol=NOISE_ALONE)
     same, apart = float((auto == drawn_alike).mean()), auto != drawn_alike
     at_border = float(_borders(drawn_alike)[apart].mean()) if apart.any() else 1.0
     return [
@@ -55,7 +55,7 @@ def _of_seed(seed: int) -> list[Row]:
     ]
 
 
-def _mapped(seed: int, **flags: str) -> tuple[Classes, float]:
+def mapped(seed: int, **flags: str) -> tuple[Classes, float]:
     """Class map (y, x) of a survey, and its mean IoU."""
     with tempfile.TemporaryDirectory() as folder:
         given = {"scene": "farm", "size": SIZE, "seed": str(seed), "engine": "plain", "controls": False, "out": folder}

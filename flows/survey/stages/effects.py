@@ -20,7 +20,7 @@ from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.effects.probe import Probe, unit_at
 from pipeline.simulator.effects.registry import BY_NAME, EFFECTS
 from pipeline.simulator.render import expected_light
-from pipeline.simulator.selection.choice import Decision, decide, list_effects, sum_up
+from pipeline.simulator.selection.choice import TOTAL, Decision, decide, list_effects, sum_up
 from pipeline.simulator.selection.survey_probe import probe_survey
 from pipeline.simulator.selection.verification import candidate_blocks, verify, worst_blocks
 from pipeline.simulator.simulated import SimulatedSource, sweep_block, sweep_starts
@@ -29,7 +29,7 @@ from storage.archive.manifests import read_table
 from storage.archive.whole_files import to_json
 
 RECORD = "effects.json"
-MANIFEST = Product("effects", version=4, files=(RECORD,))
+MANIFEST = Product("effects", version=5, files=(RECORD,))
 LOOK = {
     ROTATION: ROTATION.variants[0],
     SLIT: SLIT.variants[-1],
@@ -103,7 +103,9 @@ def source_with(
 
 
 def _verified(run: CaptureRun, decision: Decision, probes: Sequence[Probe]) -> dict[str, float]:
-    """Measure what is left out on the worst lines of the scene, in the unit of the tolerance."""
+    """Measure what is left out on the worst lines of the scene, in the unit of the tolerance; nothing of everything."""
+    if decision.chosen == decision.exact:
+        return {TOTAL: 0.0}
     scene, rig = run.scene, run.settings.simulated_rig
 
     def units(light: Light, binning: int) -> Light:

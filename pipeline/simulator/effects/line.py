@@ -90,8 +90,8 @@ class SlitBox(Effect):
     """
 
     name = "slit"
-    # Beside the rig's blurs, which need eleven kernels whatever the slit, at strips of +-960 px; at +-320 less of them.
-    cost_ns = MappingProxyType({"9x3": 38.0, "5x2": 10.0, "3x1": 1.8, "1-percent": 1.4, "3-percent": 1.3, UPRIGHT: 0.3})
+    # Beside the rig's blurs, at a strip of 320 px: `python tests/benchmarks costs`. One box is no dearer than none.
+    cost_ns = MappingProxyType({"9x3": 10.0, "5x2": 3.4, "3x1": 0.5, "1-percent": 0.3, "3-percent": 0.2, UPRIGHT: 0.0})
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound by half as much again as the probe measured; where it has not, by the box's variance and the span.
@@ -141,7 +141,7 @@ class Smear(Effect):
     """
 
     name = "smear"
-    cost_ns = MappingProxyType({POSITIONS: 15.0, FOLDED: 5.2})
+    cost_ns = MappingProxyType({POSITIONS: 18.0, FOLDED: 0.2})
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound what a blur of the positions' variance changes; 0 where every line has one position.

@@ -35,7 +35,7 @@ class Staircase(Aim):
     """
 
     name = "staircase"
-    cost_ns = MappingProxyType({EXACT: 18.0, CENTRES: 0.01})  # exact: five positions a line instead of one
+    cost_ns = MappingProxyType({EXACT: 27.0, CENTRES: 0.01})  # exact: five positions a line instead of one
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
         positions = block.rig.mirror.positions_per_line

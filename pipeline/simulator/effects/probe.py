@@ -41,6 +41,7 @@ class Detail:
     span: Floats  # (band,) greatest difference of a sample's signal and anything there
     slope: Floats  # (2, band) [1/px]
     curvature: Floats  # (2, band) [1/px^2]
+    spectral: Floats  # (2, band) first and second divided difference over wavelength [1/nm, 1/nm^2]
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,8 @@ class Probe:
     beside: tuple[Detail, ...] = ()  # what lies beside the sweeps, the nearest first; none where they see all there is
     afar: Detail | None = None  # all of the scene, as what is `WIDE_PX` wide and more sees it: means of several pixels
     anywhere: Floats | None = None  # (band,) greatest difference of a sample's signal and any of the scene
+    anywhere_spectral: Floats | None = None  # (2, band) as `Detail.spectral`, of any spectra between `ends_e`
+    own_e: Floats | None = None  # (2, band) least and greatest light of samples; None: level and span tell [e-]
     ends_e: Floats | None = None  # (2, band) least and greatest light of all the scene, None as `anywhere` [e-]
 
     def within(self, reach_px: float) -> Probe:
@@ -89,8 +92,9 @@ class Probe:
         for one in self.beside:
             if reach_px <= one.reach_px:
                 return self._with(one)
-        both = np.stack([self.anywhere] * 2)
-        return replace(self, span=self.anywhere, slope=both, curvature=4 * both)
+        both, spectral = np.stack([self.anywhere] * 2), self.anywhere_spectral
+        found = replace(self, span=self.anywhere, slope=both, curvature=4 * both)
+        return found if spectral is None else replace(found, spectral_slope=spectral[0], spectral_curvature=spectral[1])
 
     def blurred_by(self, sd_px: float) -> Probe:
         """Give the probe of what a Gaussian of this size sees of the scene, its derivatives among it."""
@@ -130,7 +134,14 @@ class Probe:
         return np.asarray(np.minimum(both, self.anywhere))
 
     def _with(self, detail: Detail) -> Probe:
-        return replace(self, span=detail.span, slope=detail.slope, curvature=detail.curvature)
+        return replace(
+            self,
+            span=detail.span,
+            slope=detail.slope,
+            curvature=detail.curvature,
+            spectral_slope=detail.spectral[0],
+            spectral_curvature=detail.spectral[1],
+        )
 
     def _changed(self, variance_px2: Floats) -> Floats:
         by_curvature = _times(self.curvature, variance_px2 / 2)
@@ -198,9 +209,11 @@ def unit_electrons(light_e: Floats, probe: Probe, rig: Rig) -> Floats:
 def lights_within(probe: Probe, rig: Rig) -> tuple[Floats, Floats]:
     """Give least and greatest light of every band, (band,) each [e-]: where level and span have their units from.
 
-    With U(S)^2 = (S + n) / m for means of m samples, the greatest S has level S / U(S), and the least a difference of
-    span U to it, or a smaller.
+    Where the probe does not hold them: with U(S)^2 = (S + n) / m for means of m samples, the greatest S has level
+    S / U(S), and the least a difference of span U to it, or a smaller.
     """
+    if probe.own_e is not None:
+        return probe.own_e[0], probe.own_e[1]
     if probe.unit != "sigma" or rig.detector.noiseless:
         unit = unit_electrons(probe.level, probe, rig)
         high, way = probe.level * unit, probe.span * unit
@@ -293,3 +306,19 @@ def steepest_difference(spectra: NDArray[Real], wavelength_nm: Floats) -> NDArra
     out[..., :-1] = steep
     np.maximum(out[..., 1:], steep, out=out[..., 1:])
     return out
+
+
+def spectral_differences_between(ends_e: Floats, wavelength_nm: Floats) -> Floats:
+    """Greatest divided differences, (2, band), of any spectra between two, (2, band): light of what is not looked at.
+
+    Second differences are greatest where bands are at one end and their neighbours at the other.
+    """
+    if len(wavelength_nm) < 2:
+        return np.zeros((2, len(wavelength_nm)))
+    low, high = ends_e
+    gaps = np.diff(wavelength_nm)
+    step = np.maximum(high[1:] - low[:-1], high[:-1] - low[1:])  # to the next band
+    steep = np.divide(step, gaps, out=np.zeros_like(gaps), where=gaps > 0)
+    down, up = difference_rates(wavelength_nm)
+    to_last, to_next = np.append(0.0, step), np.append(step, 0.0)
+    return np.stack([np.maximum(np.append(steep, 0.0), np.append(0.0, steep)), down * to_last + up * to_next])

@@ -7,7 +7,6 @@ groups of neighbouring bands, are then measured as slit and pixel show them.
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise, zip_longest
 
@@ -21,7 +20,6 @@ from pipeline.simulator.selection.reached_cells import ReachedCells
 
 Light = NDArray[np.float32]
 Floats = NDArray[np.float64]
-Offer = tuple[float, int, int]  # worth, row and column
 Kind = tuple[int, int, int]  # tier, measure and band or group of bands
 BAND_GROUPS = 8
 _WINDOWS = 5  # tiles of each measure and group that are measured closely
@@ -31,16 +29,18 @@ class Ranking:
     """The best places of every kind."""
 
     def __init__(self) -> None:
-        self._offers: dict[Kind, list[Offer]] = {}
+        self._offers: dict[Kind, list[Floats]] = {}
 
-    def offer(self, kind: Kind, places: Sequence[Offer]) -> None:
-        """Add places of one kind; those of worth minus infinity are none."""
-        self._offers.setdefault(kind, []).extend(place for place in places if place[0] > -np.inf)
+    def offer(self, kind: Kind, worth: NDArray[np.floating], row: NDArray[np.intp], column: NDArray[np.intp]) -> None:
+        """Add places of one kind, (place,) each; those of worth minus infinity are none."""
+        offers = np.stack([worth, row, column]).astype(np.float64)
+        self._offers.setdefault(kind, []).append(offers[:, offers[0] > -np.inf])
 
     def best(self, tier: int, most: int) -> Floats:
         """Give the best of each kind in turns, none twice, (place, 2) rows and columns."""
-        offers = [heapq.nlargest(most, places) for kind, places in self._offers.items() if kind[0] == tier]
-        ranked = [[one[1:] for one in places] for places in offers]
+        offers = [np.concatenate(some, axis=1) for kind, some in self._offers.items() if kind[0] == tier]
+        best = [places[:, np.lexsort(places[::-1])[::-1][:most]] for places in offers]
+        ranked = [list(zip(*places[1:].astype(int).tolist(), strict=True)) for places in best]
         found = dict.fromkeys(place for rank in zip_longest(*ranked) for place in rank if place is not None)
         return np.array(list(found)[:most], np.float64).reshape(-1, 2)
 
@@ -114,7 +114,8 @@ class BandTiles:
                 row, column, band = windows[number]
                 down, right = divmod(best, self._tile)
                 group = next(place for place, some in enumerate(self._groups) if some.start <= band < some.stop)
-                ranking.offer((tier, sort, group), [(float(shown[best, number]), row + down, column + right)])
+                place = np.array([row + down]), np.array([column + right])
+                ranking.offer((tier, sort, group), shown[best, [number]], *place)
 
     def _window(self, row: int, column: int, band: int) -> Light:
         """Light about a tile in a band and its neighbours, (row, column, 3); the scene's edge is repeated."""

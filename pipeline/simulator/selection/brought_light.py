@@ -36,19 +36,29 @@ def blended_surroundings(probe: Probe, rig: Rig, moving: Sequence[Effect]) -> Pr
     way, parts = greatest_way_px(probe, rig, moving), _blur_parts(probe, rig, blurs)
     own = _blended(probe, 0.0, way, parts)
     beside = [_blended(probe, one.reach_px - way, way, parts) for one in probe.beside if one.reach_px > way]
-    return replace(probe, slope=own.slope, curvature=own.curvature, span=own.span, beside=tuple(beside))
+    return replace(
+        probe,
+        slope=own.slope,
+        curvature=own.curvature,
+        span=own.span,
+        spectral_slope=own.spectral[0],
+        spectral_curvature=own.spectral[1],
+        beside=tuple(beside),
+    )
 
 
 def _blended(probe: Probe, reach_px: float, way_px: float, parts: Sequence[tuple[float, float]]) -> Detail:
     """What lies within a reach once the image has been moved by so much and blurred by parts (share, sd)."""
     near = probe.within(reach_px + way_px)
     slope, curvature, span = near.slope, near.curvature, near.span
+    spectral = near_spectral = np.stack([near.spectral_slope, near.spectral_curvature])
     for share, sd in parts:
         seen = _seen_through(probe, reach_px + way_px, sd)
         slope = slope + share * np.maximum(seen.slope - near.slope, 0.0)
         curvature = curvature + share * np.maximum(seen.curvature - near.curvature, 0.0)
         span = span + share * np.maximum(seen.span - near.span, 0.0)
-    return Detail(reach_px, span, slope, curvature)
+        spectral = spectral + share * np.maximum(seen.spectral - near_spectral, 0.0)
+    return Detail(reach_px, span, slope, curvature, spectral)
 
 
 def _seen_through(probe: Probe, beside_px: float, sd_px: float) -> Detail:
@@ -58,12 +68,13 @@ def _seen_through(probe: Probe, beside_px: float, sd_px: float) -> Detail:
     found = []
     for reach in (0.0, *(one.reach_px for one in probe.beside)):
         near = probe.within(max(beside_px, min(beside_px + reach, last)))
-        far = 4 * scipy.special.ndtr(-reach / sd_px if sd_px else -np.inf) * probe.anywhere
-        found.append((near.slope + far, near.curvature + 4 * far, near.span + far))
+        beyond = 4 * scipy.special.ndtr(-reach / sd_px if sd_px else -np.inf)
+        far, own = beyond * probe.anywhere, np.stack([near.spectral_slope, near.spectral_curvature])
+        spectral = own if probe.anywhere_spectral is None else own + beyond * probe.anywhere_spectral
+        found.append((near.span + far, near.slope + far, near.curvature + 4 * far, spectral))
     if probe.afar is not None and sd_px > WIDE_PX:
-        found.append((probe.afar.slope, probe.afar.curvature, probe.afar.span))
-    slope, curvature, span = (np.min(some, axis=0) for some in zip(*found, strict=True))
-    return Detail(beside_px, span, slope, curvature)
+        found.append((probe.afar.span, probe.afar.slope, probe.afar.curvature, probe.afar.spectral))
+    return Detail(beside_px, *(np.min(some, axis=0) for some in zip(*found, strict=True)))
 
 
 def _turned(probe: Probe, turn: float) -> Probe:
@@ -85,6 +96,7 @@ def _greatest_way(probe: Probe, rig: Rig, moving: Sequence[Effect]) -> float:
         beside=(),
         afar=None,
         anywhere=None,
+        own_e=None,
         slit_errors={},
         span=np.full(bands, _ENDLESS),
         slope=np.ones((2, bands)),
@@ -128,4 +140,5 @@ def light_brought(probe: Probe, rig: Rig, moving: Iterable[Effect]) -> Probe:
         spread=probe.spread + float((np.maximum(brighter, darker) / least).max(initial=0.0)),
         brightest_e=probe.brightest_e + float(brighter.max(initial=0.0)),
         darkest_e=probe.darkest_e - float(darker.max(initial=0.0)),
+        own_e=np.stack([low - darker, high + brighter]),
     )

@@ -15,6 +15,7 @@ from pipeline.simulator.effects.probe import (
     Probe,
     Unit,
     second_difference,
+    spectral_differences_between,
     steepest_difference,
     stored_mean,
     unit_at,
@@ -74,22 +75,32 @@ class LinesLooked:
         low, high = self.own.min(axis=(0, 1)), self.own.max(axis=(0, 1))
         own_unit = unit_at(np.minimum(low, high)[None], self.rig, self.unit, self.binning)
         slope, curvature = _derivatives(self.own, self.scale, self.binning)
+        nm, unit = np.asarray(scene.wavelength_nm, np.float64), np.minimum(least_unit, own_unit)
+        spectral = _spectral_derivatives(self.own[0], nm, self.scale, self.binning)
         found = []
         for reach, seen in zip((*REACHES, np.inf), self.around, strict=True):
             if seen.size:
                 low, high = np.minimum(low, seen.min(axis=(0, 1))), np.maximum(high, seen.max(axis=(0, 1)))
             if reach < np.inf:
                 if seen.size:
-                    steep, bent = _derivatives(seen, np.minimum(least_unit, own_unit), self.binning)
+                    steep, bent = _derivatives(seen, unit, self.binning)
                     slope, curvature = np.maximum(slope, steep), np.maximum(curvature, bent)
-                found.append(Detail(reach, self.span_to(low, high), slope, curvature))
+                    spectral = np.maximum(spectral, _spectral_derivatives(seen[0], nm, unit, self.binning))
+                found.append(Detail(reach, self.span_to(low, high), slope, curvature, spectral))
         ends = np.stack([low, high]).astype(np.float64)
+        between = {"anywhere_spectral": spectral_differences_between(ends, nm) / unit, "ends_e": ends}
         if covered:
             found[-1] = replace(found[-1], reach_px=np.inf)
-            return {"beside": tuple(found), "anywhere": found[-1].span, "ends_e": ends}
+            return {"beside": tuple(found), "anywhere": found[-1].span, **between}
         wide = seen_widely(scene, self.rig.camera.exposure_ms)
-        afar = Detail(np.inf, self.span_to(wide.low, wide.high), wide.slope / least_unit, wide.curvature / least_unit)
-        return {"beside": tuple(found), "afar": afar, "anywhere": self.span_to(low, high), "ends_e": ends}
+        afar = Detail(
+            np.inf,
+            self.span_to(wide.low, wide.high),
+            wide.slope / least_unit,
+            wide.curvature / least_unit,
+            wide.spectral / unit,
+        )
+        return {"beside": tuple(found), "afar": afar, "anywhere": self.span_to(low, high), **between}
 
 
 def sum_up_looks(looks: LinesLooked, scene: RasterScene, sweeps: tuple[Sweep, ...], means: Light) -> Probe:
@@ -121,12 +132,17 @@ def sum_up_looks(looks: LinesLooked, scene: RasterScene, sweeps: tuple[Sweep, ..
         lines=sum(sweep.lines for sweep in sweeps),
         seconds=CostModel().seconds(list(sweeps), camera),
         white_e=scene.panel_electrons.astype(np.float64) * (camera.exposure_ms / DEFAULT_EXPOSURE_MS),
+        own_e=np.stack([low, high]).astype(np.float64),
         binning=binning,
     )
 
 
 def worst_of_groups(probe: Probe) -> Probe:
-    """Give the probe with the worst of each group of neighbouring bands in all of them: one was looked at for each."""
+    """Give the probe with the worst of each group of neighbouring bands in all of them: one was looked at for each.
+
+    Lights of the groups are the least and the greatest of any of their bands: a level that is one band's, and the span
+    of another, do not tell the least light of a third.
+    """
     groups = band_groups(len(probe.wavelength_nm))
 
     def worst(values: Floats) -> Floats:
@@ -137,7 +153,10 @@ def worst_of_groups(probe: Probe) -> Probe:
         return np.concatenate(parts, axis=-1)
 
     def of_detail(one: Detail) -> Detail:
-        return replace(one, span=worst(one.span), slope=worst(one.slope), curvature=worst(one.curvature))
+        return Detail(one.reach_px, *map(worst, (one.span, one.slope, one.curvature, one.spectral)))
+
+    def ends(values: Floats | None) -> Floats | None:
+        return None if values is None else np.stack([-worst(-values[0]), worst(values[1])])
 
     return replace(
         probe,
@@ -151,6 +170,9 @@ def worst_of_groups(probe: Probe) -> Probe:
         beside=tuple(map(of_detail, probe.beside)),
         afar=None if probe.afar is None else of_detail(probe.afar),
         anywhere=None if probe.anywhere is None else worst(probe.anywhere),
+        anywhere_spectral=None if probe.anywhere_spectral is None else worst(probe.anywhere_spectral),
+        own_e=ends(probe.own_e),
+        ends_e=ends(probe.ends_e),
     )
 
 
@@ -175,13 +197,13 @@ def _derivatives(seen: Light, scale: Light, binning: int) -> tuple[Floats, Float
     return np.array(slope), np.array(curvature)
 
 
-def _spectral_derivatives(level: Light, wavelength_nm: Floats, scale: Light, binning: int) -> tuple[Floats, Floats]:
-    """Greatest divided differences over wavelength at each band, (band,) each over the unit; 0 where there is none."""
+def _spectral_derivatives(level: Light, wavelength_nm: Floats, scale: Light, binning: int) -> Floats:
+    """Greatest first and second divided differences over wavelength, (2, band) over the unit; 0 where there is none."""
     nm = np.asarray(wavelength_nm, np.float64)
     if len(nm) < 2:
-        return np.zeros(len(nm)), np.zeros(len(nm))
-    steep, bend = steepest_difference(level, nm), np.abs(second_difference(level, nm))
-    return _greatest(stored_mean(steep, binning) / scale), _greatest(stored_mean(bend, binning) / scale)
+        return np.zeros((2, len(nm)))
+    both = steepest_difference(level, nm), np.abs(second_difference(level, nm))
+    return np.stack([_greatest(stored_mean(one, binning) / scale) for one in both])
 
 
 def _above(difference: Light, high: Light) -> Light:

@@ -186,7 +186,7 @@ def _is_present(effect: Effect, probe: Probe, rig: Rig) -> bool:
 def _even_probe(probe: Probe, derivatives: float) -> Probe:
     """The probe of a scene of level 1 and the same derivatives in every band."""
     ones, both = np.ones(len(probe.wavelength_nm)), np.full((2, len(probe.wavelength_nm)), derivatives)
-    alone = replace(probe, beside=(), afar=None, anywhere=None, ends_e=None)
+    alone = replace(probe, beside=(), afar=None, anywhere=None, own_e=None, ends_e=None)
     seen = replace(alone, level=ones, spread=ones, span=ones, slope=both, curvature=both)
     return replace(seen, spectral_slope=both[0], spectral_curvature=both[1])
 

@@ -103,9 +103,17 @@ def _rank(ranking: Ranking, strip: _Strip, light: Light, optics: PixelOptics, ti
 def _offer(
     ranking: Ranking, kind: tuple[int, int], worth: Light, taken: NDArray[np.bool_], first: int, tile: int
 ) -> None:
-    for band in range(worth.shape[2]):
-        shown = np.where(taken, worth[..., band], -np.inf)
-        ranking.offer((*kind, band), _tile_maxima(shown, first, tile))
+    """Offer the greatest of every tile and band; worth (row, column, band) of the strip that begins at a row."""
+    _, columns, bands = worth.shape
+    shown = worth if taken.all() else np.where(taken[..., None], worth, np.float32(-np.inf))
+    ridge = np.pad(shown.max(axis=0), [(0, -columns % tile), (0, 0)], constant_values=-np.inf)
+    ridge = ridge.reshape(-1, tile, bands)
+    within = ridge.argmax(axis=1)  # (tile, band)
+    column = np.minimum(within + np.arange(len(ridge))[:, None] * tile, columns - 1)
+    greatest = np.take_along_axis(ridge, within[:, None], axis=1)[:, 0]
+    row = first + shown[:, column, np.arange(bands)].argmax(axis=0)
+    for band in range(bands):
+        ranking.offer((*kind, band), greatest[:, band], row[:, band], column[:, band])
 
 
 def telling_bands(spectra: Light) -> NDArray[np.intp]:
@@ -148,14 +156,3 @@ def _check_finite(scene: RasterScene, planes: Light, first: int) -> None:
         f"scene {scene.name} is not finite at row {row}, column {column}, component {component};"
         " fill such pixels before it is simulated"
     )
-
-
-def _tile_maxima(worth: Light, first: int, tile: int) -> list[tuple[float, int, int]]:
-    columns = worth.shape[1]
-    best_row = worth.argmax(axis=0)
-    ridge = worth[best_row, np.arange(columns)]
-    found = []
-    for start in range(0, columns, tile):
-        column = start + int(ridge[start : start + tile].argmax())
-        found.append((float(ridge[column]), first + int(best_row[column]), column))
-    return found

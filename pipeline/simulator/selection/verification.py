@@ -134,7 +134,7 @@ def verify(decision: Decision, render: Render, blocks: Mapping[str, SweepBlock],
     Draws are paired: the difference is the effect's alone. Effects of the readout change distributions, not expected
     light, and are not measured. ``render`` gives expected electrons (line, sample, band) of a block with some effects
     on, ``units`` one unit of the tolerance at each [e-]. Returns the greatest change of a stored number in units: by
-    the name of each effect that is not exact, and of `TOTAL`.
+    the name of each effect that is not exact, and of `TOTAL`; where ``none`` was asked for, of that alone.
 
     Raises BoundError: a change exceeds the bound that the decision counted on; names effect, bound, change and place.
     """
@@ -144,7 +144,8 @@ def verify(decision: Decision, render: Render, blocks: Mapping[str, SweepBlock],
         for one in decision.taken
         if acts_on_light(one.menu.effect) and one.menu.present and one.option is not one.menu.exact
     ]
-    trials = [(one.name, [one]) for one in changed] + [(TOTAL, changed)]
+    each = changed if decision.asked != "none" else []
+    trials = [(one.name, [one]) for one in each] + [(TOTAL, changed)]
     measured: dict[str, float] = {}
     for name, inexact in trials:
         instead = {one.name: one.option.variant for one in inexact}

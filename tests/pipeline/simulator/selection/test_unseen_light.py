@@ -11,15 +11,24 @@ from hypothesis import strategies as st
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, scene_to_sweep
-from pipeline.simulator.effects.probe import Detail, Probe
+from pipeline.simulator.effects.probe import (
+    Detail,
+    Probe,
+    lights_within,
+    second_difference,
+    spectral_differences_between,
+    steepest_difference,
+)
 from pipeline.simulator.rig_model import Optics, Rig
+from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, to_bands
 from pipeline.simulator.selection.line_means import line_means
 from pipeline.simulator.selection.reached_cells import reached_cells
+from pipeline.simulator.selection.surroundings import seen_widely
 from pipeline.simulator.selection.survey_probe import probe_scene
 from tests.pipeline.simulator.bound_trials import trials
 from tests.pipeline.simulator.made_up_effects import steep_probe
 from tests.pipeline.simulator.random_cases import Case
-from tests.pipeline.simulator.small_scenes import image_scene
+from tests.pipeline.simulator.small_scenes import image_scene, made_scene
 from tests.pipeline.simulator.sparse_cases import sparse_case
 
 CAMERA = LineCamera(samples=96)
@@ -75,6 +84,58 @@ def test_bounds_hold_where_little_is_seen(number: int) -> None:
     assert broken == []
 
 
+@pytest.mark.parametrize(
+    ("number", "effect", "lines"),
+    [
+        (134, "path-radiance", range(156, 158)),  # a dark band among bright ones, under a bright sky
+        (164, "response", None),  # a field in one band of twelve, beside a lone sweep
+    ],
+)
+def test_bounds_hold_where_bands_differ(number: int, effect: str, lines: range | None) -> None:
+    """Each band counts with its own least light, and by what its neighbours bring from beside that it does not."""
+    found = list(trials(replace(sparse_case(number), looked=lines), (1, 2 + number % 7), effect))
+    assert found
+    assert [one for one in found if one.is_broken] == []
+
+
+def test_least_light_of_a_dark_band_is_that_of_its_group() -> None:
+    """Of thirteen even bands, every second of them dark, the dark ones are not taken to be as bright as the others."""
+    values = np.ones((60, 80, 13))
+    values[..., ::2] = 0.1
+    scene = image_scene(values, CAMERA, np.linspace(400, 1000, 13))
+    probe = probe_scene(scene, SHARP, [Sweep("s", "fine", "x", 0.0, -32.0, 64)])
+    low, high = lights_within(probe, SHARP)
+    light = (scene.planes * scene.electrons)[0, 0]
+    assert (low <= 1.001 * light).all()
+    assert (high >= 0.999 * light).all()
+
+
+@given(st.integers(2, 6), st.integers(0, 2**32 - 1))
+def test_no_spectrum_between_two_is_steeper_than_said(bands: int, seed: int) -> None:
+    """Of light that is not looked at only its ends are known: differences over wavelength are within theirs."""
+    rng = np.random.default_rng(seed)
+    nm = 400 + np.cumsum(rng.uniform(0.1, 20, bands))
+    ends = np.sort(rng.uniform(0, 100, (2, bands)), axis=0)
+    spectra = np.concatenate([rng.uniform(*ends, (50, bands)), np.where(rng.random((50, bands)) < 0.5, *ends)])
+    steep, bent = spectral_differences_between(ends, nm)
+    assert (steepest_difference(spectra, nm) <= steep + 1e-9).all()
+    assert (np.abs(second_difference(spectra, nm)) <= bent + 1e-9).all()
+
+
+@pytest.mark.parametrize("components", [None, 2])
+def test_wide_spectra_are_those_of_means(components: int | None) -> None:
+    """Of planes of bands, or of components that mix spectra: the greatest differences of 8 x 8 px, a block apart."""
+    rng, nm = np.random.default_rng(3), np.array([400.0, 410.0, 440.0, 500.0])
+    planes = rng.uniform(0, 1, (24, 16, components or 4)).astype(np.float32)
+    scene = made_scene(planes, rng.uniform(100, 900, (components, 4) if components else 4), nm)
+    found = seen_widely(scene, DEFAULT_EXPOSURE_MS)
+    blocks = np.pad(to_bands(planes, scene.electrons), [(16, 16), (16, 16), (0, 0)], mode="edge")
+    blocks = blocks.reshape(14, 4, 12, 4, 4).mean(axis=(1, 3))
+    means = (blocks[1:, 1:] + blocks[1:, :-1] + blocks[:-1, 1:] + blocks[:-1, :-1]) / 4
+    expected = steepest_difference(means, nm), np.abs(second_difference(means, nm))
+    np.testing.assert_allclose(found.spectral, [one.max(axis=(0, 1)) for one in expected], rtol=1e-4)
+
+
 @given(
     st.integers(20, 300),
     st.integers(20, 300),
@@ -121,8 +182,8 @@ def test_covered_scene_has_nothing_beside() -> None:
 def beside_probe(far: float) -> Probe:
     """An even scene, and detail from 2 px beside the sweeps on."""
     none, some, both = np.zeros(1), np.full(1, far), np.full((2, 1), far)
-    details = (Detail(2.0, none, np.zeros((2, 1)), np.zeros((2, 1))), Detail(24.0, some, both, both))
-    afar = Detail(np.inf, some, both / 8, both / 64)
+    details = (Detail(2.0, none, *[np.zeros((2, 1))] * 3), Detail(24.0, some, both, both, both))
+    afar = Detail(np.inf, some, both / 8, both / 64, both)
     return replace(steep_probe((0.0, 0.0), span=0.0), beside=details, afar=afar, anywhere=some)
 
 

@@ -54,9 +54,9 @@ def units(light: Light, binning: int) -> Floats:
     return np.full(light.shape, 100.0)
 
 
-def decided(*effects: MadeUp, tolerance: float = 1.0) -> Decision:
+def decided(*effects: MadeUp, tolerance: float = 1.0, asked: str = "auto") -> Decision:
     """Off where the tolerance lets it be."""
-    return decide(even_probe(level=np.full(1, 1.2)), RIG, effects, tolerance)
+    return decide(even_probe(level=np.full(1, 1.2)), RIG, effects, tolerance, asked)
 
 
 def test_measured_changes_are_those_of_each_effect_and_of_all():
@@ -73,6 +73,13 @@ def test_measured_changes_are_those_of_each_effect_and_of_all():
 def test_nothing_left_out_measures_nothing():
     """Exact on, all together changes by 0."""
     assert verify(decided(Brightening("drift", 0.1, share=0.1), tolerance=0.0), render, CHIPS, units) == {TOTAL: 0.0}
+
+
+def test_nothing_on_is_measured_as_a_whole():
+    """Where everything is left out by hand, no effect is measured beside the others; together they are."""
+    effects = Brightening("drift", 0.01, share=0.01), Brightening("cloud", 0.02, share=0.02)
+    measured = verify(decided(*effects, asked="none"), render, CHIPS, units)
+    assert measured == pytest.approx({TOTAL: 1.2 * (1.01 * 1.02 - 1)}, rel=1e-4)
 
 
 def test_broken_bound_is_named_with_its_place():
