@@ -2,7 +2,8 @@
 
 The seats of a field lie in rows along the lines of the sweeps that show them. A look takes one run of lines of a sweep,
 or none of it. At a price of a second each sweep has a best run, in closed form (the largest sum of neighbours); the
-lowest price at which all of them together end in time is searched for.
+lowest price at which all of them together end in time is searched for. What that leaves of the seconds one sweep gets:
+where rows are worth about the same, no price divides them.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,7 +136,7 @@ def part_look(
     everything = _look_at_price(exposed, values, camera, cost, cheap)
     if everything.seconds <= seconds:
         return everything
-    best: PartLook | None = None
+    best = PartLook((), 0.0, 0.0)
     for _ in range(HALVINGS):  # at a lower price no fewer lines are taken
         price = math.sqrt(dear * cheap)
         look = _look_at_price(exposed, values, camera, cost, price)
@@ -142,7 +144,54 @@ def part_look(
             cheap = price
         else:
             dear, best = price, look
-    return best if best is not None and best.runs else _best_row(exposed, values, camera, cost, seconds)
+    filled = _filled(exposed, values, camera, cost, seconds, best)
+    return filled if filled.runs else None
+
+
+def _filled(
+    rows: SeatRows, values: Floats, camera: LineCamera, cost: CostModel, seconds: float, look: PartLook
+) -> PartLook:
+    """The look worth most of these: as given; one sweep's run beside the others' as long as time is; that run alone."""
+    best = look
+    for number, others in product(range(len(values)), {look.runs, ()}):
+        beside = tuple(run for run in others if run[0] != number)
+        first, stop = rows.first[number], rows.stop[number]
+        low, high = 0, int(stop.max())
+        while low < high:  # the most lines that end in time
+            lines = (low + high + 1) // 2
+            low, high = (
+                (lines, high) if _with(rows, camera, cost, beside, number, lines) <= seconds else (low, lines - 1)
+            )
+        run = _longest_run(values[number], first, stop, low)
+        if run is None:
+            continue
+        runs = tuple(sorted([*beside, (number, *run)]))
+        worth = sum(float(values[one][(rows.first[one] >= a) & (rows.stop[one] <= b)].sum()) for one, a, b in runs)
+        if worth > best.worth:
+            best = PartLook(runs, cost.seconds(sweeps_of_runs(rows.sweeps, runs), camera), worth)
+    return best
+
+
+def _with(
+    rows: SeatRows, camera: LineCamera, cost: CostModel, beside: Sequence[LineRun], number: int, lines: int
+) -> float:
+    """Seconds of runs with so many lines of one more sweep."""
+    return cost.seconds(sweeps_of_runs(rows.sweeps, [*beside, (number, 0, lines)]), camera)
+
+
+def _longest_run(values: Floats, first: NDArray[np.intp], stop: NDArray[np.intp], lines: int) -> tuple[int, int] | None:
+    """The run of at most so many lines that is worth most, without rows worth nothing at its ends; None where none."""
+    there = np.flatnonzero(stop > first)
+    if not there.size:
+        return None
+    summed = np.concatenate([[0.0], np.cumsum(values[there])])
+    end = np.searchsorted(stop[there], first[there] + lines, side="right")  # the row after its last
+    worth = np.where(end > np.arange(there.size), summed[end] - summed[:-1], 0.0)
+    begin = int(worth.argmax())
+    some = np.flatnonzero(values[there[begin : end[begin]]] > 0)
+    if not some.size:
+        return None
+    return int(first[there[begin + some[0]]]), int(stop[there[begin + some[-1]]])
 
 
 def _look_at_price(rows: SeatRows, values: Floats, camera: LineCamera, cost: CostModel, price: float) -> PartLook:
@@ -175,18 +224,6 @@ def _best_run(
         return None
     begin = int(np.flatnonzero(begins[: last + 1] == least[last])[0])
     return int(first[there[begin]]), int(stop[there[last]])
-
-
-def _best_row(rows: SeatRows, values: Floats, camera: LineCamera, cost: CostModel, seconds: float) -> PartLook | None:
-    """Of looks at a single row the one worth most, where at no price one ends in time; None where none does."""
-    order = np.argsort(-values, axis=None, kind="stable")
-    for place in order[values.ravel()[order] > 0].tolist():
-        number, row = divmod(place, values.shape[1])
-        run = (number, int(rows.first[number, row]), int(rows.stop[number, row]))
-        taken_s = cost.seconds(sweeps_of_runs(rows.sweeps, [run]), camera)
-        if taken_s <= seconds:
-            return PartLook((run,), taken_s, float(values[number, row]))
-    return None
 
 
 def cheapest_row_seconds(rows: SeatRows, camera: LineCamera, cost: CostModel, exposure_ms: float) -> float:

@@ -35,7 +35,7 @@ RECORD = {
     "per_class_iou": {"class_1": [[0.99, 0.97], [0.96, 0.94], [0.9, 0.8]]},
 }
 WHOLE: dict[str, Any] = {"budget": None, "scan_step": "2", "scan_exposure_ms": "25", "name": "north"}
-PART: dict[str, Any] = {"budget": None, "look": "part", "prior": "latest", "name": "north", "seconds": "2.1"}
+PART: dict[str, Any] = {"budget": None, "look": "part", "prior": "latest", "name": "north", "seconds": "1.98"}
 FIRST, LATER, LAST = "2026-06-01T10:00:00Z", "2026-06-04T10:00:00Z", "2026-06-07T10:00:00Z"
 
 
@@ -132,7 +132,7 @@ def test_of_a_field_that_nobody_knows_all_is_looked_at(survey_png: Survey, recor
 
 def test_what_is_due_is_looked_at_first(visited: Path, visits: Any, survey_png: Survey, recorded: Path) -> None:
     """With --refresh the lines that the visit before left out, and the notes count them."""
-    flags = {**PART, "seconds": "2.1", "refresh": "8d", "weights": str(recorded)}
+    flags = {**PART, "seconds": "1.95", "refresh": "8d", "weights": str(recorded)}
     part = survey_png(visited, **flags, visit=LAST)
     due, look = product(visited, visits[2], "belief").age.values == 3.0, part.receipt["look"]
     assert (product(visited, part, "belief").age.values[due] < 1).any()
