@@ -152,9 +152,9 @@ def _mean_of_known(values: NDArray[np.float64]) -> float:
     return float(known.mean()) if known.size else float("nan")
 
 
-def boundary_px(shape: tuple[int, int], share: float = DIAGONAL_SHARE) -> int:
+def boundary_px(shape: tuple[int, int]) -> int:
     """Width of the boundary [px]: a share of the diagonal, rounded, at least 1."""
-    return max(1, round(share * float(np.hypot(*shape))))
+    return max(1, round(DIAGONAL_SHARE * float(np.hypot(*shape))))
 
 
 def boundary_counts(

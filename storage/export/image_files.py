@@ -28,6 +28,7 @@ from storage.readers.envi_cubes import DATA_TYPES, INTERLEAVES
 LARGEST_GHOST = 1024  # bytes that GDAL's note of the layout may take before the first directory
 TILE = 512  # px: rasters within one tile need no overviews
 ROWS_AT_ONCE = 512
+OUTSIDE = 0.02  # share of pixels that a style's colours end before, at either end
 ANGULAR = (
     "angular grid of the camera: x and y are tangents of the angle from the undeflected direction [rad], y grows "
     "downwards; there is no CRS"
@@ -176,8 +177,8 @@ def _differences(rasterio: Any, plain: Path, made: Path) -> list[str]:
     return []
 
 
-def value_span(path: Path, bands: Sequence[int], share: float = 0.02) -> tuple[float, float]:
-    """Values of some bands, counted from 1, that ``share`` of a file's pixels are below and above; 0 and 1 without any.
+def value_span(path: Path, bands: Sequence[int]) -> tuple[float, float]:
+    """Values of some bands, counted from 1, that 2 % of a file's pixels are below and above; 0 and 1 without any.
 
     Of at most 512 x 512 pixels of the file.
     """
@@ -187,7 +188,7 @@ def value_span(path: Path, bands: Sequence[int], share: float = 0.02) -> tuple[f
     known = values[np.isfinite(values)]
     if not known.size:
         return 0.0, 1.0
-    low, high = (float(value) for value in np.quantile(known, (share, 1 - share)))
+    low, high = (float(value) for value in np.quantile(known, (OUTSIDE, 1 - OUTSIDE)))
     return (low, high) if low < high else (low, low + 1.0)
 
 

@@ -71,9 +71,9 @@ class AxisMotion:
             for column in (self._time, self._place, self._rate, self._command):
                 del column[:-KEPT_STEPS]
 
-    def rest(self, time_s: float, place: float = 0.0) -> None:
-        """Be at rest at a place at once, as after a loss of power; the past is forgotten."""
-        self._time, self._place, self._rate, self._command = [time_s], [place], [0.0], [place]
+    def rest(self, time_s: float) -> None:
+        """Be at rest at 0 at once, as after a loss of power; the past is forgotten."""
+        self._time, self._place, self._rate, self._command = [time_s], [0.0], [0.0], [0.0]
 
     def places(self, times_s: ArrayLike) -> Floats:
         """Give where the axis was at times (...), in the unit of its commands.
