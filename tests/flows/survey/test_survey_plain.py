@@ -130,7 +130,7 @@ def test_savings_add_up_and_ranks_follow_the_scores(farm: Done) -> None:
     for name, entry in savings.items():
         if name != "segment_wall_s":
             assert entry["ratio"] == pytest.approx(entry["done"] / entry["full"]), name
-    assert savings["capture_s"]["ratio"] <= 0.9 + 1e-9
+    assert savings["capture_s"]["done"] <= 0.9 * savings["capture_s"]["every_line_s"] + 1e-9
     work = savings["multiply_adds"]
     assert work["done"] == sum(work[part] for part in ("glance", "score", "encode", "decode"))
     attention, patches = farm.open("attention"), farm.open("patches")
