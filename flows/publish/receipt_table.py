@@ -189,7 +189,7 @@ def total_words(total: Mapping[str, Any]) -> Sequence[str]:
         )
     exact, cheap = (format_seconds(max(total[name], 0.0)) for name in ("saved_s", "saved_cheap_s"))
     words.append(
-        f"That saves about {exact} of CPU for the coarse pass and a scan of everything against all effects in full, "
+        f"That saves about {exact} of CPU in all sweeps decided on against all effects in full, "
         f"{cheap} against all as cheap as a tenth of the tolerance lets them be."
     )
     return words
