@@ -5,8 +5,7 @@ A plain scan takes every line, every second or every fourth, not binned, with on
 Surveys in two passes have the coarse pass as long exposed as the fine one or a quarter as long. Farms that training
 never saw, each with noise of its own.
 
-`python tests/benchmarks/bench_frontier.py 1280x1024` draws the map of `survey --seconds` alone, on larger farms;
-`looks` plans of two looks (`beside/second_looks.py`), on all fields or those whose seeds follow.
+`python tests/benchmarks/bench_frontier.py 1280x1024` draws the map of `survey --seconds` alone, on larger farms.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from beside.second_looks import look_rows
 from measure import Row
 from numpy.typing import NDArray
 from rich.console import Console
@@ -157,15 +155,10 @@ def _survey(seed: int, budget: float, coarse_ms: float) -> tuple[float, float]:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Draw maps of larger farms, WIDTHxHEIGHT, or of plans of two looks, and print them beside their goals."""
-    if arguments[0] == "looks":
-        found = look_rows([int(one) for one in arguments[1:]])
-    else:
-        width, height = (int(side) for side in arguments[0].split("x"))
-        found = large_rows((height, width), LARGE)
-    for row in found:
-        goal = "" if row.met is None else f", goal {row.goal}: {'met' if row.met else 'MISSED'}"
-        print(f"{row.what}: {row.figure}{goal}", flush=True)
+    """Draw maps of larger farms, WIDTHxHEIGHT, and print them beside their goals."""
+    width, height = (int(side) for side in arguments[0].split("x"))
+    for row in large_rows((height, width), LARGE):
+        print(f"{row.what}: {row.figure}, goal {row.goal}: {'met' if row.met else 'MISSED'}", flush=True)
     return 0
 
 

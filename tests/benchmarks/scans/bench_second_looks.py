@@ -7,7 +7,7 @@ they are, else the second stands. Beside that stands what surveys do today: a se
 memory's reader weighs against the first.
 
 Dense fields are farms; sparse ones are of interest in a sixteenth (odd seeds) or an eighth: a block of a farm, and one
-field around it. `python tests/benchmarks/bench_frontier.py looks 21 22` draws some of these alone.
+field around it.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from beside.sparse_lands import sparse_land
 from measure import Row
 from numpy.typing import NDArray
+from sparse_lands import sparse_land
 
 from flows.survey.stages.accuracy import columns_of_all_seats
 from flows.training.look import chosen_effects
@@ -183,10 +183,15 @@ def fields(seeds: Sequence[int]) -> Iterator[tuple[Field, Mapping[float, Scan], 
             yield Field(f"farm {seed}", farm_scene(seed, FARM, camera=CAMERA), seed), FARM_FIRST, FARM_AGAIN
 
 
-def look_rows(seeds: Sequence[int] = ()) -> Iterator[Row]:
-    """Some fields, or all, by their seconds; then what second looks gain over plain scans, dense fields and sparse."""
+def rows() -> list[Row]:
+    """All fields."""
+    return list(look_rows((*FARM_SEEDS, *LAND_SEEDS)))
+
+
+def look_rows(seeds: Sequence[int]) -> Iterator[Row]:
+    """Some fields by their seconds; then what second looks gain over plain scans, dense fields and sparse."""
     gains: dict[bool, list[tuple[float, float, float]]] = {True: [], False: []}
-    for ground, firsts, again in fields(seeds or (*FARM_SEEDS, *LAND_SEEDS)):
+    for ground, firsts, again in fields(seeds):
         for seconds, first in firsts.items():
             found = two_looks(ground, seconds, first, again)
             over = found.truth - found.plain, found.doubts - found.plain, found.visits - found.plain
