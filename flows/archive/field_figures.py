@@ -13,6 +13,7 @@ from pipeline.ground.field_scale import FieldScale
 from pipeline.planning.fine_pass import FinePlan
 
 NO_METRES = "nothing says how large a pixel is: a [pose], or a georeferenced scene, gives metres and hectares an hour"
+EVERY_LINE = "every line at full exposure"
 
 
 def field_figures(run: SurveyRun, fine: FinePlan | None) -> dict[str, Any]:
@@ -71,14 +72,16 @@ def figure_lines(figures: Mapping[str, Any]) -> list[str]:
     known = "" if figures["fine_planned"] else " at most, chosen once the coarse pass was looked at"
     parts = f"coarse {format_seconds(camera['coarse'])}, fine {format_seconds(camera['fine'])}{known}"
     lines.append(
-        f"camera: {format_seconds(camera['all'])} ({parts}); a full scan {format_seconds(camera['full_scan'])}"
+        f"camera: {format_seconds(camera['all'])} ({parts}); {EVERY_LINE} {format_seconds(camera['full_scan'])}"
     )
     count = figures["lines"]
     fine = "" if count["fine"] is None else f", fine {format_count(count['fine'])}"
-    lines.append(f"lines: coarse {format_count(count['coarse'])}{fine}; a full scan {format_count(count['full_scan'])}")
+    lines.append(
+        f"lines: coarse {format_count(count['coarse'])}{fine}; {EVERY_LINE} {format_count(count['full_scan'])}"
+    )
     if figures["hectares_per_hour"] is not None:
         lines.append(
-            f"pace: {three_digits(figures['hectares_per_hour'])} ha an hour of the camera; a full scan "
+            f"pace: {three_digits(figures['hectares_per_hour'])} ha an hour of the camera; {EVERY_LINE} "
             f"{three_digits(figures['full_scan_hectares_per_hour'])}"
         )
     return lines
