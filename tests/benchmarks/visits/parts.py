@@ -42,6 +42,7 @@ from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 STRIPS = LineCamera(samples=160)  # of which a field is four strips wide
 PART_DAYS, PART_SHARES = (3, 7), (0.35, 0.6)  # days without a look; seconds of a visit, of those of a whole quick look
 SEASON_SHARES = (0.15, 0.25)  # seconds of a visit of a season, of those of a full scan
+SOON_H = 0.5  # hours from a visit to the next of a day that is watched
 UNWATCHED = (1, 2, 3, 5)  # visits of the season, none of which is made
 ROUNDS = (1, 2)  # visits from one quick look at everything to the next
 
@@ -129,8 +130,15 @@ def season_of_parts() -> Iterator[Row]:
 
 
 def unwatched() -> Iterator[Row]:
-    """A memory that nobody looks after: how much of it it expects to be wrong, and how much is."""
+    """A memory that nobody looks after: half an hour later, and how much it expects to be wrong as weeks go by."""
     field, names, reader = Strips.of_field(), shipped().class_names, shipped_memory().reader
+    soon: list[tuple[float, float]] = []
+    for seed in SEEDS:
+        before, anew = (look_at_farm(seed, FIRST_DAY, HOUR + later_h, ANEW) for later_h in (0.0, SOON_H))
+        held = carried(Remembered(first_belief(before.looked), None, SOON_H / 24), reader)
+        soon.append((anew.score(held.classes()[0]), anew.score(anew.alone)))
+    yield Row("half an hour later, nothing looked at", mean_figure([held for held, _ in soon]))
+    yield Row("the same, scanned anew", mean_figure([anew for _, anew in soon]))
     found: dict[int, list[tuple[float, float]]] = {}
     for seed in SEEDS:
         first = first_belief(look_at_farm(seed, *SEASON[0], REFERENCE).looked)
