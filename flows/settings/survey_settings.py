@@ -52,6 +52,7 @@ BUILT_IN_SCENES = FARM_NAMES
 USUAL_SIZE = f"{FARM_SHAPE[1]}x{FARM_SHAPE[0]}"
 RIG_FIELD = "field"  # the scene of which only the rig knows more than size and bands
 OF_THE_MACHINE = ("scheduler", "workers", "device")  # what of that day need not be there today
+OF_A_PART = ("refresh", "doubt")  # of what a field that is remembered is looked at by
 PLAIN = ("seconds", "bytes_raw", "goal", "scan_step")  # settings of which one asks for a plain scan
 SPARING = ("compute", "bytes_kept", "least_gain")  # by which a plain scan is kept and read in detail in part
 OF_TWO_PASSES = ("budget", "coarse_exposure_ms", "policy", "threshold", "mask", "vgg")  # and of which none may

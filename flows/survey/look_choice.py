@@ -95,7 +95,8 @@ def choose_look(
     if settings.look != LOOK_PART:
         return settings, None, ()
     if prior is None:
-        return replace(settings, look=LOOK_WHOLE), None, ("nothing is remembered: the whole field is looked at",)
+        whole = replace(settings, look=LOOK_WHOLE, refresh=None, doubt=None)  # as it can be asked for again
+        return whole, None, ("nothing is remembered: the whole field is looked at",)
     content = weights.record.get("scans")
     if content is None:
         raise WeightsError(

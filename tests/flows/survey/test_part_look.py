@@ -123,11 +123,13 @@ def test_better_weights_read_the_lines_that_were_taken(visited: Path, visits: An
 def test_of_a_field_that_nobody_knows_all_is_looked_at(survey_png: Survey, recorded: Path, tmp_path: Path) -> None:
     """Said, and the seconds buy a plain scan of it."""
     text = io.StringIO()
-    flags = {**PART, "seconds": "5", "weights": str(recorded)}
+    flags = {**PART, "seconds": "5", "weights": str(recorded), "refresh": "14d", "doubt": "2%"}
     first = survey_png(tmp_path / "archive", console=Console(file=text, width=300), **flags)
     assert "nothing is remembered: the whole field is looked at" in text.getvalue()
     assert "look" not in first.receipt
     assert first.receipt["settings"]["look"] == "whole"
+    again = ReprocessRequest(tmp_path / "archive", weights=Path(shutil.copy(recorded, tmp_path / "same.safetensors")))
+    assert run_reprocess(again, Console(quiet=True)) == 0
 
 
 def test_what_is_due_is_looked_at_first(visited: Path, visits: Any, survey_png: Survey, recorded: Path) -> None:
