@@ -226,13 +226,14 @@ def of_this_version(stored: Mapping[str, Any]) -> dict[str, Any]:
             f"its survey had {stored['rounds']} rounds of detail, which never paid and were removed: survey the "
             "field by hand, without 'rounds'; what both share is in the archive; take what is damaged out first"
         )
-    whole = stored.get("look", LOOK_WHOLE) == LOOK_WHOLE  # once beside what is of looks at a part: a first visit's
+    if stored.get("look", LOOK_WHOLE) == LOOK_WHOLE:  # of a first visit that asked for a part
+        stored = {key: None if key in OF_A_PART else value for key, value in stored.items()}
     return {
         key: {name: item for name, item in value.items() if name in TABLES[key]}
         if key in TABLES and isinstance(value, Mapping)
         else value
         for key, value in stored.items()
-        if key in SURVEY and not (whole and key in OF_A_PART)
+        if key in SURVEY
     }
 
 

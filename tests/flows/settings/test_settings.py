@@ -350,5 +350,5 @@ def test_receipt_settings_read_back_the_same(budget, seed, bands, memory, exposu
 def test_a_receipt_of_a_whole_look_has_nothing_of_looks_at_parts() -> None:
     """As first visits once told it, which had asked for a part: they can be surveyed again."""
     stored = {"look": "whole", "refresh": 14.0, "doubt": 0.02, "seconds": 5.0}
-    assert of_this_version(stored) == {"look": "whole", "seconds": 5.0}
+    assert of_this_version(stored) == {"look": "whole", "refresh": None, "doubt": None, "seconds": 5.0}
     assert of_this_version({**stored, "look": "0:0-9"})["refresh"] == 14.0
