@@ -79,12 +79,17 @@ def read_histories(archive: Archive, field: str | None = None) -> list[FieldHist
 def _history(archive: Archive, catalogue: Catalogue, name: str, ledger: Ledger | None) -> FieldHistory:
     lines = [] if ledger is None else ledger.lines()
     events = [line for line in lines if line.get("event") in (*ENDINGS, "passed")]
-    by_run = {line["run"]: line for line in events if isinstance(line.get("run"), str)}
+    by_run = {line["run"]: line for line in events if isinstance(line.get("run"), str) and not _looked_at_nothing(line)}
     own = [run for run in catalogue.runs if run.uri in by_run or called(run) == name]
     rows = [_row(archive, catalogue, run, by_run.get(run.uri, {})) for run in own]
     found = sorted(zip(own, rows, strict=True), key=lambda one: day_of(one[1]) or 0.0)
     looked = [(run, _called(row)) for run, row in found]
     return FieldHistory(name, archive.name, [row for _, row in found], events, visit_pictures(archive, looked))
+
+
+def _looked_at_nothing(event: Mapping[str, Any]) -> bool:
+    """Whether a visit left it at the map that was there: its run is an earlier one, and it says why."""
+    return event.get("event") == "done" and bool(event.get("reason"))
 
 
 def _called(row: Mapping[str, Any]) -> str:
@@ -200,7 +205,7 @@ def report(archive: ArchiveName, *, field: str | None = None, out: OutFile, as_j
 def render_history(history: FieldHistory, runs_at: str) -> str:
     """The page; ``runs_at`` is the way from it to the archive's folder, empty where there is none."""
     counts = ", ".join(f"{count} {word}" for word, count in history.counts.items())
-    troubles = [event for event in history.events if event["event"] != "done"]
+    troubles = [event for event in history.events if event["event"] != "done" or _looked_at_nothing(event)]
     return render_page(
         "history.html",
         PLAYER_SCRIPTS if history.visits else (),
@@ -314,6 +319,8 @@ def _summed_seconds(runs: Rows) -> dict[str, list[tuple[float, float]]]:
 
 def _trouble(event: Mapping[str, Any]) -> dict[str, str]:
     what, due = str(event["event"]), _short(str(event.get("due", "")))
+    if what == "done":
+        what = "nothing looked at"
     if what == "passed":
         what = f"{'very many' if event.get('count') is None else event['count']} skipped"
         due = f"{_short(str(event.get('after', '')))} to {_short(str(event.get('until', '')))}"

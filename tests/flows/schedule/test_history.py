@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,20 @@ def archive(tmp_path_factory: pytest.TempPathFactory, survey_png: Any) -> Path:
         }
     )
     return root
+
+
+def test_a_visit_that_looked_at_nothing_has_no_run_of_its_own(archive: Path, tmp_path: Path) -> None:
+    """It is counted as done and told with its reason; the run whose map stands keeps its own date."""
+    shutil.copytree(archive, root := tmp_path / "archive")
+    run = read_histories(Archive.open(root), "north")[0].runs[0]["run"]
+    later = {"at": "2026-06-02T10:00:20Z", "due": "2026-06-02T10:00:00Z", "reason": "nothing is looked at: 1.2%"}
+    Ledger(root, "north").append({"event": "done", **later, "run": run, "seconds": 0.0})
+    (north,) = read_histories(Archive.open(root), "north")
+    assert north.counts["done"] == 2
+    assert [row["due"] for row in north.runs] == ["2026-06-01T10:00:00Z", None]
+    page = render_history(north, "")
+    assert "nothing looked at" in page
+    assert "nothing is looked at: 1.2%" in page
 
 
 def test_runs_and_ledger_are_one_history(archive: Path) -> None:
