@@ -91,7 +91,7 @@ class Probe:
             return self
         for one in self.beside:
             if reach_px <= one.reach_px:
-                return self._with(one)
+                return self.with_detail(one)
         both, spectral = np.stack([self.anywhere] * 2), self.anywhere_spectral
         found = replace(self, span=self.anywhere, slope=both, curvature=4 * both)
         return found if spectral is None else replace(found, spectral_slope=spectral[0], spectral_curvature=spectral[1])
@@ -99,7 +99,7 @@ class Probe:
     def blurred_by(self, sd_px: float) -> Probe:
         """Give the probe of what a Gaussian of this size sees of the scene, its derivatives among it."""
         wide = self.afar is not None and sd_px > WIDE_PX
-        return self._with(self.afar) if wide and self.afar else self.within(_FAR_SDS * sd_px)
+        return self.with_detail(self.afar) if wide and self.afar else self.within(_FAR_SDS * sd_px)
 
     def moved(self, along_px: float, scan_px: float) -> float:
         """Bound what a shift of the image by at most so much changes: slope times way, never more than the span."""
@@ -125,15 +125,16 @@ class Probe:
             near = [one for one in self.beside if one.reach_px >= _FAR_SDS * widest]
             beyond = [4 * scipy.special.ndtr(-one.reach_px / widest) for one in near]
             ways = [
-                self._with(one)._changed(variance_px2) + more * self.anywhere
+                self.with_detail(one)._changed(variance_px2) + more * self.anywhere
                 for one, more in zip(near, beyond, strict=True)
             ]
             return np.asarray(np.min([*ways, self.anywhere], axis=0))
         narrow = np.minimum(variance_px2, WIDE_PX**2)
-        both = self.change_blurred(narrow) + self._with(self.afar)._changed(variance_px2 - narrow)
+        both = self.change_blurred(narrow) + self.with_detail(self.afar)._changed(variance_px2 - narrow)
         return np.asarray(np.minimum(both, self.anywhere))
 
-    def _with(self, detail: Detail) -> Probe:
+    def with_detail(self, detail: Detail) -> Probe:
+        """Give the same probe with the steepest and the most curved light of another place."""
         return replace(
             self,
             span=detail.span,

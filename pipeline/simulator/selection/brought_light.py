@@ -36,15 +36,7 @@ def blended_surroundings(probe: Probe, rig: Rig, moving: Sequence[Effect]) -> Pr
     way, parts = greatest_way_px(probe, rig, moving), _blur_parts(probe, rig, blurs)
     own = _blended(probe, 0.0, way, parts)
     beside = [_blended(probe, one.reach_px - way, way, parts) for one in probe.beside if one.reach_px > way]
-    return replace(
-        probe,
-        slope=own.slope,
-        curvature=own.curvature,
-        span=own.span,
-        spectral_slope=own.spectral[0],
-        spectral_curvature=own.spectral[1],
-        beside=tuple(beside),
-    )
+    return replace(probe.with_detail(own), beside=tuple(beside))
 
 
 def _blended(probe: Probe, reach_px: float, way_px: float, parts: Sequence[tuple[float, float]]) -> Detail:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ import xarray as xr
 from PIL import Image
 from rich.console import Console
 
+from flows.archive.plan_command import forecast
 from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
 from flows.settings.load import load_settings
 from flows.survey.look_choice import LookWorth
@@ -23,6 +25,7 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.plain_scans import ScanRecord
 from storage.archive.records import read_run
 from tests.conftest import Survey, WeightsMaker, patchy_scene
+from tests.flows.conftest import CommandLine
 from tests.remembered_work import without_effects
 
 pytestmark = pytest.mark.usefixtures("no_effects")
@@ -145,13 +148,24 @@ def test_what_is_due_is_looked_at_first(visited: Path, visits: Any, survey_png: 
     assert f"{look['due_left']} of {look['due']} seats that were due had to wait" in page
 
 
-def test_of_what_is_sure_enough_nothing_is_looked_at(visited: Path, survey_png: Survey, recorded: Path) -> None:
+def test_of_what_is_sure_enough_nothing_is_looked_at(
+    visited: Path, survey_png: Survey, recorded: Path, scene_files: Path, command_line: CommandLine
+) -> None:
     """Said with the run whose map stands; nothing is captured or published, and a look is planned nevertheless."""
     runs = sorted(visited.glob("runs/*"))
     flags = {**PART, "visit": LAST, "weights": str(recorded)}
+    asked = {
+        **{name: value for name, value in flags.items() if value is not None},
+        **{"scene": str(scene_files / "scene.png"), "out": str(visited), "engine": "plain", "doubt": "50%"},
+    }
     with pytest.raises(NothingToMend, match=f"the map of {runs[-1].name} stands"):
         survey_png(visited, **{**flags, "doubt": "50%"})
     assert sorted(visited.glob("runs/*")) == runs
+    words = [word for name, value in asked.items() for word in (f"--{name.replace('_', '-')}", str(value))]
+    told = command_line("survey", *words, "--json")
+    assert told.code == 0
+    assert json.loads(told.out) == {"looked": False, "run": runs[-1].name, "why": told.err.strip().splitlines()[-1]}
+    assert forecast(load_settings(None, asked)).scans is not None
     assert survey_png(visited, **{**flags, "doubt": "0.1%"}).receipt["settings"]["doubt"] == 0.001
 
 
