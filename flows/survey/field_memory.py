@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flows.survey.field_work import look_at
+from flows.survey.memory import EarlierLook
 from models.reading.regions import Region
 from models.reading.remembered import Belief, Remembered, in_classes
 from models.weights.files import Weights
@@ -21,14 +22,6 @@ from storage.arrays.mosaics import mosaic_brightness
 REACH_PX = 64.0  # within which a memory that lies beside today's look is found
 LEAST_SHIFT_PX = 2.0  # less is how well two looks can be laid on each other
 Gap = tuple[int, int]  # what lies before the first and behind the last
-
-
-@dataclass(frozen=True)
-class CoarseMemory:
-    """Where a coarse look at a field lies."""
-
-    mosaic: Path
-    shift_px: tuple[int, int]  # down and to the right, that brings it onto the newest
 
 
 @dataclass(frozen=True)
@@ -78,9 +71,11 @@ def shifted(image: NDArray[np.float32], by: tuple[int, int]) -> NDArray[np.float
     return _framed(image[parts[0][0], parts[1][0]], (parts[0][1], parts[1][1]))
 
 
-def memory_lies(before: Sequence[CoarseMemory], now: Path, factor: int) -> FieldShift:
+def memory_lies(before: Sequence[EarlierLook], now: Path, factor: int) -> FieldShift:
     """How the field of stored coarse looks, the newest first, lies beside that of another, in fine px."""
-    pictures = (shifted(mosaic_brightness(look.mosaic), _cells(look.shift_px, factor)) for look in before)
+    pictures = (
+        shifted(mosaic_brightness(look.mosaic.path / "mosaic.zarr"), _cells(look.shift_px, factor)) for look in before
+    )
     found = field_shift(mosaic_brightness(now), laid_together(pictures), reach_px=REACH_PX / factor)
     return replace(found, shift=(factor * found.shift[0], factor * found.shift[1]))
 

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from flows.settings.values import LOOK_WHOLE
 from flows.survey.drawing import Drawing, UnknownRule, draw_field
-from flows.survey.field_memory import CoarseMemory, FieldMemory, memory_lies, whole_pixels
+from flows.survey.field_memory import FieldMemory, memory_lies, whole_pixels
 from flows.survey.field_work import FieldWork, look_at, region_params, seat_columns
-from flows.survey.memory import MEMORY, Prior
+from flows.survey.memory import MEMORY
 from flows.survey.run import SurveyRun
 from flows.survey.stage import Product, Wanted, stage
 from models.reading.inference import CoarseLook, Glance, read_glance
@@ -84,12 +84,7 @@ def _memory_lies(run: SurveyRun, mosaic: StageRef) -> FieldShift:
     """How the field of before lies beside the one of today, in fine px."""
     if run.prior is None:
         return FieldShift()
-    return memory_lies(_coarse_looks(run.prior), mosaic.path / "mosaic.zarr", run.grid.factor)
-
-
-def _coarse_looks(prior: Prior) -> tuple[CoarseMemory, ...]:
-    """What is remembered of how the field looked, the newest first, where workers find it."""
-    return tuple(CoarseMemory((look.mosaic.path / "mosaic.zarr").resolve(), look.shift_px) for look in prior.looks)
+    return memory_lies(run.prior.looks, mosaic.path / "mosaic.zarr", run.grid.factor)
 
 
 def _is_turned(run: SurveyRun, lies: FieldShift) -> bool:
@@ -107,8 +102,9 @@ def _drawing(
     prior = run.prior
     memory = None
     if prior is not None and not _is_turned(run, lies):
-        belief = (prior.belief.path / "belief.zarr").resolve()
-        memory = FieldMemory(belief, _coarse_looks(prior)[0].mosaic, prior.days, prior.classes, whole_pixels(lies))
+        last = prior.looks[0].mosaic
+        belief, coarse = (prior.belief.path / "belief.zarr").resolve(), (last.path / "mosaic.zarr").resolve()
+        memory = FieldMemory(belief, coarse, prior.days, prior.classes, whole_pixels(lies))
     create_belief(path / "belief.zarr", shape, legend, grid=run.angular_grid(), goes_on=memory is not None)
     seen = (mosaic.path / "mosaic.zarr").resolve(), (patches.path / "patches.zarr").resolve()
     made = (path / "class_map.zarr").resolve(), (path / "belief.zarr").resolve()
