@@ -37,6 +37,7 @@ from storage.archive.staging import (
     take_lock,
 )
 
+TICK_S = 0.02  # dates have milliseconds, and those of files are some of them late
 _AT_FDCWD = -100  # names are absolute, or of the working folder
 _RENAME_EXCHANGE = 2
 _UNSUPPORTED = (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP)
@@ -49,7 +50,7 @@ def date_of_store(root: Path, uri: str) -> str:
     """
     now = datetime.now(UTC)
     folders = published_runs(root)
-    if any((folder / MANIFEST_NAME).lstat().st_mtime >= now.timestamp() for folder in folders):
+    if any((folder / MANIFEST_NAME).lstat().st_mtime >= now.timestamp() - TICK_S for folder in folders):
         runs = (read_run(folder, {}) for folder in folders)
         for known in (run.sealed for run in runs if uri in run.recorded):
             try:
