@@ -122,6 +122,7 @@ class Receipt(TypedDict):
     zones: NotRequired[dict[str, Any]]  # only where zones leave something out: what is kept
     plots: NotRequired[list[dict[str, Any]]]  # only where plots are given: ground, classes, confidence of each
     unknown: NotRequired[dict[str, Any]]  # pixels unlike what the weights were trained on, where they know what is
+    expected: NotRequired[dict[str, Any]]  # what the map is likely to score, by what it says of itself; mIoU and error
     pixels: NotRequired[dict[str, int]]  # only where some have no value, no reading or no class: how many
     products: dict[str, str]
 
@@ -154,6 +155,7 @@ FINDINGS = (
     "zones",
     "plots",
     "unknown",
+    "expected",
     "pixels",
 )
 _SAVING_FIELDS = ("done", "full", "ratio", "full_is")

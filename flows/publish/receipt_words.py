@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from flows.publish.ground_findings import MOST_CHANGES, ground_words
+from flows.publish.map_findings import FOREIGN
 from flows.publish.receipt import Receipt, is_pending
 from flows.publish.zone_findings import zone_words
 from flows.survey.scores import worst_class_words
@@ -95,6 +96,11 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
         words.append(_memory_words(memory))
     if unknown := found.get("unknown"):
         words.append(_unknown_words(unknown, found.get("accuracy")))
+    if expected := found.get("expected"):
+        words.append(
+            f"By what it says of itself the map scores about {format_points(expected['miou'])} ±"
+            f" {format_points(expected['error'])}, with no label asked."
+        )
     if scans := found.get("scans"):
         words.append(_scans_words(scans))
     elif found.get("plan"):
@@ -127,9 +133,6 @@ def _field_words(field: Mapping[str, Any]) -> str:
         f"{view}{away}: {area_words(field['hectares'])} at {format_metres(field['ground_pixel_m'])} a pixel, "
         f"{three_digits(pace)} ha an hour of the camera ({three_digits(SECONDS_PER_HOUR / pace)} s a hectare)."
     )
-
-
-FOREIGN = 0.2  # share of a map that is unknown from which on its weights are the wrong ones
 
 
 def _unknown_words(unknown: Mapping[str, Any], accuracy: Mapping[str, Any] | None) -> str:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from flows.archive.field_figures import field_figures
 from flows.publish.change_picture import change_pictures, remembered
 from flows.publish.ground_findings import find_ground
+from flows.publish.map_findings import find_map
 from flows.publish.panels import draw_ground
 from flows.publish.quicklook import QuicklookData, draw_quicklook
 from flows.publish.receipt import AccuracyIs, Header, Receipt, build_receipt, check_receipt, with_accuracy
@@ -34,12 +35,10 @@ from flows.survey.stages.accuracy import load_accuracy
 from flows.survey.stages.attention import load_orientation, load_plan
 from flows.survey.stages.capture import captured
 from flows.survey.stages.effects import load_manifest
-from flows.survey.stages.maps import strange_pixels
 from flows.survey.stages.on_ground import STORE
 from flows.survey.stages.placement import SEATS_AT_ONCE, line_facts, load_registration, seen_shares
 from flows.survey.survey import STAGES, Products, StageRunner
 from pipeline.errors import IncompleteStoreError
-from pipeline.geometry.grid import UNLABELLED
 from pipeline.planning.coverage import on_scene
 from pipeline.planning.fine_pass import FinePlan
 from pipeline.planning.plain_scans import scan_words
@@ -329,22 +328,7 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     drawn = load_class_map(class_map.path / "class_map.zarr")
     posed = next((load_ground_map(ref.path / STORE) for ref in products.there(["ground"])), None)
     found |= find_ground(run, posed, drawn, BeliefStore(class_map.path / "belief.zarr")) | find_zones(run, drawn)
-    unclassed = drawn.classes == UNLABELLED
-    if (rate := run.settings.unknown_rate) is not None and run.familiar is not None:
-        count = int(np.count_nonzero(drawn.classes == run.described.config.classes))
-        told_pixels = int(np.count_nonzero(~unclassed))
-        found["unknown"] = {"pixels": count, "share": count / told_pixels if told_pixels else 0.0, "rate": rate}
-    if run.zones.left_out is not None:
-        unclassed &= ~run.zones.left_out
-    pixels = {
-        "scene_without_a_value": run.scene.filled_px,
-        "coarse_px_no_reading": 0,
-        "fine_px_no_reading": 0,
-        **{f"{name}_no_reading": count for name, count in strange_pixels(class_map).items()},
-        "map_without_a_class": int(np.count_nonzero(unclassed)),
-    }
-    if any(pixels.values()):
-        found["pixels"] = pixels
+    found |= find_map(run, class_map, drawn)
     troubled = {name: facts for name, facts in line_facts(products.of("rectify")).items() if any(facts.values())}
     if troubled:
         found["lines"] = troubled

@@ -34,6 +34,7 @@ from flows.survey.scene import (
 from flows.survey.seat_budget import SeatBudget
 from flows.survey.survey_model import SurveyModel, vgg_file
 from flows.survey.zones import SurveyZones, open_zones, place_of_field
+from models.evaluation.expected_scores import MapScores
 from models.network.device import PROCESSOR, choose_device
 from models.policies.vgg_file import VggFile
 from models.weights.familiar_files import FamiliarFile
@@ -133,6 +134,7 @@ class SurveyRun(CaptureRun):
     prior: Prior | None = None  # the run whose belief is gone on from
     reader: ReaderFile | None = None  # the reader of memories beside the weights, where there is one
     familiar: FamiliarFile | None = None  # what is familiar to the weights, where pixels may be called unknown
+    map_scores: MapScores | None = None  # how what maps expect of themselves came true, where that was measured
     notes: tuple[str, ...] = ()
     refused: str | None = None  # why this machine would refuse the survey; it is planned nevertheless
 
@@ -250,6 +252,7 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
         prior=prior,
         reader=model.reader,
         familiar=familiar,
+        map_scores=None if model.familiar is None else model.familiar.map_scores,
         notes=said,
         refused=refused,
     )

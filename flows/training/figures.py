@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flows.training.data import Report
+from models.evaluation.expected_scores import Floats, MapScores, ScoredMap, expected_counts
 from models.evaluation.metrics import (
     agreement,
     calibration_error,
@@ -76,40 +79,60 @@ def validate(weights: AnyWeights, examples: Iterable[Example], seed: int, show: 
 SCAN_EXPOSURES = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # of the reference, down to the darkest that was trained
 
 
+@dataclass(frozen=True)
+class ScanFigures:
+    """What scenes kept from training say of plain scans."""
+
+    record: dict[str, Any]  # what their maps scored, for the record of the weights
+    scores: MapScores  # how what maps expected of themselves came true
+
+
+@dataclass(frozen=True)
+class _JudgedScan:
+    """A map of a plain scan that was read whole, beside its labels."""
+
+    counts: Counts
+    sure: NDArray[np.float64]  # its labelled pixels by their confidence
+    expected: Floats  # counts as the map expects them
+
+
 def judge_scans(
     weights: Weights,
     examples: Sequence[Example],
-    looks: Looks,
+    looks: Looks | None,
     seed: int,
-    show: Callable[[str, float], None] = lambda scan, done: None,
-) -> dict[str, Any] | None:
-    """What maps of plain scans that are read whole score on each scene, by step and exposure; None without a scene.
+    report: Report = lambda what, done, figure: None,
+) -> ScanFigures | None:
+    """What maps of plain scans that are read whole score on each scene, by step and exposure.
 
+    None without a scene, and without ``looks``: then training saw none but those of the reference. In the record
     ``miou`` and the IoU of each class are tables (step, exposure) of the scenes' means, ``spread`` the standard
     deviation of their mIoU, ``calibration_error`` that of all pixels together. A scan is shown by the law of noise that
     training shows crops by.
     """
     known = [example for example in examples if example.noise is not None]
-    if not known:
+    if not known or looks is None:
         return None
     factor = weights.config.factor
     steps = [step for step in looks.steps if factor % step == 0]
     exposures = [share * REFERENCE_MS for share in SCAN_EXPOSURES if share * REFERENCE_MS >= looks.darkest_ms]
     miou, spread, calibration = np.zeros((3, len(steps), len(exposures)))
     of_classes = np.zeros((len(weights.class_names), len(steps), len(exposures)))
+    maps: dict[tuple[int, float], list[ScoredMap]] = {}
     for i, step in enumerate(steps):
         for j, exposure_ms in enumerate(exposures):
             rng = np.random.default_rng([seed, 0x5CA, i, j])
             judged = [_scanned(weights, one, looks, step, exposure_ms / REFERENCE_MS, rng) for one in known]
-            counts = [classes for classes, _ in judged]
-            calibration[i, j] = calibration_error(np.sum([sure for _, sure in judged], axis=0))
+            counts = [one.counts for one in judged]
+            calibration[i, j] = calibration_error(np.sum([one.sure for one in judged], axis=0))
             own = [mean_iou(one) for one in counts]
             miou[i, j], spread[i, j] = np.nanmean(own), np.nanstd(own, ddof=1) if len(own) > 1 else np.nan
             with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # a class that no scene has
                 of_classes[:, i, j] = np.nanmean([iou_per_class(one) for one in counts], axis=0)
-            done = (i * len(exposures) + j + 1) / miou.size
-            show(f"lines {step} px apart, {exposure_ms:g} ms: {100 * miou[i, j]:.1f}", done)
-    return {
+            maps[step, exposure_ms] = [ScoredMap(one.counts, one.expected) for one in judged]
+            told = f"lines {step} px apart, {exposure_ms:g} ms: {100 * miou[i, j]:.1f}"
+            report("judging scans", len(maps) / miou.size, told)
+    record = {
         "scenes": len(known),
         "steps": steps,
         "exposures_ms": exposures,
@@ -122,22 +145,25 @@ def judge_scans(
             if np.isfinite(iou).all()
         },
     }
+    return ScanFigures(record, MapScores.fitted(maps))
 
 
 def _scanned(
     weights: Weights, example: Example, looks: Looks, step: int, light: float, rng: np.random.Generator
-) -> tuple[Counts, NDArray[np.float64]]:
-    """Confusion counts of a scene whose plain scan is read whole, and its labelled pixels by their confidence."""
+) -> _JudgedScan:
+    """Draw the map of a scene's plain scan, read whole, and set it beside the labels."""
     assert example.noise is not None
     grid, _, labels = _parts(weights, example)
-    plain = example.fine.astype(np.float32)
+    plain, classes = example.fine.astype(np.float32), weights.config.classes
     fine, means = looks.scan(plain, example.noise, grid.factor, light=light, step=step, rng=rng)
     valid = grid.valid_seats()
     seen = glance_of_columns(weights, means, grid)
-    drawn = segment(weights, seen, patches_of(fine, grid.patch)[valid], valid)
+    drawn = segment(weights, seen, patches_of(fine, grid.patch)[valid], valid, every_class=True)
     told = (labels != UNLABELLED) & np.isfinite(drawn.confidence)
     sure = confidence_counts(drawn.confidence[told], drawn.classes[told] == labels[told])
-    return confusion(labels, drawn.classes, weights.config.classes), sure
+    assert drawn.log_probability is not None
+    expected = expected_counts([drawn.log_probability[told]], classes)
+    return _JudgedScan(confusion(labels, drawn.classes, classes), sure, expected)
 
 
 def _parts(weights: AnyWeights, example: Example) -> tuple[SceneGrid, Patches, NDArray[np.uint8]]:

@@ -15,11 +15,12 @@ from rich.console import Console
 from flows.terminal.progress import one_after_the_other
 from flows.training.data import Report, TrainingData, open_training_data
 from flows.training.familiarity import SeenScenes, measured_calibration, save_beside, trained_on
+from flows.training.figures import judge_scans
 from flows.training.train_scenes import TrainRequest, as_read, observe_all
 from models.training.examples import Example
-from models.training.looks import REFERENCE_MS
+from models.training.looks import REFERENCE_MS, Looks
 from models.training.train import TrainingSettings
-from models.weights.familiar_files import familiar_path
+from models.weights.familiar_files import MAP_SCORES, familiar_path
 from models.weights.files import CALIBRATION, Weights, load_weights
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
@@ -50,11 +51,14 @@ def measure_familiar(request: FamiliarRequest, report: Report = lambda what, don
     seen = _looked_at(weights, data, request, report)
     report("drawing maps of validation scenes", 0.0, "")
     told = trained_on(data, seen, weights.class_names)
+    looks = Looks(weights.normalisation, darkest_ms=seen.darkest_ms) if seen.darkest_ms < REFERENCE_MS else None
+    scans = judge_scans(weights, seen.validation, looks, seen.seed, report)
     record = {
         "command": request.command,
         "scenes": len(seen.train),
         "validation": len(seen.validation),
         CALIBRATION: measured_calibration(weights, seen.validation, seen.seed),
+        **({} if scans is None else {MAP_SCORES: scans.scores.as_dict()}),
     }
     why = save_beside(weights, request.weights, seen, told, record, report, out=request.out)
     if why is not None:

@@ -12,6 +12,7 @@ from flows.training.data import Report, TrainingData, either_mask, open_training
 from flows.training.familiarity import SeenScenes, measured_calibration, save_beside, trained_on
 from flows.training.figures import judge_scans, validate
 from flows.training.train_scenes import About, TrainRequest, as_read, network_config, observe_all, question_labels
+from models.evaluation.expected_scores import MapScores
 from models.network.device import choose_device
 from models.network.segmenter import Segmenter
 from models.network.sizes import Preset, SegmenterConfig
@@ -20,6 +21,7 @@ from models.training.examples import Example, measured_normalisation
 from models.training.looks import REFERENCE_MS, Looks
 from models.training.start_weights import Start, StartFile
 from models.training.train import Progress, train
+from models.weights.familiar_files import MAP_SCORES
 from models.weights.files import CALIBRATION, AnyWeights, Weights, save_weights, with_record
 from models.weights.sealed_files import read_checkpoint
 from models.weights.trained_on import TRAINED_ON
@@ -65,6 +67,7 @@ def train_weights(
     frames = as_read(kept, lesson.normalisation)
     whole = SeenScenes(lesson.examples, frames, about.wavelength_nm, request.settings.darkest_ms, request.settings.seed)
     told = trained_on(data, whole, about.names)
+    figures, scores = _figures(weights, frames, lesson.looks, request.settings.seed, report)
     record = {
         "command": request.command,
         "data": data.law,
@@ -74,13 +77,14 @@ def train_weights(
         "camera": asdict(request.camera),
         "training": summary,
         "device": device,
-        **_figures(weights, frames, lesson.looks, request.settings.seed, report),
+        **figures,
         **({} if lesson.begun is None else {"begun_from": lesson.begun.record}),
     }
     save_weights(with_record(weights, **record), request.out)
     checkpoint.unlink(missing_ok=True)
     if isinstance(weights.network, Segmenter):
-        why = save_beside(_two_scale(weights), request.out, whole, told, {"command": request.command}, report)
+        own = {"command": request.command, **({} if scores is None else {MAP_SCORES: scores.as_dict()})}
+        why = save_beside(_two_scale(weights), request.out, whole, told, own, report)
         record = record if why is None else {**record, "familiar": why}
     return record
 
@@ -145,18 +149,16 @@ def _two_scale(weights: AnyWeights, **entries: Any) -> Weights:
 
 def _figures(
     weights: AnyWeights, frames: list[Example], looks: Looks | None, seed: int, report: Report
-) -> dict[str, Any]:
+) -> tuple[dict[str, Any], MapScores | None]:
     """What the record says of scenes kept for validation; of plain scans too, where training saw such looks."""
     figures = {"validation": validate(weights, frames, seed, lambda row: report("validating", 0.0, row))}
     if not isinstance(weights.network, Segmenter):
-        return figures
+        return figures, None
     calibration = measured_calibration(_two_scale(weights), frames, seed)
     figures |= {} if calibration is None else {CALIBRATION: calibration}
-    if looks is None:
-        return figures
     two_scale = _two_scale(weights, calibration=calibration or {})
-    scans = judge_scans(two_scale, frames, looks, seed, lambda row, done: report("judging scans", done, row))
-    return figures if scans is None else figures | {"scans": scans}
+    scans = judge_scans(two_scale, frames, looks, seed, report)
+    return (figures, None) if scans is None else (figures | {"scans": scans.record}, scans.scores)
 
 
 def _check_places(out: Path, checkpoint: Path) -> None:

@@ -42,7 +42,7 @@ def confusion(labels: NDArray[np.integer], predicted: NDArray[np.integer], class
     return np.bincount(truth * classes + guess, minlength=classes**2).reshape(classes, classes)
 
 
-def labelled_classes(counts: NDArray[np.integer]) -> NDArray[np.bool_]:
+def labelled_classes(counts: NDArray[np.number]) -> NDArray[np.bool_]:
     """Which classes the labels have among the pixels judged, (..., class, class) -> (..., class)."""
     held: NDArray[np.bool_] = counts.sum(axis=-1) > 0
     return held
@@ -53,7 +53,7 @@ def false_pixels(counts: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.where(labelled_classes(counts), 0, counts.sum(axis=0))
 
 
-def iou_per_class(counts: NDArray[np.integer]) -> NDArray[np.float64]:
+def iou_per_class(counts: NDArray[np.number]) -> NDArray[np.float64]:
     """Intersection over union of each class, (..., class, class) -> (..., class); NaN for one that the labels lack."""
     hit = np.diagonal(counts, axis1=-2, axis2=-1).astype(np.float64)
     union = counts.sum(axis=-2) + counts.sum(axis=-1) - hit

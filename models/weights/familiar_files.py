@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from models.evaluation.expected_scores import MapScores
 from models.reading.familiar import Familiar, Limits
 from models.weights.files import Description, content_key, unusable
 from models.weights.sealed_files import beside, changed_tensor, key_of_sealed, open_sealed, write_sealed
@@ -22,6 +23,7 @@ else:
     torch = deferred("torch")
 
 FORMAT = "spectralzoom-familiar/1"
+MAP_SCORES = "map_scores"  # of the record: how what maps expect to score came true, where that was measured
 SUFFIX = ".familiar.safetensors"
 OF_COMPONENTS = ("centres", "covariance", "shot", "read")
 OF_LIMITS = ("rates", "light", "fine", "coarse")
@@ -34,7 +36,7 @@ class FamiliarWeights:
     familiar: Familiar
     weights_key: str
     trained_on: TrainedOn
-    record: Mapping[str, Any] = field(default_factory=dict)  # command, scenes, calibration
+    record: Mapping[str, Any] = field(default_factory=dict)  # command, scenes, calibration, map scores
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,7 @@ class FamiliarFile:
     path: Path
     key: str
     trained_on: TrainedOn
+    map_scores: MapScores | None = None  # None of files of before, and of weights that were trained in one light
 
 
 def familiar_path(weights: Path) -> Path:
@@ -82,7 +85,9 @@ def describe_familiar(weights: Path, described: Description, weights_key: str) -
         return None
     with open_sealed(path, "np", FORMAT, _refused) as (_, about):
         _checked(path, about, described, weights_key)
-    return FamiliarFile(path, familiar_key(path), TrainedOn.read(about["trained_on"]))
+    scores = about["record"].get(MAP_SCORES)
+    told = None if scores is None else MapScores.read(scores)
+    return FamiliarFile(path, familiar_key(path), TrainedOn.read(about["trained_on"]), told)
 
 
 def familiar_key(path: Path) -> str:
@@ -116,7 +121,9 @@ def _checked(path: Path, about: Mapping[str, Any], described: Description, weigh
     """Refuse a description that lacks something, or is of other weights (WeightsError)."""
     try:
         TrainedOn.read(about["trained_on"])
-        key, columns, _ = str(about["weights_key"]), int(about["columns"]), (about["steps"], about["record"])
+        key, columns, _ = str(about["weights_key"]), int(about["columns"]), about["steps"]
+        if (scores := about["record"].get(MAP_SCORES)) is not None:
+            MapScores.read(scores)
     except (KeyError, TypeError, ValueError) as error:
         raise _refused(path, f"its description lacks {error}") from error
     if key != weights_key or columns != described.config.columns:

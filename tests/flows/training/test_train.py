@@ -25,10 +25,11 @@ from flows.training.measure_familiar import FamiliarRequest, measure_familiar
 from flows.training.train import joined_split, train_weights
 from flows.training.train_command import run_train, usual_crop
 from flows.training.train_scenes import TrainRequest, suggested_patch
+from models.evaluation.expected_scores import MapScores
 from models.network.sizes import PRESETS, Preset
 from models.training.start_weights import StartFile
 from models.training.train import TrainingSettings
-from models.weights.familiar_files import familiar_path, load_familiar
+from models.weights.familiar_files import MAP_SCORES, familiar_path, load_familiar
 from models.weights.files import describe_weights, load_any_weights, load_weights
 from models.weights.trained_on import TrainedOn
 from pipeline.errors import SceneError, SettingsError, WeightsError
@@ -321,7 +322,7 @@ def test_masks_of_what_was_seen_add_up(earlier: Path, monkeypatch: pytest.Monkey
 
 
 def test_weights_for_short_exposures_have_a_record_of_plain_scans(folder: Path, out: Path):
-    """mIoU by step and exposure from the darkest up, in the file too; without it, and of a control, there is none."""
+    """mIoU by step and exposure from the darkest up, and beside it what maps expect; else, and of a control, none."""
     settings = replace(SETTINGS, darkest_ms=6.0)
     record = train_weights(_request(folder, out, validation=2, settings=settings))
     scans = describe_weights(out).record["scans"]
@@ -330,6 +331,13 @@ def test_weights_for_short_exposures_have_a_record_of_plain_scans(folder: Path, 
     tables = [scans["miou"], *scans["per_class_iou"].values()]
     assert all(np.shape(table) == (2, 5) and np.min(table) >= 0 and np.max(table) <= 1 for table in tables)
     assert np.shape(scans["spread"]) == (2, 5)
+    told = load_familiar(out, describe_weights(out)).record[MAP_SCORES]
+    scores = MapScores.read(told)
+    assert (scores.steps, scores.exposures_ms, scores.scenes) == ((1, 2), (6.0, 12.0, 25.0, 50.0, 100.0), 2)
+    assert np.abs(scores.bias).max() > 0.01
+    measure_familiar(FamiliarRequest(str(folder), out, familiar_path(out)))
+    again = MapScores.read(load_familiar(out, describe_weights(out)).record[MAP_SCORES])
+    np.testing.assert_allclose(again.bias, scores.bias, atol=0.05)
     assert "scans" not in train_weights(_request(folder, out, validation=2))
     assert "scans" not in train_weights(_request(folder, out, validation=0, settings=settings))
     dense = _request(folder, out, validation=2, settings=settings, preset="dense")

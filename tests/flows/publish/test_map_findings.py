@@ -1,0 +1,88 @@
+"""What a receipt says that a map is likely to score."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from flows.publish.receipt_words import sentences
+from models.evaluation.expected_scores import MapScores, expected_counts, expected_score
+from models.reading.familiar import Familiar, Limits
+from models.weights.familiar_files import MAP_SCORES, FamiliarWeights, familiar_path, save_familiar
+from models.weights.files import content_key, describe_weights
+from models.weights.trained_on import TrainedOn
+from pipeline.errors import WeightsError
+from tests.conftest import CLASSES, Survey
+
+SEEN = TrainedOn(3, (460.0, 640.0), (3.0, 100.0), 2, CLASSES, (96, 300), (24.0, 60.0), 0.12)
+BIAS = np.array([-0.4, 0.1, 0.0])
+SCORES = MapScores((1,), (50.0, 100.0), np.stack([[0 * BIAS, BIAS]]), np.array([[0.02, 0.01]]), 4)
+
+
+def _judged(weights: Path, folder: Path, content: dict[str, Any], limit: float = 1e6) -> Path:
+    """A copy of the tiny weights beside which stands how what their maps expect came true."""
+    path = folder / "judged.safetensors"
+    shutil.copy(weights, path)
+    one, table = np.eye(3), np.full((1, 1, 2), limit)
+    limits = Limits(np.array([0.001, 0.05]), np.ones(1), (1,), table, table[0])
+    familiar = Familiar(np.zeros((1, 3)), one[None], 1e-9 * one[None], 1e-9 * one, limits, 3)
+    save_familiar(FamiliarWeights(familiar, content_key(path), SEEN, {MAP_SCORES: content}), familiar_path(path))
+    return path
+
+
+def test_a_plain_scan_is_told_what_its_map_scores_by_itself(survey_png: Survey, weights: Path, tmp_path: Path):
+    """By the stored belief, as another reader opens it, and the bias of its exposure; in words too."""
+    path = _judged(weights, tmp_path, SCORES.as_dict())
+    receipt: Any = survey_png(tmp_path / "a", weights=str(path), effects="none", budget=None, scan_step="1").receipt
+    (store,) = (tmp_path / "a").glob("stages/segment/*/belief.zarr")
+    said = xr.open_zarr(store, consolidated=False)["log_probability"].values
+    said = said - np.log(np.exp(said).sum(axis=-1, keepdims=True))
+    told = expected_score(expected_counts([said], len(CLASSES)), BIAS, 0.01)
+    assert receipt["expected"]["miou"] == pytest.approx(told.miou, abs=1e-5)
+    assert receipt["expected"]["error"] == pytest.approx(told.error, abs=1e-5)
+    assert set(receipt["expected"]["per_class_iou"]) <= set(CLASSES)
+    words = f"the map scores about {100 * told.miou:.1f} ± {100 * told.error:.1f}"
+    assert any(words in sentence for sentence in sentences(receipt))
+    again: Any = survey_png(
+        tmp_path / "b", weights=str(path), effects="none", budget=None, scan_step="1", unknown="off"
+    ).receipt
+    assert again["expected"] == receipt["expected"]
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        {},
+        {"budget": None, "scan_step": "2"},
+        {"budget": None, "scan_step": "1", "scan_exposure_ms": "49"},
+        {"budget": None, "scan_step": "1", "bytes_kept": "60%"},
+    ],
+    ids=["two passes", "another step", "a darker scan", "read in part"],
+)
+def test_nothing_is_told_of_maps_of_which_nobody_knows(
+    survey_png: Survey, weights: Path, tmp_path: Path, flags: dict[str, str | None]
+):
+    """Two passes, a step or an exposure that was not measured, a scan of which a part alone is read."""
+    path = _judged(weights, tmp_path, SCORES.as_dict())
+    assert "expected" not in survey_png(tmp_path / "a", weights=str(path), effects="none", **flags).receipt
+
+
+def test_nothing_is_told_of_a_field_that_the_weights_do_not_know(survey_png: Survey, weights: Path, tmp_path: Path):
+    """Where most of it is unknown the probabilities of the rest say nothing."""
+    path = _judged(weights, tmp_path, SCORES.as_dict(), limit=1e-6)
+    receipt: Any = survey_png(tmp_path / "a", weights=str(path), effects="none", budget=None, scan_step="1").receipt
+    assert receipt["unknown"]["share"] == 1
+    assert "expected" not in receipt
+
+
+def test_a_table_that_is_none_is_refused_with_its_file(survey_png: Survey, weights: Path, tmp_path: Path):
+    """The file is named, and what to do."""
+    path = _judged(weights, tmp_path, SCORES.as_dict() | {"error": [[0.1]]})
+    with pytest.raises(WeightsError, match=r"judged\.familiar.*--familiar"):
+        survey_png(tmp_path / "a", weights=str(path), effects="none", budget=None, scan_step="1")
+    assert MAP_SCORES not in describe_weights(path).record

@@ -1,0 +1,176 @@
+"""What maps are likely to score by what they say of themselves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from models.evaluation.expected_scores import (
+    LEAST_ERROR,
+    MapScores,
+    ScoredMap,
+    error_of_looks,
+    expected_counts,
+    expected_score,
+    fitted_bias,
+)
+from models.evaluation.metrics import confusion, iou_per_class, mean_iou
+
+CLASSES = 4
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def _map(seed: int, pixels: int = 4000, *, hotter: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """Log-probabilities (pixel, class), and labels drawn by them; the map says them ``hotter`` times as surely."""
+    rng = np.random.default_rng(seed)
+    logits = rng.normal(size=(pixels, CLASSES)) * 3
+    true = np.exp(logits) / np.exp(logits).sum(axis=1, keepdims=True)
+    labels = (true.cumsum(axis=1) < rng.random((pixels, 1))).sum(axis=1).clip(max=CLASSES - 1)
+    said = np.exp(hotter * logits)
+    return np.log(said / said.sum(axis=1, keepdims=True)), labels.astype(np.uint8)
+
+
+def _scored(seed: int, hotter: float = 1.0) -> ScoredMap:
+    said, labels = _map(seed, hotter=hotter)
+    counts = confusion(labels, said.argmax(axis=1).astype(np.uint8), CLASSES)
+    return ScoredMap(counts, expected_counts([said], CLASSES))
+
+
+@given(SEEDS, st.integers(0, 200))
+def test_expected_counts_of_parts_add_up(seed: int, cut: int):
+    """Counts of a map are those of its parts together, one for each pixel, whatever the cut."""
+    said, _ = _map(seed, 200)
+    whole = expected_counts([said], CLASSES)
+    assert np.allclose(whole, expected_counts([said[:cut], said[cut:]], CLASSES))
+    assert whole.sum() == pytest.approx(len(said))
+
+
+@given(SEEDS)
+def test_what_nothing_is_known_of_is_left_out(seed: int):
+    """Pixels without a probability, NaN or minus infinity, count for nothing."""
+    said, _ = _map(seed, 50)
+    said[::5], said[1::5, 2] = np.nan, -np.inf
+    kept = np.isfinite(said).all(axis=1)
+    assert np.array_equal(expected_counts([said], CLASSES), expected_counts([said[kept]], CLASSES))
+
+
+@given(SEEDS)
+def test_columns_are_those_of_the_map(seed: int):
+    """What is mapped as a class is as many pixels as the map shows of it; ties go to the first."""
+    said, _ = _map(seed, 300)
+    said[0] = np.log(1 / CLASSES)
+    shown = np.bincount(said.argmax(axis=1), minlength=CLASSES)
+    assert np.allclose(expected_counts([said], CLASSES).sum(axis=0), shown)
+
+
+@settings(max_examples=20)
+@given(SEEDS)
+def test_a_map_that_is_as_sure_as_it_may_be_expects_what_it_scores(seed: int):
+    """Where labels are drawn by the probabilities, the IoU expected is the IoU but for chance."""
+    one = _scored(seed)
+    assert np.abs(iou_per_class(one.expected) - iou_per_class(one.counts)).max() < 0.06
+    told = expected_score(one.expected, np.zeros(CLASSES))
+    assert abs(told.miou - mean_iou(one.counts)) < 0.04
+
+
+@pytest.mark.parametrize("hotter", [0.5, 2.0])
+def test_maps_that_are_too_sure_or_not_enough_are_put_right(hotter: float):
+    """What other maps of the same kind were off by is taken off: a third of the error is left at most."""
+    maps, other = [_scored(seed, hotter) for seed in range(6)], _scored(77, hotter)
+    bias, truth = fitted_bias(maps), mean_iou(other.counts)
+    off = expected_score(other.expected, np.zeros(CLASSES)).miou - truth
+    assert abs(off) > 0.03
+    assert abs(expected_score(other.expected, bias).miou - truth) < abs(off) / 3
+    assert (bias > 0).all() == (hotter < 1)
+
+
+def test_a_class_that_no_scene_has_is_not_put_right():
+    """Its bias is 0, as is that of one which maps show by mistake alone."""
+    one = _scored(3)
+    counts = one.counts.copy()
+    counts[2] = 0
+    assert fitted_bias([ScoredMap(counts, one.expected)])[2] == 0
+
+
+def test_a_class_of_few_pixels_counts_by_the_odds_that_it_is_there():
+    """One expected pixel of a class moves the mean by next to nothing; a hundred by half, with a large error."""
+    counts = np.diag([5000.0, 5000.0, 0.0])
+    base = expected_score(counts, np.zeros(3))
+    assert base.miou > 0.99
+    means, errors = [], []
+    for pixels in (1.0, 100.0, 5000.0):
+        some = counts.copy()
+        some[2, 0] = pixels  # all of them mapped as something else
+        told = expected_score(some, np.zeros(3))
+        means.append(told.miou)
+        errors.append(told.error)
+        assert np.isfinite(told.per_class_iou[2]) == (pixels > 100)
+    assert means[0] == pytest.approx(base.miou, abs=1e-3)
+    assert means[1] == pytest.approx((2 * base.miou + 0.5 * 0.005) / 2.5, abs=0.01)
+    assert means[2] < 0.6
+    assert errors[1] > 5 * errors[0]
+
+
+def test_of_nothing_nothing_is_expected():
+    """Without a pixel the score is NaN, not 0."""
+    told = expected_score(np.zeros((3, 3)), np.zeros(3))
+    assert np.isnan(told.miou)
+    assert np.isnan(told.error)
+
+
+def test_one_scene_tells_of_no_error_but_the_least():
+    """A single map is put right by itself, and nobody takes its error for none."""
+    assert error_of_looks([_scored(1)]) == LEAST_ERROR
+
+
+def test_the_error_of_looks_is_that_of_scenes_which_differ():
+    """Maps of which some are too sure and some are not have a larger error than those that are alike."""
+    alike = [_scored(seed) for seed in range(6)]
+    mixed = [_scored(seed, 0.5 if seed % 2 else 2.0) for seed in range(6)]
+    assert error_of_looks(mixed) > 3 * error_of_looks(alike)
+
+
+def _scores() -> MapScores:
+    looks = {(step, ms): [_scored(7 * step + k, 1 + 2 / ms) for k in range(3)] for step in (2, 1) for ms in (4.0, 64.0)}
+    return MapScores.fitted(looks)
+
+
+def test_scores_come_back_from_a_record():
+    """What is written down is read again, rounded."""
+    scores = _scores()
+    again = MapScores.read(scores.as_dict())
+    assert (again.steps, again.exposures_ms, again.scenes) == ((1, 2), (4.0, 64.0), 3)
+    assert np.allclose(again.bias, scores.bias, atol=1e-4)
+    assert np.allclose(again.error, scores.error, atol=1e-5)
+
+
+def test_exposures_between_are_between_by_their_logarithm():
+    """Half of the way from 4 to 64 ms is 16 ms; the ends are what was measured."""
+    scores, counts = _scores(), _scored(50).expected
+    first, middle, last = (scores.expected(counts, 2, ms) for ms in (4.0, 16.0, 64.0))
+    assert first is not None
+    assert middle is not None
+    assert last is not None
+    assert first.miou == expected_score(counts, scores.bias[1, 0], scores.error[1, 0]).miou
+    assert middle.miou == pytest.approx((first.miou + last.miou) / 2, abs=0.005)
+    assert middle.miou != last.miou
+
+
+@pytest.mark.parametrize(("step", "exposure_ms"), [(4, 16.0), (1, 3.9), (1, 65.0)])
+def test_nothing_is_said_of_looks_beyond_those_measured(step: int, exposure_ms: float):
+    """Another step, a darker and a lighter exposure have no score; neither have maps of other classes."""
+    scores = _scores()
+    assert scores.expected(_scored(50).expected, step, exposure_ms) is None
+    assert scores.expected(np.eye(CLASSES + 1), 1, 16.0) is None
+
+
+@pytest.mark.parametrize("part", ["steps", "exposures_ms", "bias", "error", "scenes"])
+def test_a_record_that_lacks_a_part_is_none(part: str):
+    """Each part is needed, and tables have to be of the steps and exposures."""
+    content = _scores().as_dict()
+    with pytest.raises(KeyError, match=part):
+        MapScores.read({name: value for name, value in content.items() if name != part})
+    with pytest.raises(ValueError, match="looks"):
+        MapScores.read(content | {"error": [[0.1]]})
