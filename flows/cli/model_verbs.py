@@ -151,7 +151,8 @@ def train(
         enough.
     darkest_ms
         Shortest exposure that the weights are to read: crops are shown with exposures from here to 100 ms, and lines 1,
-        2 or 4 px apart; the file then has a record of plain scans, by which `survey --seconds` plans.
+        2 or 4 px apart; where scenes are kept for validation the file then has a record of plain scans on them, by
+        which `survey --seconds` plans.
     device
         Where the network computes: `cpu`, `cuda`, `mps`, or `auto`, the first of the last two that torch can use here,
         else the processor.

@@ -106,7 +106,7 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
     elif found.get("plan"):
         words.append(
             "The weights have no record of plain scans, so that seconds are told beside every line at full exposure; "
-            "train --darkest-ms 3 makes one."
+            "train --darkest-ms 3 makes one, by scenes kept for validation."
         )
     for name, one in found.get("pointing", {}).items():
         if isinstance(one, Mapping) and (told := _pointing_words(name, one)):

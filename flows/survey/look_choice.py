@@ -101,7 +101,7 @@ def choose_look(
     if content is None:
         raise WeightsError(
             f"the weights {path.name} have no record of plain scans, by which a part of a field is chosen: leave --look"
-            " out, or train weights with --darkest-ms 3"
+            " out, or train weights with --darkest-ms 3, some scenes kept for validation"
         )
     there = grid.valid_share().ravel() > 0 if shown is None else shown
     strips, classes = _strips(prior, grid, reader, weights), len(weights.class_names)

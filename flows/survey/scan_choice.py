@@ -75,7 +75,8 @@ def choose_plain_scan(
         if settings.scan_step is None and settings.plain:
             raise WeightsError(
                 f"the weights {path.name} have no record of plain scans, by which one would be chosen: give the scan "
-                "with --scan-step and --scan-exposure-ms, or train weights with --darkest-ms 3"
+                "with --scan-step and --scan-exposure-ms, or train weights with --darkest-ms 3, some scenes kept for"
+                " validation"
             )
         return settings, ScanChoice()
     record = ScanRecord.read(content)

@@ -76,7 +76,7 @@ def validate(weights: AnyWeights, examples: Iterable[Example], seed: int, show: 
     }
 
 
-SCAN_EXPOSURES = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # of the reference, down to the darkest that was trained
+SCAN_EXPOSURES = (1.0, 0.5, 0.25, 0.12, 0.06, 0.03)  # of the reference; the last judged is the darkest trained
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,8 @@ def judge_scans(
         return None
     factor = weights.config.factor
     steps = [step for step in looks.steps if factor % step == 0]
-    exposures = [share * REFERENCE_MS for share in SCAN_EXPOSURES if share * REFERENCE_MS >= looks.darkest_ms]
+    lighter = [share * REFERENCE_MS for share in SCAN_EXPOSURES if share * REFERENCE_MS > looks.darkest_ms]
+    exposures = [*lighter, looks.darkest_ms]
     miou, spread, calibration = np.zeros((3, len(steps), len(exposures)))
     of_classes = np.zeros((len(weights.class_names), len(steps), len(exposures)))
     maps: dict[tuple[int, float], list[ScoredMap]] = {}

@@ -92,6 +92,8 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
             f"spectralzoom evaluate {request.dataset} {given} {out}",
             soft_wrap=True,
         )
+        if request.settings.darkest_ms < REFERENCE_MS and request.preset == "two-scale":
+            console.print("nor has the file a record of plain scans, by which survey --seconds chooses", soft_wrap=True)
         return
     title = f"{figures['scenes']} scene{'s' if figures['scenes'] > 1 else ''} kept for validation"
     caption = f"none: the coarse pass alone; all: fine everywhere; else fine at {figures['share_of_seats']:.0%}"

@@ -218,7 +218,9 @@ def test_nothing_is_expected_of_a_scan_beyond_the_record(
 
 def test_weights_without_a_record_scan_by_hand_alone(survey_png: Survey, tmp_path: Path) -> None:
     """Old weights: seconds are refused with what to do instead, and a scan by hand has no expectation."""
-    with pytest.raises(WeightsError, match=r"no record of plain scans.*--scan-step and --scan-exposure-ms"):
+    with pytest.raises(
+        WeightsError, match=r"no record of plain scans.*--scan-step and --scan-exposure-ms.*for validation"
+    ):
         survey_png(tmp_path / "none", budget=None, seconds="5")
     published = survey_png(tmp_path / "by hand", budget=None, scan_step="4")
     assert "scans" not in published.receipt

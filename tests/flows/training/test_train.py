@@ -344,6 +344,27 @@ def test_weights_for_short_exposures_have_a_record_of_plain_scans(folder: Path, 
     assert "scans" not in train_weights(dense)
 
 
+def test_the_record_of_plain_scans_ends_with_the_darkest_that_was_trained(folder: Path, out: Path):
+    """Whatever exposure that is: surveys may choose down to it."""
+    settings = replace(SETTINGS, darkest_ms=8.0)
+    scans = train_weights(_request(folder, out, validation=1, settings=settings))["scans"]
+    assert scans["exposures_ms"] == [100.0, 50.0, 25.0, 12.0, 8.0]
+    assert np.shape(scans["miou"]) == (2, 5)
+
+
+@pytest.mark.parametrize(
+    ("darkest_ms", "preset", "said"), [(3.0, "two-scale", True), (100.0, "two-scale", False), (3.0, "dense", False)]
+)
+def test_weights_that_will_choose_no_scan_say_so(
+    folder: Path, out: Path, darkest_ms: float, preset: Preset, said: bool
+):
+    """Short exposures without scenes to judge scans on: told as training ends, not first by a survey."""
+    shown, settings = io.StringIO(), replace(SETTINGS, darkest_ms=darkest_ms)
+    request = _request(folder, out, validation=0, settings=settings, preset=preset)
+    run_train(request, Console(file=shown, width=100))
+    assert ("nor has the file a record of plain scans" in shown.getvalue()) == said
+
+
 def test_whitening_knows_the_noise_of_short_exposures(folder: Path, out: Path):
     """Weights that are to read short exposures make less of directions that noise would hide."""
     sizes = []
