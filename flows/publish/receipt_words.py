@@ -102,7 +102,7 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
             f" {format_points(expected['error'])}, with no label asked."
         )
     if scans := found.get("scans"):
-        words.append(_scans_words(scans))
+        words.append(_scans_words(scans, read_whole="kept" not in found))
     elif found.get("plan"):
         words.append(
             "The weights have no record of plain scans, so that seconds are told beside every line at full exposure; "
@@ -208,7 +208,7 @@ def days_words(days: float) -> str:
     return f"{days:.1f} days earlier" if days < 10 else f"{days:.0f} days earlier"
 
 
-def _scans_words(scans: Mapping[str, Mapping[str, Any]]) -> str:
+def _scans_words(scans: Mapping[str, Mapping[str, Any]], *, read_whole: bool) -> str:
     """What the weights' record expects of the plain scan that was taken, or would have of one in the same seconds."""
 
     def told(scan: Mapping[str, Any]) -> str:
@@ -220,7 +220,8 @@ def _scans_words(scans: Mapping[str, Mapping[str, Any]]) -> str:
 
     words, taken, best, reference = [], *(scans.get(name) for name in ("taken", "best_in_time", "reference"))
     if taken is not None:
-        words.append(f"By the weights' record such a scan scores about {points(taken)}.")
+        read = "" if read_whole else ", read whole,"
+        words.append(f"By the weights' record such a scan{read} scores about {points(taken)}.")
     elif best is not None:
         words.append(
             f"One plain scan in the same seconds ({told(best)}) scores about {points(best)} by the weights' record."

@@ -96,6 +96,16 @@ def test_receipt_and_pages_tell_a_scan(scanned: tuple[Path, Any]) -> None:
     assert "such a scan scores about 91.0 ± 3.0" in page
 
 
+def test_what_is_read_in_part_is_not_promised_what_reading_everything_scores(
+    survey_png: Survey, recorded: Path, tmp_path: Path
+):
+    """The record tells of scans that are read whole, and the sentence says so."""
+    published = survey_png(tmp_path, weights=str(recorded), budget=None, scan_step="2", compute="40%", policy="sobel")
+    page = (published.folder / "report.html").read_text(encoding="utf-8")
+    assert "such a scan, read whole, scores about" in page
+    assert "such a scan scores" not in page
+
+
 def test_controls_say_nothing_of_a_scan(tmp_path: Path, survey_png: Survey) -> None:
     """Asked for, no other placement is judged beside it, and what is judged is not judged again."""
     published = survey_png(tmp_path, budget=None, scan_step="4", controls=True)
