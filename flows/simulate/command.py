@@ -78,7 +78,8 @@ def run_simulate(
     keep_freed_memory()
     with console.status("opening the scene"):
         run, sweeps, notes = open_simulation(settings, coarse=coarse)
-        run = replace(run, planned=tuple(sweeps))  # no other sweep is taken, so none has to be bounded and checked
+        # No other sweep is taken, so none has to be bounded and checked; who compares wants to see what was chosen.
+        run = replace(run, planned=tuple(sweeps), weighs_small=picture is not None)
         run.archive.reclaim()  # what a killed scan left half made
     for note in notes:
         console.print(f"[dim]note: {escape(note)}[/]")

@@ -6,12 +6,13 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError, ShapeError
+from pipeline.lazy import deferred
 from pipeline.simulator.effects.counting import (
     DARK_CURRENT,
     DEFECTS,
@@ -28,12 +29,16 @@ from pipeline.simulator.effects.effect import OFF, SweepBlock
 from pipeline.simulator.effects.noise import (
     LEAST_MERGED_READ_E,
     least_expected,
-    merged_noise,
     normal_deviates,
     photon_counts,
     rounded_counts,
 )
 from pipeline.simulator.render import Choice
+
+if TYPE_CHECKING:
+    from pipeline.simulator.effects import noise_loops
+else:
+    noise_loops = deferred("pipeline.simulator.effects.noise_loops")
 
 Light = NDArray[np.float32]
 
@@ -53,7 +58,7 @@ def read_out(light: Light, block: SweepBlock, chosen: Mapping[Any, str] | Choice
     readout = Readout(block, Choice.of(chosen))
     raw = np.empty(light.shape, np.uint16)
     for row, number in enumerate(block.numbers):
-        raw[row] = readout.converted(readout.electrons(light[row], int(number)))
+        raw[row] = readout.numbers(light[row], int(number))
     return raw
 
 
@@ -74,34 +79,41 @@ class Readout:
     block: SweepBlock
     choice: Choice
 
+    def numbers(self, light: Light, number: int) -> NDArray[np.uint16]:
+        """Give the converter's numbers of one line's light, (sample, band) [e-]."""
+        if not self._merges:
+            return self.converted(self.electrons(light, number))
+        seen = np.ascontiguousarray(light if self.dead is None else np.where(self.dead, 0, light), np.float32)
+        deviate, camera, raw = (
+            self._deviates(SHOT.name, number),
+            self.block.rig.camera,
+            np.empty(light.shape, np.uint16),
+        )
+        added = np.ravel(np.asarray(self.added, np.float32))
+        finite = noise_loops.read_merged(
+            *(seen.reshape(-1), added, deviate.reshape(-1), self.read_noise_e),
+            *(camera.electrons_per_dn, camera.dark_dn, camera.full_scale_dn, raw.reshape(-1)),
+        )
+        least = least_expected(self.read_noise_e)
+        if not finite or least:
+            expected = self._expected(light, number)
+            dim = np.flatnonzero(expected < np.float32(least))
+            exact = photon_counts(expected.take(dim), deviate.take(dim))
+            exact += self._deviates(READ_NOISE.name, number).take(dim) * np.float32(self.read_noise_e)
+            raw.reshape(-1)[dim] = self.converted(exact)
+        return raw
+
     def electrons(self, light: Light, number: int) -> Light:
-        """Give what leaves the amplifier for one line's light, (sample, band). [e-]"""
-        expected = np.maximum(light, 0)
-        if self.dead is not None:
-            expected[self.dead] = 0
-        expected += self.added
-        if not np.isfinite(expected.max(initial=0.0)):
-            sample, band = np.argwhere(~np.isfinite(expected))[0]
-            raise SceneError(
-                f"sweep {self.block.sweep.name}: line {number}, sample {sample}, band {band}"
-                f" expects {expected[sample, band]} electrons; give a scene and a rig of finite numbers"
-            )
-        shot = self._variant(SHOT.name)
+        """Give what leaves the amplifier for one line's light, (sample, band); each noise of its own draw. [e-]"""
+        expected, shot = self._expected(light, number), self._variant(SHOT.name)
         if shot == OFF:
             return self._with_read_noise(self._within_well(expected), number)
         deviate = self._deviates(SHOT.name, number)
         if shot == EXACT:
             return self._with_read_noise(self._within_well(photon_counts(expected, deviate)), number)
-        merged = self.read_noise_e >= LEAST_MERGED_READ_E and self.well_e is None
-        least = least_expected(self.read_noise_e if merged else 0.0)
+        least = least_expected(0.0)
         dim = np.flatnonzero(expected < np.float32(least)) if least else np.zeros(0, np.intp)
         exact = photon_counts(expected.take(dim), deviate.take(dim))
-        if merged:
-            electrons = merged_noise(expected, self.read_noise_e, deviate)
-            if dim.size:
-                read = self._deviates(READ_NOISE.name, number).take(dim)
-                electrons.reshape(-1)[dim] = exact + read * np.float32(self.read_noise_e)
-            return electrons
         counts = rounded_counts(expected, deviate)
         counts.reshape(-1)[dim] = exact
         return self._with_read_noise(self._within_well(counts), number)
@@ -140,6 +152,26 @@ class Readout:
         """Electrons that an element holds; None where the converter ends before any could overflow, or it is off."""
         on = self._variant(SATURATION.name) != OFF and well_reached(self.block.rig, self.read_noise_e)
         return self.block.rig.detector.well_e if on else None
+
+    @cached_property
+    def _merges(self) -> bool:
+        """Whether shot and read noise come of one draw."""
+        cheap = self._variant(SHOT.name) not in (OFF, EXACT)
+        return cheap and self.read_noise_e >= LEAST_MERGED_READ_E and self.well_e is None
+
+    def _expected(self, light: Light, number: int) -> Light:
+        """Electrons that a line's elements expect, (sample, band) (SceneError: one is not finite)."""
+        expected = np.maximum(light, 0)
+        if self.dead is not None:
+            expected[self.dead] = 0
+        expected += self.added
+        if not np.isfinite(expected.max(initial=0.0)):
+            sample, band = np.argwhere(~np.isfinite(expected))[0]
+            raise SceneError(
+                f"sweep {self.block.sweep.name}: line {number}, sample {sample}, band {band}"
+                f" expects {expected[sample, band]} electrons; give a scene and a rig of finite numbers"
+            )
+        return expected
 
     def _within_well(self, electrons: Light) -> Light:
         return electrons if self.well_e is None else np.minimum(electrons, np.float32(self.well_e), out=electrons)

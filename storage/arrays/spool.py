@@ -304,12 +304,12 @@ def _write_anew(path: Path, content: bytes) -> None:
         file.write(content)
 
 
-def _write_all(file: BinaryIO, content: bytes) -> None:
+def _write_all(file: BinaryIO, content: bytes | memoryview) -> None:
     """Write every byte; a full disk may take only some of them before it refuses."""
     view = memoryview(content)
     while view:
         view = view[os.write(file.fileno(), view) :]
 
 
-def _to_bytes(data: NDArray[np.uint16]) -> bytes:
-    return np.ascontiguousarray(data.T, "<u2").tobytes()
+def _to_bytes(data: NDArray[np.uint16]) -> memoryview:
+    return np.ascontiguousarray(data.T, "<u2").data.cast("B")

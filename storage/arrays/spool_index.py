@@ -59,7 +59,7 @@ class Head:
         text = json.dumps(facts).encode()
         return cls(json.loads(text), with_check(text))
 
-    def entry(self, line: Line, content: bytes) -> SpoolEntry:
+    def entry(self, line: Line, content: bytes | memoryview) -> SpoolEntry:
         """Give the entry of a line whose numbers are written as ``content``."""
         facts = {
             "line": int(line.number),

@@ -8,10 +8,18 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
+
+from pipeline.lazy import deferred
+
+if TYPE_CHECKING:  # numba takes half a second to import: a plan of a survey never needs it
+    from pipeline.simulator.effects import noise_loops
+else:
+    noise_loops = deferred("pipeline.simulator.effects.noise_loops")
 
 Floats = NDArray[np.float64]
 Light = NDArray[np.float32]
@@ -31,18 +39,7 @@ def normal_deviates(rng: np.random.Generator, count: int) -> Light:
            doi:10.1214/aoms/1177706645
     """
     drawn = np.empty(count + count % 2, np.float32)
-    for start in range(0, len(drawn), PIECE):
-        piece = drawn[start : start + PIECE]
-        half = len(piece) // 2
-        words = rng.bit_generator.random_raw(half).view(np.uint32)
-        radius: Light = np.multiply(words[:half], np.float32(2**-32), dtype=np.float32, casting="unsafe")
-        radius += np.float32(2**-33)  # never 0
-        np.log(radius, out=radius)
-        radius *= np.float32(-2)
-        np.sqrt(radius, out=radius)
-        turn = np.multiply(words[half:].view(np.int32), np.float32(np.pi * 2**-31), dtype=np.float32, casting="unsafe")
-        np.multiply(np.cos(turn, out=piece[:half]), radius, out=piece[:half])
-        np.multiply(np.sin(turn, out=piece[half:]), radius, out=piece[half:])
+    noise_loops.draw_pairs(rng.bit_generator.random_raw(len(drawn) // 2).view(np.uint32), PIECE, drawn)
     return drawn[:count]
 
 
@@ -80,22 +77,6 @@ def rounded_counts(expected: Light, deviate: Light) -> Light:
     spread += expected
     spread -= np.float32(1 / 6)
     np.maximum(np.rint(spread, out=spread), 0, out=spread)
-    return spread
-
-
-def merged_noise(expected: Light, read_noise_e: float, deviate: Light) -> Light:
-    """Give electrons with shot and read noise from one deviate z: mean + sqrt(V) z + (k3 / 6 V) (z^2 - 1).
-
-    Three cumulants are right (Cornish and Fisher, 1938, second order); what is left is bounded by `divergence`.
-    """
-    spread = expected + np.float32(read_noise_e**2)
-    skew = expected / spread
-    skew *= np.float32(1 / 6)
-    np.sqrt(spread, out=spread)
-    spread += skew * deviate
-    spread *= deviate
-    spread -= skew
-    spread += expected
     return spread
 
 

@@ -23,7 +23,7 @@ from pipeline.simulator.effects.probe import Probe, Unit
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.selection.options import ALWAYS_ON, Menu, Option, cost_of, list_options
 
-Reason = Literal["absent", "unseen", "small", "needed", "spent", "exact", "asked", "unasked", "always"]
+Reason = Literal["absent", "unseen", "small", "needed", "spent", "exact", "asked", "unasked", "unweighed", "always"]
 CHEAP_SHARE = 0.1  # of the tolerance: what a variant may err by itself in the reference "everything on, cheap"
 UNIT_WORDS: dict[Unit, str] = {"sigma": "sigma of the noise", "dn": "DN"}
 TOTAL = "all effects"
@@ -34,7 +34,7 @@ class Treatment:
     """What was decided for one effect, and why.
 
     ``small``: off, within the tolerance. ``needed``: leaving it out exceeds the tolerance alone; ``spent``: with the
-    others.
+    others. ``unweighed``: on, for choosing takes longer than leaving out anything saves.
     """
 
     menu: Menu
@@ -269,6 +269,7 @@ def sum_up(decision: Decision, measured: Mapping[str, float] | None = None) -> d
         "cost_s": cost,
         "exact_cost_s": exact,
         "cheap_cost_s": cheap,
+        "unweighed": any(one.reason == "unweighed" for one in decision.taken),
         "saved_s": exact - cost,
         "saved_cheap_s": cheap - cost,
     }
@@ -297,6 +298,7 @@ def _said_reason(one: Treatment, decision: Decision) -> str:
         "exact": "the tolerance is 0, so everything is computed",
         "asked": "asked for",
         "unasked": f"not asked for; {left_out}",
+        "unweighed": "on a scene so small choosing takes longer than it can save, so everything is computed",
         "always": "always there, for raw lines are whole numbers of limited size",
     }[one.reason]
 

@@ -172,6 +172,16 @@ def _menu(effect: Effect, probe: Probe, rig: Rig, present: bool, gain: float) ->
     return Menu(effect, (exact, *map(option, effect.variants[1:])), option(OFF), present, merged)
 
 
+def unbounded_menu(effect: Effect, probe: Probe, rig: Rig) -> Menu:
+    """Give the exact variant alone, and off without a bound: of a scene that nobody has looked at."""
+    costs = effect.cost_at(probe, rig) if hasattr(effect, "cost_at") else effect.cost_ns
+    exact = Option(effect.variants[0], 0.0, _cost_ns(costs, effect.variants[0]), "exact")
+    merged: Merged | None = effect.merged(rig) if hasattr(effect, "merged") else None
+    if not _is_present(effect, probe, rig):
+        return Menu(effect, (exact,), Option(OFF, 0.0, 0.0, effect.bound(probe, rig, OFF).why), False, merged)
+    return Menu(effect, (exact,), Option(OFF, math.inf, 0.0, "not looked at"), True, merged)
+
+
 def _cost_ns(costs: Mapping[str, float], variant: str) -> float:
     return 0.0 if variant == OFF else max(costs[variant], LEAST_COST_NS)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import CostModel, Sweep, exposing
+from pipeline.lazy import deferred
 from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE
 from pipeline.simulator.effects.effect import OFF
 from pipeline.simulator.effects.line import SLIT, UPRIGHT, box_of, box_parts
@@ -37,6 +39,11 @@ from pipeline.simulator.selection.sample_views import (
 )
 from pipeline.simulator.selection.surroundings import REACHES
 from pipeline.simulator.selection.telling_places import TELLING_BANDS, TellingPlaces, telling_places
+
+if TYPE_CHECKING:
+    from pipeline.simulator.selection import change_loops
+else:
+    change_loops = deferred("pipeline.simulator.selection.change_loops")
 
 Floats = NDArray[np.float64]
 Light = NDArray[np.float32]
@@ -184,9 +191,9 @@ def _changes(
     scene: RasterScene, rig: Rig, views: SampleViews, footprint: Footprint, finest: Light, scale: Light
 ) -> Floats:
     """Greatest change of each stored number by another footprint, over the unit, (number,): measured, with its sign."""
-    change = light_seen(scene, rig.camera, views, footprint, _PHASES) - finest
-    change = np.abs(_stored(np.where(np.abs(change) > _ROUNDING * np.abs(finest), change, np.float32(0)), views))
-    return np.asarray((change / scale).max(axis=(0, 2)).astype(np.float64))
+    light, greatest = light_seen(scene, rig.camera, views, footprint, _PHASES), np.zeros(views.sums)
+    change_loops.greatest_changes(light, finest, scale, views.binning, _ROUNDING, greatest)
+    return greatest
 
 
 def _footprint(

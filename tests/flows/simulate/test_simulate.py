@@ -192,6 +192,26 @@ TOTAL = {"asked": "auto", "tolerance": 0.1, "unit": "sigma", "bound": 0.0, "meas
 TOTAL |= {"on": 1, "off": 1, "saved_s": 1.0, "saved_cheap_s": 0.5}
 
 
+def test_a_small_scene_is_not_looked_at(command_line: Any, scene_files: Path, tmp_path: Path) -> None:
+    """Where choosing cannot pay, auto takes what all does, number for number, and says so; a comparison chooses."""
+    given = ["simulate", str(scene_files / "scene.png"), "--coarse", *narrow(tmp_path)]
+    said = command_line(*given, "-o", str(tmp_path / "auto"))
+    assert "choosing takes longer than it can save" in " ".join(said.err.split())
+    auto, full = (
+        json.loads(command_line(*given, "-o", str(tmp_path / name), "--effects", name, "--json").out)
+        for name in ("auto", "all")
+    )
+    assert auto["effects_total"]["unweighed"]
+    assert not full["effects_total"]["unweighed"]
+    cubes = [
+        xr.open_zarr(tmp_path / name / found["cubes"][0], consolidated=False)
+        for name, found in (("auto", auto), ("all", full))
+    ]
+    np.testing.assert_array_equal(cubes[0]["dn"].values, cubes[1]["dn"].values)
+    chosen = command_line(*given, "-o", str(tmp_path / "auto"), "--compare", str(tmp_path / "both.png"), "--json")
+    assert not json.loads(chosen.out)["effects_total"]["unweighed"]
+
+
 @pytest.mark.parametrize("width", [72, 99, 100])
 def test_the_table_fits_the_terminal(width: int) -> None:
     """Figures are never broken; words stand in the table where there is room, else below it."""
