@@ -31,7 +31,6 @@ from scipy.stats import t as student  # noqa: E402
 from flows.evaluate.frames import Candidate, Look, look_at, open_frames, scene_of  # noqa: E402
 from models.evaluation.bootstrap import LEVEL, paired_interval  # noqa: E402
 from models.evaluation.metrics import confusion, mean_iou_of_each  # noqa: E402
-from models.evaluation.placement import RANDOM_DRAWS  # noqa: E402
 from models.policies.policies import score_seats  # noqa: E402
 from models.reading.inference import segment  # noqa: E402
 from models.training.looks import REFERENCE_MS  # noqa: E402
@@ -42,9 +41,10 @@ from pipeline.simulator.scenes.scene import RasterScene  # noqa: E402
 
 WEIGHTS = "SPECTRALZOOM_DIM_WEIGHTS"
 DATA = {"cwfid": "cwfid", "Indian_pines_corrected": "indian_pines/Indian_pines_corrected.npy"}  # by what weights say
-LIGHTS = {"1": 1.0, "1/4": 0.25, "1/8": 0.125}  # of the reference exposure
+LIGHTS = {"1": 1.0, "1/4": 0.25, "1/8": 0.125, "1/32": 0.03125}  # of the reference exposure
 SHARES = (0.1, 0.35)  # of the seats
-SECONDS = (8.0, 13.0, 25.0, 60.0)  # of surveys that choose their scan
+RANDOM_DRAWS = 3
+SECONDS = (7.0, 9.0, 13.0, 25.0)  # of surveys that choose their scan
 STEPS, EXPOSURES_MS = (1, 2, 4), (100.0, 50.0, 35.0, 25.0, 17.0, 12.0, 8.0, 6.0, 4.0, 3.0)
 SLACK = 0.3  # points of mIoU that such a survey may lie below the best plain scan tried
 NONE, ALL = "none", "all"
@@ -139,8 +139,10 @@ def _light_rows(
                 gained = "" if kind == NONE else f"{one.beside(ours[NONE])} beside none, "
                 yield Row(f"light {name}, {kind}", one.words, peers=f"{gained}{one.beside(ours[ALL])} beside all")
         for share in SHARES:
-            chosen, drawn = (ours[_kind(share, policy)] for policy in ("gain", "random"))
-            yield Row(f"light {name}, {share:.0%} by gain beside random", chosen.beside(drawn))
+            drawn = ours[_kind(share, "random")]
+            for policy in ("gain", "entropy"):
+                chosen = ours[_kind(share, policy)]
+                yield Row(f"light {name}, {share:.0%} by {policy} beside random", chosen.beside(drawn))
 
 
 def _judged(
@@ -176,7 +178,7 @@ def _maps(weights: Weights, look: Look, *, seats: bool) -> Mapping[str, list[Cou
     there = look.seen.grid.valid_share().ravel() > 0
     found[NONE] = [counts(valid[:0])]
     for share in SHARES:
-        for policy, draws in (("gain", 1), ("random", RANDOM_DRAWS)):
+        for policy, draws in (("gain", 1), ("entropy", 1), ("random", RANDOM_DRAWS)):
             placed = [frame_seats(score_seats(policy, look.seen, seed=draw), share, there) for draw in range(draws)]
             found[_kind(share, policy)] = [counts(one.seats) for one in placed]
     return found
