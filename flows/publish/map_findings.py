@@ -15,8 +15,7 @@ from flows.survey.stages.maps import strange_pixels
 from models.evaluation.expected_scores import expected_counts
 from pipeline.geometry.grid import UNLABELLED
 from storage.archive.keys import StageRef
-from storage.arrays.beliefs import BeliefStore
-from storage.arrays.class_maps import ClassMap
+from storage.arrays.class_maps import BeliefStore, ClassMap
 
 FOREIGN = 0.2  # share of a map that is unknown from which on its weights are the wrong ones
 STRIP_ROWS = 256  # of a belief that are read at a time

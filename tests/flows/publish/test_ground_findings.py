@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from flows.publish.ground_findings import changed_hectares, ground_words, older_hectares
+from flows.publish.findings import changed_hectares, ground_words, older_hectares
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.field_places import NoPlace
 from storage.arrays.class_maps import ClassMap

@@ -13,9 +13,8 @@ import xarray as xr
 from flows.publish.receipt_words import sentences
 from models.evaluation.expected_scores import MapScores, expected_counts, expected_score
 from models.reading.familiar import Familiar, Limits
-from models.weights.familiar_files import MAP_SCORES, FamiliarWeights, familiar_path, save_familiar
+from models.weights.companion_files import MAP_SCORES, FamiliarWeights, TrainedOn, familiar_path, save_familiar
 from models.weights.files import content_key, describe_weights
-from models.weights.trained_on import TrainedOn
 from pipeline.errors import WeightsError
 from tests.conftest import CLASSES, Survey
 
