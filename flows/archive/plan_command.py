@@ -14,9 +14,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from flows.archive.field_figures import field_figures, figure_lines
 from flows.cli.app import AsJson
 from flows.cli.survey_verbs import NO_FLAGS, SurveyFlags, by_setting
-from flows.publish.findings import field_figures, figure_lines
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
 from flows.survey.extent import PastCosts

@@ -1,134 +1,36 @@
-"""What a plan and a run say of the field on the ground: size, pace of the camera, hectares of classes, zones, plots."""
+"""What a run finds: hectares of each class, what changed, what is old; its zones and plots; what its map says."""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flows.settings.values import LOOK_WHOLE
+from flows.survey.memory import told_of_memory
 from flows.survey.run import SurveyRun
-from flows.terminal.figures import (
-    area_words,
-    counted,
-    format_count,
-    format_metres,
-    format_percent,
-    format_seconds,
-    three_digits,
-)
+from flows.survey.stages.maps import strange_pixels
+from flows.terminal.figures import area_words, counted, format_count, format_percent
+from models.evaluation.expected_scores import expected_counts
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace, FieldScale, areas_by_number
+from pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace, areas_by_number
 from pipeline.ground.georeference import class_areas_m2, crs_name, pixel_side_m
 from pipeline.ground.zones import figures_of_plots
-from pipeline.planning.fine_pass import FinePlan
+from storage.archive.keys import StageRef
 from storage.arrays.class_maps import BeliefStore, ClassMap
 from storage.arrays.ground_maps import GroundMap
 
-if TYPE_CHECKING:
-    from flows.survey.run import SurveyRun
-
-NO_METRES = "nothing says how large a pixel is: a [pose], or a georeferenced scene, gives metres and hectares an hour"
-EVERY_LINE = "every line at full exposure"
 OLDER_DAYS = (1, 7, 30)  # since a look, of which the hectares are told
 MOST_CHANGES = 4  # told in words
 PLOTS_FILE = "plots.csv"
 LEADING = 3  # classes of a plot that are told in words
-
-
-def field_figures(run: SurveyRun, fine: FinePlan | None) -> dict[str, Any]:
-    """Figures of the field and of the captures as JSON tells them; None for what nobody knows.
-
-    ``fine`` is the fine pass where it is planned already, else it takes what the budget leaves at most. Hectares are
-    those that the survey keeps to, and those an hour are of all of the camera's seconds.
-    """
-    scale, fine_s = run.zones.place.scale(run.camera.ifov_rad), run.plan.fine_s if fine is None else fine.seconds
-    seconds = run.plan.coarse_s + fine_s
-    kept = _kept(run, scale)
-    footprint = scale.footprint
-    return {
-        "size_px": [scale.shape[1], scale.shape[0]],
-        "view_deg": [scale.view_deg[1], scale.view_deg[0]],
-        "ground_pixel_m": scale.pixel_m,
-        "range_m": None
-        if footprint is None
-        else dict(zip(("nearest", "median", "farthest"), footprint.range_m, strict=True)),
-        "footprint_m": None if footprint is None else {"width": footprint.width_m, "depth": footprint.depth_m},
-        "footprint_east_north_m": None if footprint is None else footprint.outline_m.tolist(),
-        "hectares": kept.hectares,
-        "kept_share": None if run.zones.kept is None else float(run.zones.kept.kept.mean()),
-        "camera_s": {"coarse": run.plan.coarse_s, "fine": fine_s, "all": seconds, "full_scan": run.plan.full_s},
-        "fine_planned": fine is not None or run.plan.plain,
-        "lines": {
-            "coarse": sum(sweep.lines for sweep in run.plan.coarse),
-            "fine": None if fine is None else fine.lines,
-            "full_scan": sum(sweep.lines for sweep in run.plan.full),
-        },
-        "hectares_per_hour": kept.hectares_per_hour(seconds),
-        "full_scan_hectares_per_hour": kept.hectares_per_hour(run.plan.full_s),
-    }
-
-
-def _kept(run: SurveyRun, scale: FieldScale) -> FieldScale:
-    """The scale of what zones leave of the field."""
-    if run.zones.kept is None or scale.area_m2 is None:
-        return scale
-    rows, columns = (slice(0, size) for size in scale.shape)
-    areas = run.zones.place.pixel_areas_m2(rows, columns)
-    assert areas is not None
-    return FieldScale(scale.shape, scale.view_deg, scale.pixel_m, float(np.nansum(areas[run.zones.kept.kept])))
-
-
-def figure_lines(figures: Mapping[str, Any]) -> list[str]:
-    """The figures in words, a line each."""
-    (width, height), (across, down), camera = figures["size_px"], figures["view_deg"], figures["camera_s"]
-    lines = [f"field: {width} x {height} px, {across:.3g} x {down:.3g} degrees{_ground_words(figures)}"]
-    if figures["kept_share"] is not None:
-        lines.append(f"zones: {format_percent(figures['kept_share'])} of the field is kept to")
-    if figures["ground_pixel_m"] is None:
-        lines.append(NO_METRES)
-    else:
-        lines.append(f"ground: {format_metres(figures['ground_pixel_m'])} a pixel{_range_words(figures)}")
-    known = "" if figures["fine_planned"] else " at most, chosen once the coarse pass was looked at"
-    parts = f"coarse {format_seconds(camera['coarse'])}, fine {format_seconds(camera['fine'])}{known}"
-    lines.append(
-        f"camera: {format_seconds(camera['all'])} ({parts}); {EVERY_LINE} {format_seconds(camera['full_scan'])}"
-    )
-    count = figures["lines"]
-    fine = "" if count["fine"] is None else f", fine {format_count(count['fine'])}"
-    lines.append(
-        f"lines: coarse {format_count(count['coarse'])}{fine}; {EVERY_LINE} {format_count(count['full_scan'])}"
-    )
-    if figures["hectares_per_hour"] is not None:
-        lines.append(
-            f"pace: {three_digits(figures['hectares_per_hour'])} ha an hour of the camera; {EVERY_LINE} "
-            f"{three_digits(figures['full_scan_hectares_per_hour'])}"
-        )
-    return lines
-
-
-def _ground_words(figures: Mapping[str, Any]) -> str:
-    if figures["hectares"] is None:
-        return ""
-    footprint = figures["footprint_m"]
-    size = (
-        ""
-        if footprint is None
-        else f", {format_metres(footprint['width'])} wide and {format_metres(footprint['depth'])} deep"
-    )
-    ground = area_words(figures["hectares"])
-    return f"{size}; {ground}{' kept to' if figures['kept_share'] is not None else ''}"
-
-
-def _range_words(figures: Mapping[str, Any]) -> str:
-    if figures["range_m"] is None:
-        return ""
-    nearest, median, farthest = (format_metres(figures["range_m"][name]) for name in ("nearest", "median", "farthest"))
-    return f" in the middle, seen from {median} away ({nearest} to {farthest})"
+FOREIGN = 0.2  # share of a map that is unknown from which on its weights are the wrong ones
+STRIP_ROWS = 256  # of a belief that are read at a time
 
 
 def find_ground(run: SurveyRun, posed: GroundMap | None, found: ClassMap, belief: BeliefStore) -> dict[str, Any]:
@@ -278,3 +180,51 @@ def plots_csv(plots: Sequence[Mapping[str, Any]]) -> str:
         cells = [*(plot[name] for name in head), *(plot["shares"][name] for name in names)]
         table.writerow(["" if cell is None else cell for cell in cells])
     return text.getvalue()
+
+
+def find_map(run: SurveyRun, ref: StageRef, drawn: ClassMap) -> dict[str, Any]:
+    """Findings of a map in the stage ``ref``: ``unknown``, ``pixels`` and ``expected``, each where there is one."""
+    found: dict[str, Any] = {}
+    unclassed, share = drawn.classes == UNLABELLED, 0.0
+    if (rate := run.settings.unknown_rate) is not None and run.familiar is not None:
+        count = int(np.count_nonzero(drawn.classes == run.described.config.classes))
+        told_pixels = int(np.count_nonzero(~unclassed))
+        share = count / told_pixels if told_pixels else 0.0
+        found["unknown"] = {"pixels": count, "share": share, "rate": rate}
+    if run.zones.left_out is not None:
+        unclassed &= ~run.zones.left_out
+    pixels = {
+        "scene_without_a_value": run.scene.filled_px,
+        "coarse_px_no_reading": 0,
+        "fine_px_no_reading": 0,
+        **{f"{name}_no_reading": count for name, count in strange_pixels(ref).items()},
+        "map_without_a_class": int(np.count_nonzero(unclassed)),
+    }
+    if any(pixels.values()):
+        found["pixels"] = pixels
+    expected = None if share > FOREIGN else _expected(run, ref)
+    return found if expected is None else found | {"expected": expected}
+
+
+def _expected(run: SurveyRun, ref: StageRef) -> dict[str, Any] | None:
+    """What the map is likely to score by what it says of itself; None where nobody knows how such comes true.
+
+    That is known of maps of plain scans that are read whole, without a memory.
+    """
+    settings, step = run.settings, run.settings.scan_step
+    memory = told_of_memory(ref.path)
+    remembers = memory is not None and memory["put_aside"] is None
+    if run.map_scores is None or step is None or settings.look != LOOK_WHOLE or run.budget is not None or remembers:
+        return None
+    names = run.described.class_names
+    counts = expected_counts(_strips(BeliefStore(ref.path / "belief.zarr")), len(names))
+    score = run.map_scores.expected(counts, step, settings.scan_exposure_ms or run.camera.exposure_ms)
+    if score is None or not np.isfinite(score.miou):
+        return None
+    of_classes = {name: float(iou) for name, iou in zip(names, score.per_class_iou, strict=True) if np.isfinite(iou)}
+    return {"miou": score.miou, "error": score.error, "per_class_iou": of_classes}
+
+
+def _strips(belief: BeliefStore) -> Iterator[NDArray[np.float32]]:
+    for top in range(0, belief.shape[0], STRIP_ROWS):
+        yield belief.read(slice(top, min(top + STRIP_ROWS, belief.shape[0])))[0]

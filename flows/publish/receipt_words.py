@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from flows.publish.findings import MOST_CHANGES, ground_words, zone_words
-from flows.publish.map_findings import FOREIGN
+from flows.publish.findings import FOREIGN, MOST_CHANGES, ground_words, zone_words
 from flows.publish.receipt import Receipt, is_pending
 from flows.survey.scores import worst_class_words
 from flows.terminal.figures import (
