@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import flows.settings.load as settings_load
     import flows.terminal.processes as processes
     import flows.terminal.progress as terminal_progress
-    import flows.training.train_command as train_command
+    import flows.training.train as train_command
     import flows.training.train_scenes as train_scenes
     import models.training.train as models_training
     import spectralzoom.opened as opened
@@ -41,7 +41,7 @@ else:
     settings_load = deferred("flows.settings.load")
     processes = deferred("flows.terminal.processes")
     terminal_progress = deferred("flows.terminal.progress")
-    train_command = deferred("flows.training.train_command")
+    train_command = deferred("flows.training.train")
     train_scenes = deferred("flows.training.train_scenes")
     models_training = deferred("models.training.train")
     opened = deferred("spectralzoom.opened")

@@ -12,8 +12,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from flows.archive.map_differences import MapPair, draw_difference
 from flows.cli.app import ArchiveName, AsJson, OutFolder, check_outside
+from flows.publish.change_pictures import MapPair, draw_difference
 from flows.publish.receipt import areas_on_ground
 from flows.settings.survey_settings import BUILT_IN_SCENES
 from flows.survey.scores import score_of

@@ -13,7 +13,6 @@ import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
-from flows.archive.export_areas import CSV, write_areas
 from flows.archive.export_layers import (
     ExportedRun,
     Layer,
@@ -24,7 +23,7 @@ from flows.archive.export_layers import (
     seen_rows,
     write_layer_style,
 )
-from flows.archive.export_spectra import spectral_layers
+from flows.archive.export_values import CSV, spectral_layers, write_areas
 from flows.archive.export_zones import check_zones, write_zones
 from flows.archive.product_choice import NO_PRODUCTS, ProductChoice, ProductFlags, choose_products
 from flows.cli.app import ArchiveName, AsJson, OutFile, Switch, check_outside, stderr
@@ -39,7 +38,7 @@ from storage.arrays.georeference import load_geobox
 from storage.arrays.ground_maps import load_bands, open_image
 from storage.arrays.layout import SHARD_ROWS
 from storage.export.image_files import EnviFile, has_map_info, write_cog, write_envi
-from storage.export.qgis_styles import STYLE
+from storage.export.map_files import STYLE
 from storage.export.stac_items import (
     COG,
     ZARR,

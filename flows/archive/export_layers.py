@@ -20,14 +20,13 @@ from pipeline.ground.georeference import zoomed_out
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.archive.records import RECEIPT, read_run, read_store
-from storage.arrays.beliefs import OLD_CLASS, unpacked_days
-from storage.arrays.class_maps import ClassNames, legend_of
+from storage.arrays.class_maps import OLD_CLASS, ClassNames, legend_of, unpacked_days
 from storage.arrays.georeference import load_geobox
 from storage.arrays.ground_maps import StoredImage, open_image
 from storage.arrays.layout import grid_of, open_group
 from storage.arrays.quicklooks import choose_bands
 from storage.export.image_files import ANGULAR, CogImage, Place, value_span
-from storage.export.qgis_styles import GREENS, GREYS, write_class_style, write_colour_style, write_ramp_style
+from storage.export.map_files import GREENS, GREYS, write_class_style, write_colour_style, write_ramp_style
 from storage.export.stac_items import classes
 
 Rows = Iterator[tuple[int, NDArray[Any]]]

@@ -14,36 +14,34 @@ from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
 
 from flows.archive.export_layers import ExportedRun
-from flows.archive.export_spectra import MosaicView
+from flows.archive.export_values import MosaicView
 from flows.archive.product_choice import ProductChoice, class_numbers
 from pipeline.errors import SettingsError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.georeference import crs_wkt, degree_m, pixel_side_m, to_degrees, to_plane
 from pipeline.planning.orientation import find_rows
-from pipeline.products.outlines import class_polygons
-from pipeline.products.prescriptions import (
-    CellGrid,
-    Heading,
-    ToAxes,
-    cell_polygons,
-    count_classes,
-    dose_cells,
-    pixel_axes,
-)
-from pipeline.products.regions import grow_class, merge_small
+from pipeline.products.areas import CellGrid, Heading, ToAxes, cell_polygons, count_classes, dose_cells, pixel_axes
+from pipeline.products.regions import class_polygons, grow_class, merge_small
 from storage.arrays.class_maps import ClassNames
 from storage.arrays.ground_maps import open_image
 from storage.arrays.mosaics import mosaic_brightness
-from storage.export.qgis_styles import NONE, REDS, STYLE, Entry, ramp_colour, write_polygon_style
-from storage.export.task_data import TaskGrid, TaskWords, write_task_data
-from storage.export.vector_files import (
+from storage.export.map_files import (
     DEGREE_DIGITS,
     GEOJSON,
     GEOPACKAGE,
+    NONE,
+    REDS,
     SHAPEFILE,
+    STYLE,
+    Entry,
+    TaskGrid,
+    TaskWords,
+    ramp_colour,
     write_geojson,
     write_geopackage,
+    write_polygon_style,
     write_shapefile,
+    write_task_data,
 )
 
 IN_DEGREES = {"proj:code": "EPSG:4326"}

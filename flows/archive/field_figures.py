@@ -9,7 +9,7 @@ import numpy as np
 
 from flows.survey.run import SurveyRun
 from flows.terminal.figures import area_words, format_count, format_metres, format_percent, format_seconds, three_digits
-from pipeline.ground.field_scale import FieldScale
+from pipeline.ground.field_places import FieldScale
 from pipeline.planning.fine_pass import FinePlan
 
 NO_METRES = "nothing says how large a pixel is: a [pose], or a georeferenced scene, gives metres and hectares an hour"

@@ -12,7 +12,7 @@ from cyclopts import Parameter
 from flows.cli.app import Switch, split_list
 from pipeline.errors import SettingsError
 from pipeline.products.indices import SpectralIndex, find_index
-from storage.export.task_data import UNITS, DoseUnit
+from storage.export.map_files import UNITS, DoseUnit
 
 ROWS = "rows"  # said as a heading: along the crop rows
 

@@ -44,7 +44,7 @@ from flows.survey.survey import STAGES, TITLES, Products, StageRunner, judge
 from flows.terminal.figures import counted, format_points, format_seconds
 from flows.terminal.processes import DONE, FAILED, PARTLY
 from flows.terminal.progress import StageProgress, put_out
-from models.network.process import keep_freed_memory, use_one_thread
+from models.network.machine import keep_freed_memory, use_one_thread
 from pipeline.errors import ArchiveError, PipelineError, SceneError, SettingsError, WeightsError, visible
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef

@@ -16,11 +16,11 @@ from flows.evaluate.command import run_evaluate
 from flows.evaluate.frames import SHARES, USUAL, EvaluateRequest
 from flows.terminal.progress import print_json
 from flows.tradeoff.command import run_tradeoff
-from flows.training.measure_familiar import FamiliarRequest, run_measure_familiar
+from flows.training.familiarity import FamiliarRequest, run_measure_familiar
 from flows.training.remember import JUDGED_LANDS, LANDS, MemoryRequest, run_remember
-from flows.training.train_command import asked_command, run_train, usual_crop
+from flows.training.train import asked_command, run_train, usual_crop
 from flows.training.train_scenes import TrainRequest
-from models.network.device import PROCESSOR, Device
+from models.network.machine import PROCESSOR, Device
 from models.training.memory import MemoryTraining
 from models.training.train import TrainingSettings
 from pipeline.errors import SettingsError

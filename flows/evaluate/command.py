@@ -31,9 +31,8 @@ from flows.evaluate.work import Made, Work
 from flows.terminal.processes import writing
 from flows.terminal.progress import StageProgress, on_stdout
 from flows.training.data import alike_notes
-from models.evaluation.bootstrap import LEVEL
-from models.evaluation.metrics import agreement, false_pixels, iou_per_class, mean_iou
-from models.network.process import keep_freed_memory
+from models.evaluation.metrics import LEVEL, agreement, false_pixels, iou_per_class, mean_iou
+from models.network.machine import keep_freed_memory
 from models.weights.files import describe_weights, unsealed_note
 from pipeline.lazy import deferred
 from storage.archive.whole_files import to_json

@@ -31,7 +31,7 @@ from flows.evaluate.rows import (
     wanted_rows,
 )
 from flows.evaluate.series import Record, Row, mean_or_none
-from models.network.process import one_thread
+from models.network.machine import one_thread
 from models.policies.policies import score_seats
 from models.reading.control_maps import draw_with_control
 from models.reading.inference import CoarseLook, glance_of_columns, segment

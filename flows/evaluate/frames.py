@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from flows.survey.scene import check_labels, judged_labels
 from flows.training.data import TrainingData, farm_test_data, only_class, open_training_data
 from flows.training.look import observe_scene
-from models.evaluation.bootstrap import DRAWS
-from models.network.device import PROCESSOR
+from models.evaluation.metrics import DRAWS
+from models.network.machine import PROCESSOR
 from models.network.spectral import patches_of
 from models.policies.policies import NETWORK_POLICIES, POLICIES
 from models.reading.inference import CoarseLook, Glance, glance_of_columns

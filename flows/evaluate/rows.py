@@ -28,7 +28,7 @@ from models.evaluation.placement import (
     rank_correlation,
     top_seats,
 )
-from models.network.cost import MultiplyAdds, control_multiply_adds, multiply_adds
+from models.network.sizes import MultiplyAdds, control_multiply_adds, multiply_adds
 from models.policies.policies import score_multiply_adds, score_seats
 from models.reading.control_maps import draw_with_control
 from models.reading.inference import Glance, segment

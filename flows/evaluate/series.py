@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from models.evaluation.bootstrap import paired_interval
+from models.evaluation.metrics import paired_interval
 
 Record = dict[str, Any]
 Runs = Sequence[Sequence[Record]]  # of each weights, or of each seed, the records of its frames

@@ -30,7 +30,7 @@ from flows.evaluate.series import Record
 from flows.terminal.figures import format_seconds
 from flows.terminal.processes import writing
 from flows.training.data import TrainingData
-from models.network.device import PROCESSOR, choose_device
+from models.network.machine import PROCESSOR, choose_device
 from models.weights.files import AnyWeights, Weights, load_any_weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.planning.line_blocks import WIDTHS

@@ -10,9 +10,16 @@ import numpy as np
 from matplotlib import colormaps
 from numpy.typing import NDArray
 
-from flows.publish.page_parts import grey_png, in_base64, indexed_png, jpeg
-from flows.publish.page_places import PagePlaces
-from flows.publish.page_spectra import NOTHING, PageSpectra, class_means
+from flows.publish.page_data import (
+    NOTHING,
+    PagePlaces,
+    PageSpectra,
+    class_means,
+    grey_png,
+    in_base64,
+    indexed_png,
+    jpeg,
+)
 from flows.publish.panels import UNLABELLED_COLOUR, class_palette
 from pipeline.geometry.grid import UNLABELLED
 

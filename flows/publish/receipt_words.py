@@ -7,10 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from flows.publish.ground_findings import MOST_CHANGES, ground_words
-from flows.publish.map_findings import FOREIGN
+from flows.publish.findings import FOREIGN, MOST_CHANGES, ground_words, zone_words
 from flows.publish.receipt import Receipt, is_pending
-from flows.publish.zone_findings import zone_words
 from flows.survey.scores import worst_class_words
 from flows.terminal.figures import (
     area_words,
@@ -21,7 +19,7 @@ from flows.terminal.figures import (
     format_seconds,
     three_digits,
 )
-from pipeline.ground.field_scale import SECONDS_PER_HOUR
+from pipeline.ground.field_places import SECONDS_PER_HOUR
 from pipeline.planning.plain_scans import scan_words
 
 

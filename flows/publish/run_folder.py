@@ -16,15 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.archive.field_figures import field_figures
-from flows.publish.change_picture import change_pictures, remembered
-from flows.publish.ground_findings import find_ground
-from flows.publish.map_findings import find_map
+from flows.publish.change_pictures import change_pictures, remembered
+from flows.publish.findings import PLOTS_FILE, find_ground, find_map, find_zones, plots_csv
 from flows.publish.panels import draw_ground
 from flows.publish.quicklook import QuicklookData, draw_quicklook
 from flows.publish.receipt import AccuracyIs, Header, Receipt, build_receipt, check_receipt, with_accuracy
 from flows.publish.report import Picture, render_report
 from flows.publish.run_layers import block_of, field_map, read_coarse
-from flows.publish.zone_findings import PLOTS_FILE, find_zones, plots_csv
 from flows.settings.load import anchor_paths
 from flows.settings.values import LOOK_WHOLE
 from flows.survey.extent import work_done, work_of_map
@@ -43,13 +41,12 @@ from pipeline.planning.coverage import on_scene
 from pipeline.planning.fine_pass import FinePlan
 from pipeline.planning.plain_scans import scan_words
 from pipeline.planning.prices import SavingEntry, capture_savings
-from pipeline.rectify.calibration.calibrate import of_bands, reflectance
+from pipeline.rectify.calibrate import of_bands, reflectance
 from storage.archive.keys import StageRef
 from storage.archive.records import StageRecord, read_run
 from storage.archive.run_folders import RunDraft
 from storage.archive.whole_files import to_json
-from storage.arrays.beliefs import BeliefStore
-from storage.arrays.class_maps import load_class_map, load_class_names
+from storage.arrays.class_maps import BeliefStore, load_class_map, load_class_names
 from storage.arrays.cubes import RawCube
 from storage.arrays.ground_maps import load_ground_map
 from storage.arrays.mosaics import load_attention, open_patches

@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.publish.change_picture import RememberedField
+from flows.publish.change_pictures import RememberedField
 from flows.publish.field_map import FieldMap, SweepShown
-from flows.publish.page_places import PagePlaces, places_of_grid, places_of_pose
-from flows.publish.page_spectra import PageSpectra, page_spectra
+from flows.publish.page_data import PagePlaces, PageSpectra, page_spectra, places_of_grid, places_of_pose
 from flows.publish.quicklook import QuicklookData, colours_of
 from flows.publish.receipt_words import days_words
 from flows.survey.run import SurveyRun

@@ -29,7 +29,7 @@ from flows.survey.run import SurveyRun, now, open_run
 from flows.survey.survey import STAGES, TITLES, Products, StageRunner, Step, judge, survey
 from flows.terminal.figures import format_percent
 from flows.terminal.progress import StageProgress
-from models.network.process import keep_freed_memory, use_one_thread
+from models.network.machine import keep_freed_memory, use_one_thread
 from pipeline.lazy import deferred
 from storage.archive.archive import Archive
 from storage.archive.keys import canonical_json

@@ -35,7 +35,7 @@ from flows.settings.values import (
     Wavelengths,
     parse_tolerance,
 )
-from models.network.device import PROCESSOR, Device
+from models.network.machine import PROCESSOR, Device
 from models.policies.policies import Policy
 from models.reading.familiar import RATE
 from pipeline.geometry.camera import LineCamera

@@ -24,7 +24,7 @@ from flows.survey.stages.effects import choose_effects, load_manifest
 from flows.terminal.figures import format_bytes, format_seconds
 from flows.terminal.processes import writing
 from flows.terminal.progress import StageProgress
-from models.network.process import keep_freed_memory
+from models.network.machine import keep_freed_memory
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep

@@ -21,8 +21,7 @@ from models.reading.inference import CoarseLook, segment
 from models.reading.regions import Region
 from models.reading.remembered import Looked, MemoryAgreement, changed_from, compare, first_belief, recall
 from pipeline.geometry.grid import UNLABELLED
-from storage.arrays.beliefs import write_belief_tile, write_changes_tile
-from storage.arrays.class_maps import write_class_tile
+from storage.arrays.class_maps import write_belief_tile, write_changes_tile, write_class_tile
 from storage.arrays.layout import read_array
 from storage.arrays.mosaics import PatchStore, open_patches
 from storage.arrays.tile_work import let_tiles_go

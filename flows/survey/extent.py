@@ -16,8 +16,7 @@ from flows.survey.reading_costs import SHARD, ReadingCosts
 from flows.survey.run import SurveyRun
 from flows.survey.stage import Unit
 from flows.survey.survey import STAGES
-from models.network.cost import MultiplyAdds, multiply_adds
-from models.network.sizes import SegmenterConfig
+from models.network.sizes import MultiplyAdds, SegmenterConfig, multiply_adds
 from models.reading.regions import plan_regions, whole_field
 from pipeline.errors import PipelineError
 from pipeline.geometry.camera import LineCamera

@@ -15,8 +15,8 @@ from flows.survey.memory import EarlierLook
 from models.reading.regions import Region
 from models.reading.remembered import Belief, Remembered, in_classes
 from models.weights.files import Weights
-from pipeline.rectify.registration.field_shift import FieldShift, field_shift
-from storage.arrays.beliefs import BeliefStore
+from pipeline.rectify.registration.alignment import FieldShift, field_shift
+from storage.arrays.class_maps import BeliefStore
 from storage.arrays.mosaics import mosaic_brightness
 
 REACH_PX = 64.0  # within which a memory that lies beside today's look is found

@@ -17,16 +17,22 @@ from numpy.typing import NDArray
 from flows.survey.reading_costs import SHARD
 from flows.survey.run import SurveyRun
 from flows.survey.survey_model import weights_path
-from models.network.device import PROCESSOR
+from models.network.machine import PROCESSOR
 from models.network.sizes import saliency_bytes
 from models.policies.policies import GLANCING_POLICIES, IMAGE_POLICIES, score_seats
 from models.policies.vgg_file import VggFile
 from models.reading.familiar import Familiar
 from models.reading.inference import CoarseLook, Glance, look_coarsely, read_glance
 from models.reading.regions import HALO_CELLS, REGION_PX, Region, most_bytes, plan_regions, whole_field
-from models.weights.familiar_files import familiar_key, familiar_path, load_familiar
+from models.weights.companion_files import (
+    familiar_key,
+    familiar_path,
+    load_familiar,
+    load_memory,
+    memory_key,
+    memory_path,
+)
 from models.weights.files import Weights, content_key, describe_weights, load_weights
-from models.weights.memory_files import load_memory, memory_key, memory_path
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.readings import beyond_range, readings_alone

@@ -15,14 +15,14 @@ from flows.survey.capture_plan import lay_out_sweeps
 from flows.survey.memory import Prior
 from models.reading.doubts import SeatDoubts
 from models.reading.remembered import COME_TRUE, Belief, Remembered, carried, in_classes
+from models.weights.companion_files import ReaderFile, load_memory
 from models.weights.files import Description
-from models.weights.memory_files import ReaderFile, load_memory
 from pipeline.errors import BudgetError, NothingToMend, SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.area_cover import seats_shown
 from pipeline.planning.part_looks import PartLook, SeatRows, cheapest_row_seconds, part_look, sweeps_of_runs
 from pipeline.planning.plain_scans import LOSS, MIOU, ScanRecord, exposures_between, scan_words
-from storage.arrays.beliefs import BeliefStore
+from storage.arrays.class_maps import BeliefStore
 
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float64]

@@ -18,7 +18,7 @@ from storage.archive.archive import Archive, run_stem
 from storage.archive.keys import StageRef, published_runs
 from storage.archive.manifests import read_table
 from storage.archive.records import Run, read_run
-from storage.arrays.beliefs import BeliefStore
+from storage.arrays.class_maps import BeliefStore
 from storage.arrays.mosaics import mosaic_shape
 
 NONE, LATEST, AUTO = "none", "latest", "auto"

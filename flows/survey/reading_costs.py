@@ -8,8 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from models.network.cost import MultiplyAdds, multiply_adds
-from models.network.sizes import SegmenterConfig
+from models.network.sizes import MultiplyAdds, SegmenterConfig, multiply_adds
 from models.policies.policies import GLANCING_POLICIES, IMAGE_POLICIES, score_multiply_adds
 from models.reading.regions import Region, plan_regions, whole_field
 from pipeline.geometry.grid import SceneGrid

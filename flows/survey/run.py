@@ -35,11 +35,10 @@ from flows.survey.seat_budget import SeatBudget
 from flows.survey.survey_model import SurveyModel, vgg_file
 from flows.survey.zones import SurveyZones, open_zones, place_of_field
 from models.evaluation.expected_scores import MapScores
-from models.network.device import PROCESSOR, choose_device
+from models.network.machine import PROCESSOR, choose_device
 from models.policies.vgg_file import VggFile
-from models.weights.familiar_files import FamiliarFile
+from models.weights.companion_files import FamiliarFile, ReaderFile
 from models.weights.files import Description, Weights
-from models.weights.memory_files import ReaderFile
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid

@@ -11,9 +11,19 @@ from numpy.typing import NDArray
 
 from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
 from flows.settings.values import UNKNOWN_AUTO, UNKNOWN_OFF
-from models.network.device import choose_device
+from models.network.machine import choose_device
 from models.policies.vgg_file import VggFile
-from models.weights.familiar_files import FamiliarFile, describe_familiar, familiar_path, load_familiar
+from models.weights.companion_files import (
+    TRAINED_ON,
+    FamiliarFile,
+    ReaderFile,
+    TrainedOn,
+    describe_familiar,
+    describe_reader,
+    familiar_path,
+    load_familiar,
+    load_memory,
+)
 from models.weights.files import (
     Description,
     Weights,
@@ -23,8 +33,6 @@ from models.weights.files import (
     load_weights,
     unsealed_note,
 )
-from models.weights.memory_files import ReaderFile, describe_reader, load_memory
-from models.weights.trained_on import TRAINED_ON, TrainedOn
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.lazy import Once
 

@@ -12,7 +12,7 @@ from flows.survey.stages.accuracy import columns_of_all_seats
 from flows.survey.survey_model import shipped_weights
 from flows.tradeoff.entries import Level, Setting, Tradeoff, register_all
 from models.evaluation.metrics import confusion, mean_iou
-from models.network.process import keep_freed_memory
+from models.network.machine import keep_freed_memory
 from models.policies.policies import score_seats
 from models.reading.inference import CoarseLook, DrawnMap, Glance, glance, look_coarsely, read_glance, segment
 from models.weights.files import Weights, load_weights

@@ -18,7 +18,7 @@ from flows.survey.stages.accuracy import columns_of_all_seats
 from flows.survey.survey_model import shipped_weights
 from flows.tradeoff.entries import Setting, Tradeoff, register_all
 from models.evaluation.metrics import confusion, mean_iou
-from models.network.cost import multiply_adds
+from models.network.sizes import multiply_adds
 from models.policies.policies import score_seats
 from models.reading.inference import DrawnMap, Glance, glance, glance_of_columns, segment
 from models.weights.files import Weights, load_weights

@@ -13,12 +13,12 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_normal, scene_to_direction
 from pipeline.geometry.paper_equations import LINE_MODELS, LineModel, line_points, unlimited_position
 from pipeline.geometry.scan import CostModel, Sweep, line_positions, scene_to_sweep
-from pipeline.rectify.calibration.calibrate import reflectance
+from pipeline.rectify.calibrate import reflectance
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.lookup import grid_points, lookup
+from pipeline.rectify.placed import tie_table
 from pipeline.rectify.registration.shifts import PairShift, pair_shift
 from pipeline.rectify.resample import resample
-from pipeline.rectify.tie_points import tie_table
 from pipeline.rectify.tracks import Track, make_tracks
 from pipeline.simulator.effects.registry import QUIET
 from pipeline.simulator.rig_model import Rig

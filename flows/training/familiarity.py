@@ -1,27 +1,38 @@
-"""What new weights say of what they were trained on, and what is familiar to them: measured as training ends."""
+"""What weights say of what they were trained on, and what is familiar to them: measured as training ends, or later.
+
+`spectralzoom train --familiar` measures it for weights that were trained before such was: it looks at the scenes of
+their training again, as their record names them, and writes a file to put beside the weights: they and all that was
+made with them stay what they are.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Console
 
-from flows.training.data import Report, TrainingData, read_farm_name
+from flows.terminal.progress import one_after_the_other
+from flows.training.data import Report, TrainingData, open_training_data, read_farm_name
+from flows.training.figures import judge_scans
+from flows.training.train_scenes import TrainRequest, as_read, observe_all
 from models.network.spectral import patches_of
 from models.reading.inference import glance_of_columns, segment
 from models.training.calibration import JudgedMap, judge_confidence
 from models.training.examples import Example
 from models.training.familiar import fit_familiar
-from models.weights.familiar_files import FamiliarWeights, familiar_path, save_familiar
-from models.weights.files import Weights, content_key
-from models.weights.trained_on import TrainedOn
-from pipeline.errors import SceneError
+from models.training.looks import REFERENCE_MS, Looks
+from models.training.train import TrainingSettings
+from models.weights.companion_files import MAP_SCORES, FamiliarWeights, TrainedOn, familiar_path, save_familiar
+from models.weights.files import CALIBRATION, Weights, content_key, load_weights
+from pipeline.errors import SceneError, SettingsError
+from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M
+from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES, FARM_PIXEL_M
 from pipeline.simulator.scenes.farm.seasons import sun_over_farm
 
 
@@ -98,3 +109,104 @@ def save_beside(
         return f"nothing will be called unknown: {error}"
     save_familiar(FamiliarWeights(familiar, content_key(path), told, record), out or familiar_path(path))
     return None
+
+
+@dataclass(frozen=True)
+class FamiliarRequest:
+    """For which weights, where to, and the data that they were trained on."""
+
+    dataset: str
+    weights: Path
+    out: Path
+    choices: dict[str, Any] = field(default_factory=dict)  # of load_data_set: labels, bands, wavelengths, masks
+    command: str = ""
+
+
+def measure_familiar(request: FamiliarRequest, report: Report = lambda what, done, figure: None) -> dict[str, Any]:
+    """Measure what is familiar to some weights and save it; give the record that stands in the file.
+
+    Raises SettingsError: a place that cannot be written to, other data than the weights were trained on, or no scene
+    that was kept for validation; WeightsError: the weights cannot be read.
+    """
+    if not request.out.parent.is_dir() or request.out.is_dir():
+        raise SettingsError(f"-o {request.out}: expected the name of a file in a folder that exists")
+    weights = load_weights(request.weights)
+    data = _data_of(weights, request)
+    seen = _looked_at(weights, data, request, report)
+    report("drawing maps of validation scenes", 0.0, "")
+    told = trained_on(data, seen, weights.class_names)
+    looks = Looks(weights.normalisation, darkest_ms=seen.darkest_ms) if seen.darkest_ms < REFERENCE_MS else None
+    scans = judge_scans(weights, seen.validation, looks, seen.seed, report)
+    record = {
+        "command": request.command,
+        "scenes": len(seen.train),
+        "validation": len(seen.validation),
+        CALIBRATION: measured_calibration(weights, seen.validation, seen.seed),
+        **({} if scans is None else {MAP_SCORES: scans.scores.as_dict()}),
+    }
+    why = save_beside(weights, request.weights, seen, told, record, report, out=request.out)
+    if why is not None:
+        raise SettingsError(f"--familiar {request.weights}: {why}")
+    return record
+
+
+def _data_of(weights: Weights, request: FamiliarRequest) -> TrainingData:
+    """The scenes of the weights' training. Raises SettingsError: the data set is another."""
+    split = weights.record.get("split") or {}
+    own = [name for name in split.get("train", {}) if ": " not in name]  # others are those of what they began from
+    scenes = len(own) if request.dataset in FARM_NAMES else None
+    camera = LineCamera(**weights.record.get("camera", {}))
+    held_out = {} if scenes else {"hold_out": tuple(split.get("held_out", ()))}
+    data = open_training_data(
+        request.dataset, len(split.get("validation", ())), scenes, camera, **held_out, **request.choices
+    )
+    if list(data.train) != own or list(data.validation) != list(split.get("validation", ())):
+        raise SettingsError(
+            f"--familiar {request.weights}: these weights were trained on {weights.record.get('data', 'other data')},"
+            f" {len(own)} scenes{f', the first {own[0]}' if own else ''}; {request.dataset} has others: give the data"
+            " set of their training"
+        )
+    return data
+
+
+def _looked_at(weights: Weights, data: TrainingData, request: FamiliarRequest, report: Report) -> SeenScenes:
+    settings, config = weights.record.get("settings", {}), weights.config
+    seed, darkest_ms = int(settings.get("seed", 0)), float(settings.get("darkest_ms", REFERENCE_MS))
+    how = TrainRequest(
+        request.dataset,
+        request.out,
+        patch=config.patch,
+        factor=config.factor,
+        columns=config.columns,
+        choices=request.choices,
+        settings=TrainingSettings(seed=seed),
+        camera=data.camera,
+    )
+    looks: list[list[Example]] = []
+    about = None
+    for what, names in (("looking at scenes", data.train), ("looking at validation scenes", data.validation)):
+        if not names:
+            raise SettingsError(
+                f"--familiar {request.weights}: no scene was kept for validation when these weights were trained, so"
+                " that nobody can say how often a known pixel would be unknown; train them with --validation 1 or more"
+            )
+        found, about = observe_all(how, data, names, what, report, about)
+        looks.append(as_read(found, weights.normalisation))
+        if (about.basis, about.names) != (weights.basis, weights.class_names):
+            raise SettingsError(f"{request.dataset} has other bands or classes than {request.weights} was trained on")
+    assert about is not None
+    return SeenScenes(looks[0], looks[1], about.wavelength_nm, darkest_ms, seed)
+
+
+def run_measure_familiar(request: FamiliarRequest, console: Console) -> dict[str, Any]:
+    """Measure with a progress bar on ``console``; give the record kept in the file."""
+    with one_after_the_other(console) as report:
+        record = measure_familiar(request, report)
+    words = f"what is familiar: {request.out}, of {record['scenes']} scenes"
+    beside = familiar_path(request.weights)
+    if request.out.resolve() != beside.resolve():
+        words += f"; surveys use it when it is called {beside.name} and lies beside the weights"
+    console.print(words, markup=False, soft_wrap=True)
+    error = record[CALIBRATION]["expected_error"]
+    console.print(f"confidence is off by {100 * error:.2f} points on {record['validation']} scenes", soft_wrap=True)
+    return record

@@ -20,7 +20,7 @@ from flows.terminal.progress import StageProgress, put_out
 from pipeline.errors import SettingsError
 from pipeline.readings import MOST_VALUE
 from storage.archive.whole_files import write_whole
-from storage.readers.label_matching import listed_names
+from storage.readers.label_files import listed_names
 from storage.readers.raster_files import split_variable
 from storage.readers.scene_drafts import FoundClass, SceneDraft, draft_scene
 from storage.readers.scene_toml import SETTINGS_NAME

@@ -26,8 +26,8 @@ from models.reading.remembered import Belief, Looked, Remembered, first_belief, 
 from models.training.looks import REFERENCE_MS, ColumnNoise, Looks
 from models.training.memory import MemoryTraining, PastLook, Visit, train_reader
 from models.training.train import Progress
+from models.weights.companion_files import MemoryWeights, save_memory
 from models.weights.files import Weights, content_key, load_weights
-from models.weights.memory_files import MemoryWeights, save_memory
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid, pad_by_reflection

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from flows.training.data import Report, TrainingData, alike_notes, only_class, pack_mask, trained_pixels
 from flows.training.look import observe_scene
-from models.network.device import PROCESSOR
+from models.network.machine import PROCESSOR
 from models.network.sizes import PRESETS, Positions, Preset, SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
 from models.training.examples import Example, Observation, normalised

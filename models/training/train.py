@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from models.network.controls import Network, build_network
-from models.network.device import PROCESSOR
-from models.network.process import keep_freed_memory
+from models.network.machine import PROCESSOR, keep_freed_memory
 from models.network.sizes import SegmenterConfig
 from models.training.examples import Batch, CropSampler, Example
 from models.training.looks import REFERENCE_MS, Looks
@@ -231,7 +230,7 @@ def train(
 
     ``start``: Named tensors that the network begins with; others are drawn. ``checkpoint``: File that the state is kept
     in; a killed run of the same settings and examples goes on from it. ``device``: where it computes, by
-    `models.network.device.choose_device`; the network that is given lies in the processor's memory again.
+    `models.network.machine.choose_device`; the network that is given lies in the processor's memory again.
 
     Raises TrainingError where: the loss or its gradient was not finite three steps in a row; the last batch is kept
     beside the checkpoint. WeightsError : a tensor of ``start`` that the network has no place for.

@@ -105,7 +105,7 @@ class Weights(AnyWeights):
     network: Segmenter
 
     def on(self, device: str) -> Weights:
-        """The same where it computes on a device of this machine, by `models.network.device.choose_device`."""
+        """The same where it computes on a device of this machine, by `models.network.machine.choose_device`."""
         self.network.to(device)
         return self
 

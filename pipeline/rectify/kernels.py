@@ -1,7 +1,7 @@
 """Short separable kernels: which pixels a position reads, with which weights, and the weighted sum of table rows.
 
 The sums run on ``torch.nn.functional.embedding_bag``. Its threads are left as the process has set them: a worker that
-is to use one core says so once (``models.network.process.use_one_thread``).
+is to use one core says so once (``models.network.machine.use_one_thread``).
 """
 
 from __future__ import annotations

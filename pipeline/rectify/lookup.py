@@ -1,7 +1,7 @@
 """Lookup: where on a sweep, in lines and samples, each point of the scene was seen. Exact rays.
 
 A straight even track has a closed form, any other is solved by Newton on its knots. For whole grids
-:mod:`pipeline.rectify.tie_points` keeps the exact answer at every few pixels.
+:mod:`pipeline.rectify.placed` keeps the exact answer at every few pixels.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Placed sweeps: lines, the tracks on which they lie, the pixel grid, and what of it each track can reach."""
+"""Placed sweeps: lines, the tracks on which they lie, the pixel grid, and what of it each track can reach.
+
+A grid's lookup is kept as ties at every few of its pixels, bilinear between, within a bound that was checked.
+"""
 
 from __future__ import annotations
 
@@ -8,20 +11,182 @@ from functools import cached_property, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import ShapeError
+from pipeline.errors import SettingsError, ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import points_of_scan
-from pipeline.rectify.calibration.calibrate import Elements, judge_elements
-from pipeline.rectify.lookup import track_lookup
-from pipeline.rectify.tie_points import TieTable, tie_table
+from pipeline.geometry.scan import Axis, points_of_scan
+from pipeline.rectify.calibrate import Elements, judge_elements
+from pipeline.rectify.lookup import KnotCurve, drop_unseen, grid_points, knots_of_points, track_lookup
 from pipeline.rectify.tracks import Track, make_tracks
 from pipeline.source import SweepLines
 
+SAFETY = 1.05  # on the bound of ties, which holds to the second order
 PIECE_SAMPLES = 64
 MARGIN_PX = 2.0  # of the grid: half a pixel, half a sample, and rounding
 TAPS = 3  # knots and samples that a kernel reads beyond the outermost coordinate
 LEAST_TIE_PX = 4  # closer ties take a byte a pixel and more
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TieTable:
+    """Knot and sample of a grid's pixels, kept at every ``spacing``-th one and bilinear between.
+
+    Only the part of the grid is kept that the track can have seen. Ties beyond the track's ends and sides are
+    continued, so that pixels inside next to its border have four.
+    """
+
+    ties: Floats  # (row, column, 2) knot coordinate and sample; tie (i, j) is pixel ``corner`` + (i, j) * spacing
+    spacing: int  # 1: every pixel is a tie, and NaN where it is off the track
+    shape: tuple[int, int]  # (y, x) of the grid
+    bound_px: float  # largest error of a coordinate [px of the sweep]
+    seen: NDArray[np.bool_]  # (knot,) of the track
+    samples: int  # of a line
+    corner: tuple[int, int]  # first row and column of the part of the grid that is kept
+    kept: tuple[int, int]  # rows and columns of it
+
+    def coordinates(self, rows: slice, columns: slice) -> Floats:
+        """Coordinates of a contiguous part of the grid, (y, x, 2), as of ``track_lookup``."""
+        asked = [range(size)[one] for one, size in zip((rows, columns), self.shape, strict=True)]
+        here = [
+            slice(min(max(one.start - first, 0), count), max(min(one.stop - first, count), 0))
+            for one, first, count in zip(asked, self.corner, self.kept, strict=True)
+        ]
+        if any(part.stop <= part.start for part in here):
+            found: Floats = np.empty((0, 0, 2))
+        elif self.spacing == 1:
+            found = self.ties[here[0], here[1]].copy()
+        else:
+            found = self._between(*here)
+            ties = self.ties[tuple(slice(one.start // self.spacing, -(-one.stop // self.spacing) + 1) for one in here)]
+            most = np.array([len(self.seen), self.samples]) - 0.5
+            if not (
+                self.seen.all() and (ties >= -0.5).all() and (ties <= most).all()
+            ):  # else all between lie on the track
+                drop_unseen(found, self.seen, self.samples)
+        if found.shape[:2] == (len(asked[0]), len(asked[1])):
+            return found
+        whole = np.full((len(asked[0]), len(asked[1]), 2), np.nan)
+        top, left = (first + one.start - part.start for first, one, part in zip(self.corner, here, asked, strict=True))
+        whole[top : top + found.shape[0], left : left + found.shape[1]] = found
+        return whole
+
+    def _between(self, rows: slice, columns: slice) -> Floats:
+        """Straight lines along the few rows of ties first, then, in long runs of memory, down the columns."""
+        first, last = rows.start // self.spacing, (rows.stop - 1) // self.spacing
+        cell, part = np.divmod(np.arange(columns.start, columns.stop), self.spacing)
+        ties = self.ties[first : last + 2]
+        left = np.take(ties, cell, axis=1)
+        along = left + (part / self.spacing)[:, None] * (np.take(ties, cell + 1, axis=1) - left)
+        flat = along.reshape(len(along), -1)  # two axes instead of three: numpy's loops are then twice as fast
+        out = np.empty((rows.stop - rows.start, flat.shape[1]))
+        for row in range(first, last + 1):
+            start, stop = max(row * self.spacing, rows.start), min((row + 1) * self.spacing, rows.stop)
+            down = (np.arange(start, stop) - row * self.spacing) / self.spacing
+            block, above = out[start - rows.start : stop - rows.start], flat[row - first]
+            np.multiply(flat[row - first + 1] - above, down[:, None], out=block)
+            block += above
+        return out.reshape(len(out), len(cell), 2)
+
+
+def tie_table(
+    track: Track,
+    camera: LineCamera,
+    *,
+    along: Axis,
+    binning: int = 1,
+    origin_px: tuple[float, float],
+    spacing_px: float,
+    shape: tuple[int, int],
+    tie: int = 16,
+    tolerance_px: float = 2e-3,
+) -> TieTable:
+    """Tabulate a track's lookup over a grid, given by its first centre, the distance of centres [px] and (y, x).
+
+    The distance of ties starts at ``tie`` pixels and is halved until the error of the pixels between, in lines and in
+    samples, is bound by ``tolerance_px`` [px of the sweep]. The bound is an eighth of the ties' second differences (of
+    both axes together) and how far the knots lie off straight lines of a tie's length, which shows a single line out of
+    place that no tie may meet; or the error found half-way between ties, if that is more.
+
+    Raises SettingsError: the distance of ties is below 1, or the tolerance below 0.
+    """
+    if tie < 1 or not tolerance_px >= 0:
+        raise SettingsError(f"expected ties at least 1 px apart and a tolerance from 0, got {tie} and {tolerance_px}")
+    curve, samples = KnotCurve(track), camera.samples // binning
+    corner, kept = _within_reach(curve, camera, along, (binning, origin_px, spacing_px, shape))
+
+    def exact(first: float, step: int, counts: tuple[int, int]) -> Floats:
+        origin = (origin_px[0] + spacing_px * (corner[0] + first), origin_px[1] + spacing_px * (corner[1] + first))
+        points = grid_points(origin, step * spacing_px, counts)
+        return knots_of_points(curve, camera, points.reshape(-1, 2), along, binning).reshape(*counts, 2)
+
+    step_px = spacing_px * camera.ifov_rad / track.width
+    while tie > 1:
+        ties, bound = np.empty((0, 0, 2)), _knot_bound(track, tie * step_px)
+        if bound <= tolerance_px and min(kept) > 0:
+            rows, columns = ((size - 1) // tie + 2 for size in kept)
+            ties = exact(0, tie, (rows, columns))
+            corners = _corners(ties)
+            ends = np.array([len(track), samples]) - 0.5
+            cells = ((corners.max(axis=0) >= -0.5) & (corners.min(axis=0) <= ends)).all(
+                axis=-1
+            )  # hold points of the track
+            bound = SAFETY * (bound + _tie_bound(ties, cells))
+            if bound <= tolerance_px:
+                middle = exact(tie / 2, tie, (rows - 1, columns - 1))
+                bound = max(bound, float(np.abs(middle - corners.mean(axis=0))[cells].max(initial=0)))
+        if bound <= tolerance_px:
+            return TieTable(ties, tie, shape, bound, track.seen, samples, corner, kept)
+        tie //= 2
+    pixels = exact(0, 1, kept)
+    drop_unseen(pixels, track.seen, samples)
+    return TieTable(pixels, 1, shape, 0.0, track.seen, samples, corner, kept)
+
+
+def _within_reach(
+    curve: KnotCurve, camera: LineCamera, along: Axis, grid: tuple[int, tuple[float, float], float, tuple[int, int]]
+) -> tuple[tuple[int, int], tuple[int, int]]:
+    """First row and column of the pixels that lie between the ends of any of the track's lines, and how many."""
+    binning, origin_px, spacing_px, shape = grid
+    knots = np.concatenate([[-0.5], np.arange(len(curve.track)), [len(curve.track) - 0.5]])
+    scan, _, across, _ = (tangent[:, None] / camera.ifov_rad for tangent in curve.at(knots))
+    ends = np.array([0, camera.samples // binning * binning]) - camera.samples / 2
+    x, y = points_of_scan(across, camera, scan, ends * camera.ifov_rad)  # type: ignore[arg-type]
+    step = float(np.max(np.hypot(np.diff(scan[:, 0]), np.diff(across[:, 0]))))  # a curve leaves its knots by less
+    low, high = [], []
+    for place, start, size in zip((y, x) if along == "x" else (x, y), origin_px, shape, strict=True):
+        low.append(int(np.clip(np.floor((place.min() - step - start) / spacing_px) - 1, 0, size)))
+        high.append(int(np.clip(np.ceil((place.max() + step - start) / spacing_px) + 2, 0, size)))
+    kept = (high[0] - low[0], high[1] - low[1])
+    return ((low[0], low[1]), kept) if min(kept) > 0 else ((0, 0), (0, 0))
+
+
+def _knot_bound(track: Track, knots: float) -> float:
+    """How far knots lie off the middle of straight lines between two others, up to ``knots`` apart [step]."""
+    if track.uniform and track.straight:
+        return 0.0
+    worst = 0.0
+    for half in range(1, min(int(np.ceil(knots / 2)), (len(track) - 1) // 2) + 1):
+        for tangent in (track.scan, track.across):
+            middle = (tangent[: -2 * half] + tangent[2 * half :]) / 2
+            worst = max(worst, float(np.abs(tangent[half:-half] - middle).max()) / track.width)
+    return worst
+
+
+def _tie_bound(ties: Floats, cells: NDArray[np.bool_]) -> float:
+    """Largest error of bilinear interpolation in the given cells, by the second differences at their corners."""
+    total = np.zeros_like(ties)
+    for axis in (0, 1):
+        if ties.shape[axis] > 2:
+            inner = np.abs(np.diff(ties, 2, axis=axis))
+            total += np.pad(inner, [(1, 1) if at == axis else (0, 0) for at in range(3)], mode="edge")
+    return float(np.max(_corners(total), axis=0)[cells].max(initial=0)) / 8
+
+
+def _corners(ties: Floats) -> Floats:
+    """The four ties of each cell, (4, row, column, 2)."""
+    return np.stack([ties[:-1, :-1], ties[:-1, 1:], ties[1:, :-1], ties[1:, 1:]])
 
 
 @dataclass(frozen=True)

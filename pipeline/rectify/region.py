@@ -11,8 +11,18 @@ from numpy.typing import NDArray
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.rectify.kernels import Kernel
-from pipeline.rectify.line_cache import BLOCK_LINES, LineCache, Raw, ReadWindow, held_samples, line_blocks
-from pipeline.rectify.mosaic import LookedUp, cut_runs, mosaic, read_part
+from pipeline.rectify.mosaic import (
+    BLOCK_LINES,
+    LineCache,
+    LookedUp,
+    Raw,
+    ReadWindow,
+    cut_runs,
+    held_samples,
+    line_blocks,
+    mosaic,
+    read_part,
+)
 from pipeline.rectify.placed import TAPS, ColumnReach, PixelGrid, Placed, TrackReach, member_lines, place
 from pipeline.rectify.tracks import Track
 from pipeline.source import SweepLines

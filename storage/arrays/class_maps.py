@@ -1,4 +1,9 @@
-"""Maps of classes on the grid of a mosaic, their names as CF flags; those on the ground are in `ground_maps`."""
+"""Maps of classes on the grid of a mosaic, and what is believed of each pixel; those of the ground: `ground_maps`.
+
+Names of classes are CF flags. Of a pixel log-probabilities of its classes, how long ago it was looked at and by what
+light are kept, packed by CF's rules (scale_factor, add_offset), so that any reader of netCDF or Zarr gets numbers: a
+twentieth of a nat in a byte, an eighth of a day in two, a sixteenth of an octave of light in one.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +20,7 @@ from pipeline.errors import ShapeError
 from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.georeference import create_placed_group
 from storage.arrays.layout import (
+    SHARD_ROWS,
     AngularGrid,
     create_array,
     damage_named,
@@ -23,9 +29,19 @@ from storage.arrays.layout import (
     open_group,
     read_array,
     whole_shards,
+    write_counts,
+    write_image,
 )
 
 CONFIDENCE = {"long_name": "probability of the class given", "units": "1", "valid_range": [0.0, 1.0]}
+STEP, FAINTEST, NOTHING = 0.05, -12.7, 255  # nats; 254 is certainty, 255 that nothing is known
+DAY_STEP, NEVER = 0.125, 65535
+OCTAVE_STEP, DARKEST, DARK = 0.0625, -10.0, 255  # log2 of reference exposures; 255 where there was no light
+# what the images of a pixel hold of which nothing is known
+NOT_BELIEVED = {"log_probability": NOTHING, "age": NEVER, "log2_light": DARK}
+OLD_CLASS = "changed_from"
+CHANGED = {"long_name": "share of the patch's pixels with another class than remembered", "units": "1"}
+Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -147,3 +163,143 @@ def load_class_map(path: Path) -> ClassMap:
     group = open_group(path)
     classes, confidence, legend = read_array(group, "classes"), read_array(group, "confidence"), legend_of(group)
     return ClassMap(classes, confidence, legend.names, legend.colours, grid_of(dict(group.attrs)))
+
+
+def create_belief(
+    path: Path, shape: tuple[int, int], legend: ClassNames, *, grid: AngularGrid | None = None, goes_on: bool = False
+) -> None:
+    """Begin a store for a field of (y, x) ``shape`` of which nothing is known yet.
+
+    Where it ``goes_on`` from an earlier one there is also what its pixels were, where they changed: `OLD_CLASS`.
+    """
+    names = {"class_names": list(legend.names), "class_colours": np.asarray(legend.colours).tolist()}
+    group, place = create_placed_group(path, "belief", grid, shape, names)
+    write_counts(group, **{"class": len(legend.names)})
+    about: dict[str, Any] = {
+        "long_name": "natural logarithm of the probability of each class",
+        "units": "1",
+        "scale_factor": STEP,
+        "add_offset": FAINTEST,
+        "_FillValue": NOTHING,
+        **place,
+    }
+    spec = image_spec(("y", "x", "class"), (*shape, len(legend.names)), "|u1")
+    create_array(group, "log_probability", spec, about)
+    about = {"long_name": "time since the pixel was looked at", "units": "days", "scale_factor": DAY_STEP, **place}
+    create_array(group, "age", image_spec(("y", "x"), shape, "<u2"), {**about, "_FillValue": NEVER})
+    about = {"long_name": "log2 of the reference exposures that it rests on", "units": "1", "_FillValue": DARK, **place}
+    packing = {"scale_factor": OCTAVE_STEP, "add_offset": DARKEST}
+    create_array(group, "log2_light", image_spec(("y", "x"), shape, "|u1"), {**about, **packing})
+    if goes_on:
+        create_array(group, OLD_CLASS, image_spec(("y", "x"), shape, "|u1"), {**old_class_flags(legend), **place})
+
+
+def old_class_flags(legend: ClassNames) -> dict[str, Any]:
+    """CF's flag attributes of an image of the classes that pixels had before."""
+    words = f"class remembered, where the map is sure of another one; {UNLABELLED} everywhere else"
+    return {**class_flags(legend.names, legend.colours), "long_name": words}
+
+
+def write_belief_tile(
+    path: Path, origin: tuple[int, int], log_probability: Floats, age_days: Floats, light: Floats
+) -> None:
+    """Store (y, x, class) log-probabilities, (y, x) ages and light of whole shards from row and column ``origin`` on.
+
+    NaN is what nothing is known of. Raises ShapeError: they differ in size; ChunkError: the tile splits a shard;
+    IncompleteStoreError: there is no store.
+    """
+    if not log_probability.shape[:2] == age_days.shape == light.shape:
+        sizes = f"{log_probability.shape}, ages {age_days.shape} and light {light.shape}"
+        raise ShapeError(f"probabilities {sizes} are not of one tile")
+    with damage_named(str(path)):
+        group = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
+        names = ("log_probability", "age", "log2_light")
+        arrays = [array for name in names if isinstance(array := group[name], zarr.Array)]
+    place = tuple(slice(first, first + size) for first, size in zip(origin, age_days.shape, strict=True))
+    whole_shards("the belief", place, arrays[1].shape, arrays[1].shards or ())
+    for top in range(0, len(age_days), SHARD_ROWS):  # what is packed never lies there for all rows at once
+        part = log_probability[top : top + SHARD_ROWS]
+        packed = np.rint((np.clip(part, FAINTEST, 0) - FAINTEST) / STEP)
+        rows = slice(place[0].start + top, place[0].start + top + len(part))
+        arrays[0][rows, place[1]] = np.where(np.isnan(part), NOTHING, np.minimum(packed, NOTHING - 1)).astype(np.uint8)
+    days = np.rint(np.clip(age_days, 0, DAY_STEP * (NEVER - 1)) / DAY_STEP)
+    arrays[1][place] = np.where(np.isnan(age_days), NEVER, days).astype(np.uint16)
+    octaves = np.clip(np.log2(np.maximum(light, 2.0**DARKEST)), DARKEST, DARKEST + OCTAVE_STEP * (DARK - 1))
+    packed = np.rint((octaves - DARKEST) / OCTAVE_STEP)
+    arrays[2][place] = np.where(light > 0, packed, DARK).astype(np.uint8)
+
+
+def write_changes_tile(path: Path, origin: tuple[int, int], old_class: NDArray[np.uint8]) -> None:
+    """Store (y, x) classes that pixels had, 255 where they have them still, of whole shards from ``origin`` on.
+
+    Raises ChunkError: the tile splits a shard; IncompleteStoreError: the store goes on from none, or is not there.
+    """
+    with damage_named(f"{path}/{OLD_CLASS}"):
+        array = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)[OLD_CLASS]
+        assert isinstance(array, zarr.Array)
+    place = tuple(slice(first, first + size) for first, size in zip(origin, old_class.shape, strict=True))
+    whole_shards("the belief", place, array.shape, array.shards or ())
+    array[place] = old_class
+
+
+def drop_changes(path: Path) -> None:
+    """Take out of a belief what its pixels were: it goes on from none after all."""
+    with damage_named(str(path)):
+        del zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)[OLD_CLASS]
+
+
+def write_changes(path: Path, changed: Floats, patch_px: int) -> None:
+    """Add (seat_y, seat_x) shares of pixels that changed to a stored belief; a seat has ``patch_px`` a side."""
+    with damage_named(str(path)):
+        group = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
+    write_image(group, "changed", ("seat_y", "seat_x"), changed, {**CHANGED, "patch_px": patch_px})
+
+
+def unpacked_days(packed: NDArray[np.uint16]) -> Floats:
+    """Days of stored ages; NaN where nothing is known."""
+    return np.where(packed == NEVER, np.float32(np.nan), packed * np.float32(DAY_STEP)).astype(np.float32)
+
+
+class BeliefStore:
+    """A stored belief, read in parts. Raises IncompleteStoreError where there is none, or it is damaged."""
+
+    def __init__(self, path: Path) -> None:
+        self._group = open_group(path)
+        array = self._group.get("age")
+        self.shape = (array.shape[0], array.shape[1]) if isinstance(array, zarr.Array) else (0, 0)
+
+    @property
+    def legend(self) -> ClassNames:
+        """Its classes, in the order of the probabilities."""
+        return legend_of(self._group)
+
+    def read(self, rows: slice = slice(None), columns: slice = slice(None)) -> tuple[Floats, Floats, Floats]:
+        """Log-probabilities (y, x, class) that sum to 1 once taken to powers, ages in days and light (y, x).
+
+        NaN where nothing is known, no light where there was none.
+        """
+        packed = read_array(self._group, "log_probability", np.s_[rows, columns])
+        values = (packed * np.float32(STEP) + np.float32(FAINTEST)).astype(np.float32)
+        values -= np.log(np.exp(values).sum(axis=-1, keepdims=True))
+        values[packed == NOTHING] = np.nan
+        days = self.age(rows, columns)
+        packed_light = read_array(self._group, "log2_light", np.s_[rows, columns])
+        light = np.exp2(packed_light * np.float32(OCTAVE_STEP) + np.float32(DARKEST))
+        return values, days, np.where(packed_light == DARK, 0, light).astype(np.float32)
+
+    def age(self, rows: slice = slice(None), columns: slice = slice(None)) -> Floats:
+        """(y, x) days since a pixel was looked at; NaN where nothing is known."""
+        return unpacked_days(read_array(self._group, "age", np.s_[rows, columns]))
+
+    def old_class(self) -> NDArray[np.uint8] | None:
+        """(y, x) class that a pixel had where it has another now, else 255; None of a first look."""
+        return read_array(self._group, OLD_CLASS) if OLD_CLASS in self._group else None
+
+    @property
+    def patch_px(self) -> int:
+        """Pixels a side of the seats that changes are told of."""
+        return int(self._group["changed"].attrs["patch_px"])  # type: ignore[arg-type]
+
+    def changed(self) -> Floats | None:
+        """Shares of pixels that changed, by seat; None of a first look."""
+        return read_array(self._group, "changed") if "changed" in self._group else None

@@ -15,9 +15,17 @@ import zarr
 from numpy.typing import NDArray
 
 from pipeline.errors import IncompleteStoreError, ShapeError
-from pipeline.ground.field_scale import M2_PER_HECTARE
-from storage.arrays.beliefs import CHANGED, OLD_CLASS, old_class_flags
-from storage.arrays.class_maps import CONFIDENCE, ClassNames, check_named, class_flags, legend_of
+from pipeline.ground.field_places import M2_PER_HECTARE
+from storage.arrays.class_maps import (
+    CHANGED,
+    CONFIDENCE,
+    OLD_CLASS,
+    ClassNames,
+    check_named,
+    class_flags,
+    legend_of,
+    old_class_flags,
+)
 from storage.arrays.georeference import ON_THE_MAP, geobox_of_group, load_geobox, map_attributes, write_map_coordinates
 from storage.arrays.layout import (
     SHARD_COLUMNS,

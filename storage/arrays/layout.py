@@ -2,6 +2,8 @@
 
 Chunks of 32 x 32 px with all bands, in shards of 64 rows, each chunk with its own crc32c: one patch is one range read,
 and a flipped bit is an error instead of a wrong number. Codecs to choose from are tried in memory in the same layout.
+
+Pixels of which a scene knows nothing are taken out of stored images: no class, no value, no memory.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING, Any
@@ -22,6 +25,7 @@ from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec, ZstdCodec
 from zarr.storage import MemoryStore
 
 from pipeline.errors import ChunkError, IncompleteStoreError, SettingsError, ShapeError, WavelengthError
+from pipeline.geometry.grid import UNLABELLED
 
 if TYPE_CHECKING:
     from odc.geo.geobox import GeoBox
@@ -40,6 +44,9 @@ _SPATIAL_CONVENTION = {
     "spec_url": "https://github.com/zarr-conventions/spatial/blob/v1/README.md",
     "description": "Relation of array indices to tangents of the undeflected direction; there is no CRS",
 }
+# of each kind of store: its images, and the number that stands for nothing in them
+NO_CLASS = {"classes": UNLABELLED, "confidence": np.nan}
+NO_VALUE = {"values": np.nan, "coverage": 0}
 
 
 @dataclass(frozen=True)
@@ -289,3 +296,29 @@ def _compressors(codec: str, size: int) -> tuple[Any, ...]:
         raise SettingsError(f"the codec must be one of {', '.join(CODECS)}, got {codec!r}")
     name, level = BLOSC[codec]
     return (BloscCodec(cname=name, clevel=level, shuffle=BloscShuffle.bitshuffle, typesize=size),)  # type: ignore[arg-type]
+
+
+def blank_pixels(path: Path, where: NDArray[np.bool_], images: Mapping[str, float]) -> None:
+    """Write nothing into the (y, x) pixels ``where`` of a store's images, one shard at a time.
+
+    Raises IncompleteStoreError: an image is missing or damaged.
+    """
+    with damage_named(str(path)):
+        group = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
+        arrays = {name: array for name in images if isinstance(array := group[name], zarr.Array)}
+    for name, array in arrays.items():
+        sizes = (array.shards or array.chunks)[:2]
+        for top, left in product(*(range(0, size, step) for size, step in zip(where.shape, sizes, strict=True))):
+            place = np.s_[top : top + sizes[0], left : left + sizes[1]]
+            if (gaps := where[place]).any():
+                values = read_array(group, name, place).copy()
+                values[gaps] = images[name]
+                array[place] = values
+
+
+def blank_coarse(missing: NDArray[np.bool_], factor: int) -> NDArray[np.bool_]:
+    """(y, x) coarse pixels of ``factor`` px a side of which the scene has less than half."""
+    starts = [np.arange(0, side, factor) for side in missing.shape]
+    gaps = np.add.reduceat(np.add.reduceat(missing.astype(np.int32), starts[0], axis=0), starts[1], axis=1)
+    down, across = (np.minimum(factor, side - first) for first, side in zip(starts, missing.shape, strict=True))
+    return np.asarray(2 * gaps > down[:, None] * across)

@@ -12,7 +12,7 @@ import zarr
 from numpy.typing import NDArray
 
 from pipeline.errors import IncompleteStoreError, ShapeError
-from pipeline.rectify.tie_points import TieTable
+from pipeline.rectify.placed import TieTable
 from pipeline.rectify.tracks import Track
 from storage.archive.keys import KEY_LENGTH
 from storage.arrays.layout import create_group, damage_named, open_group, read_array, write_image, write_small

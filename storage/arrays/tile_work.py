@@ -18,11 +18,11 @@ from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import exposing
 from pipeline.rectify.kernels import Kernel
-from pipeline.rectify.line_cache import LineCache
-from pipeline.rectify.line_numbers import LineNumbers, number_lines
+from pipeline.rectify.mosaic import LineCache
 from pipeline.rectify.placed import PixelGrid, Placed, place
 from pipeline.rectify.region import Reaches, Tile, cache_bytes, column_reach, mosaic_tile, plan_tiles, tile_bytes
 from pipeline.rectify.registration.alignment import SweepShift, no_shifts
+from pipeline.rectify.tracks import LineNumbers, number_lines
 from storage.archive.manifests import read_table
 from storage.arrays.cubes import RawCube, open_raw_cube
 from storage.arrays.lookups import Tables, open_lookup

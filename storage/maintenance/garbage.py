@@ -97,12 +97,7 @@ def clear_up(
 
 
 def plan_clearance(
-    archive: Archive,
-    *,
-    keep_days: float = 1.0,
-    raw_too: bool = False,
-    made_again: Mapping[str, int | str] = NOTHING,
-    now: datetime | None = None,
+    archive: Archive, *, keep_days: float = 1.0, raw_too: bool = False, made_again: Mapping[str, int | str] = NOTHING
 ) -> Clearance:
     """Find what can go: stores that no run names, spools of published captures, and what a dead process left.
 
@@ -115,7 +110,7 @@ def plan_clearance(
         raise SettingsError(f"--keep-days {keep_days}: expected a number of days, 0 or more")
     catalogue = Catalogue.read(archive.root)
     named = set[str]().union(*(catalogue.named_and_below[run.uri] for run in catalogue.runs))
-    moment = now or archive.now()
+    moment = archive.now()
     spared = _spared(catalogue, named, keep_days, raw_too, moment)
     below = catalogue.ancestors(spared) & set(catalogue.stores) - named
     kept = dict.fromkeys(below, "what stays was made of it") | spared

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from pipeline.rectify.calibration.calibrate import calibrate
+from pipeline.rectify.calibrate import calibrate
 from pipeline.source import References
 from storage.readers.scene_toml import BandWavelengths
 

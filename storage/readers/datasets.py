@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import UNLABELLED
-from storage.readers.label_matching import (
+from storage.readers.label_files import (
     MatchedFiles,
     folders_within,
     image_folder,

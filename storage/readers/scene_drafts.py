@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 from pipeline.errors import PipelineError, SceneError
 from pipeline.readings import edge_fill
 from storage.readers.cube_sources import CubeSource
-from storage.readers.label_matching import (
+from storage.readers.label_files import (
+    Legend,
     MatchedFiles,
     find_label,
+    find_legend,
     folders_within,
     image_folder,
     is_label_name,
@@ -24,7 +26,6 @@ from storage.readers.label_matching import (
     match_folder,
 )
 from storage.readers.labels import MIXED, MOST_FOUND_CLASSES, load_codes, shown_value, value_of_code
-from storage.readers.legends import Legend, find_legend
 from storage.readers.raster_files import IMAGE_ENDINGS, TIFF_ENDINGS, image_shape, open_tiff_rows, split_variable
 from storage.readers.scan_files import open_cube_source
 from storage.readers.scene_files import scene_number

@@ -20,7 +20,7 @@ from pipeline.readings import MOST_STEPS, MOST_VALUE, beyond_range, find_beyond
 from pipeline.simulator.scenes.scene import BRIGHT_PERCENTILE
 from storage.archive.staging import file_hash
 from storage.readers.cube_sources import BLOCK_LINES, Raster, machine_bytes, scene_lines
-from storage.readers.label_matching import find_label
+from storage.readers.label_files import find_label
 from storage.readers.labels import Labels, load_frame_or_raster, load_labels
 from storage.readers.raster_files import split_variable
 from storage.readers.scan_files import known_bands, open_cube_source, reader_of

@@ -15,7 +15,7 @@ import numpy as np
 from bench_tiles import CAMERA, alone, write_raw
 from measure import Row
 
-from models.network.process import keep_freed_memory, use_one_thread
+from models.network.machine import keep_freed_memory, use_one_thread
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.coverage import full_sweeps
 from pipeline.rectify.placed import PixelGrid

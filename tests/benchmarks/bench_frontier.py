@@ -29,7 +29,7 @@ from flows.training.look import chosen_effects
 from models.evaluation.expected_scores import MapScores, expected_counts
 from models.evaluation.metrics import confusion, mean_iou
 from models.reading.inference import segment
-from models.weights.familiar_files import MAP_SCORES, load_familiar
+from models.weights.companion_files import MAP_SCORES, load_familiar
 from models.weights.files import Description, Weights, load_weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid

@@ -22,7 +22,7 @@ from pipeline.geometry.mirror import (
 )
 from pipeline.geometry.scan import points_of_scan
 from pipeline.rectify.lookup import KnotCurve, track_lookup
-from pipeline.rectify.tie_points import TieTable, tie_table
+from pipeline.rectify.placed import TieTable, tie_table
 from pipeline.rectify.tracks import Track, make_tracks
 
 CAMERA = LineCamera()

@@ -256,7 +256,7 @@ def _of_the_file(folder: Path, split: Split) -> list[Result]:
 
 def _judged(source: str, weights: Weights, seen: Glance, fine: Values, labels: Labels) -> list[Result]:
     """The map with several shares of the seats, by entropy."""
-    from models.network.process import one_thread
+    from models.network.machine import one_thread
     from models.policies.policies import score_seats
     from models.reading.inference import glance_of_columns, segment
     from pipeline.planning.selection import frame_seats

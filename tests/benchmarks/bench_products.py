@@ -23,9 +23,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.products.outlines import class_polygons
-from pipeline.products.regions import merge_small
-from storage.export.qgis_styles import REDS, ramp_colour
+from pipeline.products.regions import class_polygons, merge_small
+from storage.export.map_files import REDS, ramp_colour
 
 SIDES = (3000, 3400)
 LEAST_PX = {"regions of 8 px and more": 8, "every region": 1}

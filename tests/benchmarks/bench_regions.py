@@ -25,7 +25,7 @@ from flows.survey.field_work import FieldWork, WeightsFile
 from flows.survey.reading_costs import SHARD
 from flows.survey.run import SurveyRun, open_run
 from models.evaluation.metrics import confusion, mean_iou
-from models.network.process import use_one_thread
+from models.network.machine import use_one_thread
 from models.reading.regions import HALO_CELLS, Region, most_bytes, plan_regions
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.selection import frame_seats

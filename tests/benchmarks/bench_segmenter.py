@@ -14,11 +14,10 @@ import torch
 from measure import Clock, Row, ratio, time_in_turn
 from numpy.typing import NDArray
 
-from models.network.cost import multiply_adds
 from models.network.layers import Encoder, Memory, cut
-from models.network.process import keep_freed_memory, one_thread
+from models.network.machine import keep_freed_memory, one_thread
 from models.network.segmenter import Segmenter
-from models.network.sizes import SegmenterConfig
+from models.network.sizes import SegmenterConfig, multiply_adds
 from models.network.spectral import Normalisation, SpectralBasis
 from models.policies.policies import score_multiply_adds, score_seats
 from models.reading.inference import (

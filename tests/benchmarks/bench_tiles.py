@@ -23,12 +23,12 @@ import numpy as np
 from measure import Row, peak_bytes, ratio, time_in_turn
 from numpy.typing import NDArray
 
-from models.network.process import keep_freed_memory, use_one_thread
+from models.network.machine import keep_freed_memory, use_one_thread
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.planning.coverage import full_sweeps
-from pipeline.rectify.line_cache import BLOCK_LINES
+from pipeline.rectify.mosaic import BLOCK_LINES
 from pipeline.rectify.placed import PixelGrid, place
 from pipeline.source import Line, References
 from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube

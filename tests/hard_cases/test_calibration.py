@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.rectify.calibration.calibrate import calibrate
-from pipeline.rectify.calibration.detector import find_bad_elements
+from pipeline.rectify.calibrate import calibrate
+from pipeline.rectify.detector import find_bad_elements
 from pipeline.source import References
 
 FULL = 4095

@@ -9,11 +9,10 @@ from pipeline.errors import PoseError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_position, scene_to_direction
 from pipeline.geometry.scan import points_of_scan
-from pipeline.rectify.line_numbers import number_lines
 from pipeline.rectify.lookup import grid_points, lookup, track_lookup
+from pipeline.rectify.placed import tie_table
 from pipeline.rectify.resample import merge_lines, resample
-from pipeline.rectify.tie_points import tie_table
-from pipeline.rectify.tracks import Track, make_tracks
+from pipeline.rectify.tracks import Track, make_tracks, number_lines
 
 CAMERA = LineCamera()
 STRIP = 2600.0

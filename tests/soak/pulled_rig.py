@@ -20,8 +20,7 @@ from typing import Any, Literal
 from flows.settings.load import load_settings
 from flows.simulate.rig_emulation import emulated_source
 from pipeline.rig.emulator.camera_server import CameraServer
-from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock
-from pipeline.rig.emulator.mirror_ports import EmulatedPort
+from pipeline.rig.emulator.emulated_rig import EmulatedPort, EmulatedRig, FastClock
 from pipeline.rig.emulator.scene_camera import SceneView
 from pipeline.simulator.simulated import SimulatedSource
 from tests.faults.nursery import ROOT

@@ -20,7 +20,7 @@ from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.readings import edge_fill
 from storage.readers.datasets import load_data_set
-from storage.readers.legends import find_legend, read_legend
+from storage.readers.label_files import find_legend, read_legend
 from storage.readers.scene_files import load_scene_file
 from storage.readers.scene_toml import load_scene_settings
 from tests.flows.conftest import command_line

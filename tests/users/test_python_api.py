@@ -16,11 +16,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import spectralzoom
-from spectralzoom.opened import NoRunError, OpenedRun
+from spectralzoom.opened import NoRunError, OpenedRun, by_wavelength, on_axes, open_labelled
 from storage.archive.archive import Archive
 from storage.arrays.class_maps import load_class_map
 from storage.arrays.ground_maps import load_geobox
-from storage.arrays.labelled_stores import by_wavelength, on_axes, open_labelled
 from tests.conftest import WeightsMaker
 from tests.flows.small_fields import write_field
 from tests.remembered_work import without_effects

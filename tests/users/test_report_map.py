@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 
 from flows.publish.field_map import FieldMap, SweepShown
-from flows.publish.page_parts import grey_png
-from flows.publish.page_places import PagePlaces
-from flows.publish.page_spectra import page_spectra
+from flows.publish.page_data import PagePlaces, grey_png, page_spectra
 from flows.publish.report import Picture, render_report
 from tests.flows.publish.test_receipt import make_receipt
 from tests.users.browser import Tab, chromium, needs_browser

@@ -13,7 +13,7 @@ from flows.publish.receipt_words import sentences
 from flows.settings.load import load_settings
 from flows.survey.zones import place_of_field
 from pipeline.geometry.camera import LineCamera
-from pipeline.ground.field_scale import scale_of_pixels, scale_of_view
+from pipeline.ground.field_places import scale_of_pixels, scale_of_view
 from pipeline.ground.view import GroundView, RigPose
 from pipeline.simulator.scenes.farm.farm_scene import PIXEL_M, farm_scene
 from tests.conftest import Survey

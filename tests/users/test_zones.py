@@ -20,8 +20,7 @@ from flows.survey.run import SurveyRun, open_run
 from pipeline.errors import SettingsError, ZoneError
 from pipeline.geometry.grid import UNLABELLED
 from storage.archive.archive import Archive
-from storage.arrays.beliefs import BeliefStore
-from storage.arrays.class_maps import ClassMap, load_class_map
+from storage.arrays.class_maps import BeliefStore, ClassMap, load_class_map
 from storage.arrays.mosaics import load_attention, open_patches
 from tests.conftest import Survey
 from tests.remembered_work import without_effects

@@ -20,13 +20,22 @@ from models.reading.inference import CoarseLook, Glance, read_glance
 from models.reading.regions import whole_field
 from models.reading.remembered import MemoryAgreement, changed_shares
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.rectify.registration.field_shift import FieldShift
+from pipeline.rectify.registration.alignment import FieldShift
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS
 from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table, write_table
-from storage.arrays.beliefs import OLD_CLASS, UNKNOWN, BeliefStore, create_belief, drop_changes, write_changes
-from storage.arrays.blank_pixels import NO_CLASS, blank_pixels
-from storage.arrays.class_maps import ClassNames, create_class_map, with_unknown
+from storage.arrays.class_maps import (
+    NOT_BELIEVED,
+    OLD_CLASS,
+    BeliefStore,
+    ClassNames,
+    create_belief,
+    create_class_map,
+    drop_changes,
+    with_unknown,
+    write_changes,
+)
+from storage.arrays.layout import NO_CLASS, blank_pixels
 from storage.arrays.mosaics import open_patches
 
 CLASS_MAP = Product("segment", version=8, files=("class_map.zarr", "belief.zarr"), by_weights=True)
@@ -58,7 +67,7 @@ def draw_map(run: SurveyRun, mosaic: StageRef, patches: StageRef) -> Wanted:
         if run.scene.missing is not None:
             blank_pixels(out, run.scene.missing, NO_CLASS)
             changes = {} if drawn.comparison is None else {OLD_CLASS: UNLABELLED}
-            blank_pixels(path / "belief.zarr", run.scene.missing, UNKNOWN | changes)
+            blank_pixels(path / "belief.zarr", run.scene.missing, NOT_BELIEVED | changes)
         if run.zones.left_out is not None:
             blank_pixels(out, run.zones.left_out, NO_CLASS)
         if (old_class := BeliefStore(path / "belief.zarr").old_class()) is not None:

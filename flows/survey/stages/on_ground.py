@@ -14,8 +14,7 @@ from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.map_grid import GroundGrid, ground_grid, image_at, map_blocks, nearest_at
 from pipeline.ground.view import GroundView
 from storage.archive.keys import StageRef
-from storage.arrays.beliefs import OLD_CLASS, BeliefStore
-from storage.arrays.class_maps import ClassMap, ClassNames, load_class_map
+from storage.arrays.class_maps import OLD_CLASS, BeliefStore, ClassMap, ClassNames, load_class_map
 from storage.arrays.ground_maps import BLOCK, GroundMapWriter
 from storage.arrays.layout import SHARD_ROWS, open_group, read_array, read_bands
 from storage.arrays.quicklooks import choose_bands, develop, stretch

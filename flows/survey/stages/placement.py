@@ -16,19 +16,17 @@ from flows.survey.stages.attention import load_plan
 from flows.survey.stages.capture import captured
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import seat_pixels
-from pipeline.rectify.line_cache import LineCache
-from pipeline.rectify.placed import PixelGrid, Placed
+from pipeline.rectify.mosaic import LineCache
+from pipeline.rectify.placed import PixelGrid, Placed, TieTable
 from pipeline.rectify.region import read_every_seat, read_seats
 from pipeline.rectify.registration.alignment import SweepShift
 from pipeline.rectify.registration.illumination import overlap_light, solve_lights
 from pipeline.rectify.registration.overlaps import BroadSweep, broad_bands
 from pipeline.rectify.registration.seams import Anchor, Registration, SeamWindow, anchor_sweep, register_sweeps
-from pipeline.rectify.tie_points import TieTable
 from pipeline.rectify.tracks import Track
 from storage.archive.keys import StageRef
 from storage.archive.manifests import read_table, write_table
-from storage.arrays.blank_pixels import NO_VALUE, blank_coarse, blank_pixels
-from storage.arrays.layout import read_array
+from storage.arrays.layout import NO_VALUE, blank_coarse, blank_pixels, read_array
 from storage.arrays.lookups import path_digest, write_lookup
 from storage.arrays.mosaics import MosaicWriter, PatchWriter, load_mosaic, open_patches
 from storage.arrays.quicklooks import choose_bands, stretched

@@ -16,7 +16,7 @@ from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.geometry.scan import Sweep, shifted_position
-from pipeline.rectify.calibration.calibrate import calibrate, of_bands
+from pipeline.rectify.calibrate import calibrate, of_bands
 from pipeline.rectify.lookup import track_lookup
 from pipeline.rectify.resample import resample
 from pipeline.rectify.tracks import Track, make_tracks

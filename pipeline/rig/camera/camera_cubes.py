@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.errors import RigError, SceneError, ShapeError
 from pipeline.readings import SIGMA_OF_MEDIAN
-from pipeline.rectify.calibration.detector import find_bad_elements
+from pipeline.rectify.detector import find_bad_elements
 from pipeline.rig.camera.camera_texts import FRAME_INDEX, LineTimes, parse_frame_index, split_header, times_of_lines
 from pipeline.source import References
 
@@ -271,7 +271,7 @@ def as_references(dark: MeanFrame, white: MeanFrame, *, panel: ArrayLike = 1.0) 
     """Join dark and white into the references of a sweep, and say what was found.
 
     An element is bad where its dark frame is stuck, where either jumps amid its frames, or where
-    :func:`pipeline.rectify.calibration.detector.find_bad_elements` says so.
+    :func:`pipeline.rectify.detector.find_bad_elements` says so.
 
     ``panel`` is the value of the white panel, one or (band,). RigError where the frames are of two sizes, swapped,
     without light, do not show the same throughout, or too many elements would be bad.

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
-from models.network.process import use_one_thread
+from models.network.machine import use_one_thread
 from storage.arrays.class_maps import load_class_map
 
 SIZE, SEEDS, TOLERANCE = "640x512", (1, 2), 0.1

@@ -17,7 +17,7 @@ from bench_calls import BANDS, bare_field, night
 from measure import Row
 from numpy.typing import NDArray
 
-from models.network.process import use_one_thread
+from models.network.machine import use_one_thread
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.effect import OFF, Effect, SweepBlock
 from pipeline.simulator.effects.probe import noise_electrons

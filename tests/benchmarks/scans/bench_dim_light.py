@@ -29,8 +29,7 @@ from numpy.typing import NDArray  # noqa: E402
 from scipy.stats import t as student  # noqa: E402
 
 from flows.evaluate.frames import Candidate, Look, look_at, open_frames, scene_of  # noqa: E402
-from models.evaluation.bootstrap import LEVEL, paired_interval  # noqa: E402
-from models.evaluation.metrics import confusion, mean_iou_of_each  # noqa: E402
+from models.evaluation.metrics import LEVEL, confusion, mean_iou_of_each, paired_interval  # noqa: E402
 from models.policies.policies import score_seats  # noqa: E402
 from models.reading.inference import segment  # noqa: E402
 from models.training.looks import REFERENCE_MS  # noqa: E402

@@ -29,8 +29,8 @@ from models.reading.doubts import SeatDoubts
 from models.reading.inference import DrawnMap, glance_of_columns, segment
 from models.reading.remembered import COME_TRUE, Looked, Remembered, carried, first_belief, recall
 from models.training.looks import REFERENCE_MS
+from models.weights.companion_files import MemoryWeights, load_memory, memory_path
 from models.weights.files import Weights, describe_weights, load_weights
-from models.weights.memory_files import MemoryWeights, load_memory, memory_path
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel, Sweep

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from flows.archive.compare_command import _classes, _confidence, _pair_of, compare, find_run
-from flows.archive.map_differences import OTHER, SAME, MapPair, change_rgb, draw_difference, thin_changes
+from flows.publish.change_pictures import OTHER, SAME, MapPair, change_rgb, draw_difference, thin_changes
 from pipeline.errors import ArchiveError, SceneError, SettingsError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
 from storage.archive.archive import Archive

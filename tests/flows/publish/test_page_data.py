@@ -14,11 +14,18 @@ from hypothesis import strategies as st
 from odc.geo.geobox import GeoBox
 from PIL import Image
 
-from flows.publish import page_spectra as spectra_of_page
+from flows.publish import page_data
 from flows.publish.field_map import FieldMap, map_facts
-from flows.publish.page_parts import SHA256, indexed_png, part, policy
-from flows.publish.page_places import places_of_grid, places_of_pose
-from flows.publish.page_spectra import class_means, page_spectra
+from flows.publish.page_data import (
+    SHA256,
+    class_means,
+    indexed_png,
+    page_spectra,
+    part,
+    places_of_grid,
+    places_of_pose,
+    policy,
+)
 from flows.publish.report import MAP_SCRIPTS
 from pipeline.ground.map_grid import MapFrame, map_crs
 from pipeline.ground.view import GroundView, RigPose
@@ -34,7 +41,7 @@ def test_spectra_are_kept_to_half_a_step(shape: tuple[int, int, int], seed: int,
     mosaic[rng.random(shape[:2]) < 0.2] = np.nan
     nm = rng.permutation(np.linspace(400, 900, shape[2]))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(spectra_of_page, "MOST_VALUES", most)
+        patch.setattr(page_data, "MOST_VALUES", most)
         found = page_spectra([mosaic[:3], mosaic[3:]], shape, nm, 4)
     assert found.levels.size <= max(most, found.levels.shape[2])
     assert (np.diff(found.wavelength_nm) > 0).all()
@@ -48,7 +55,7 @@ def test_spectra_are_kept_to_half_a_step(shape: tuple[int, int, int], seed: int,
 
 def test_bands_and_pixels_that_are_taken_together_are_means(monkeypatch: pytest.MonkeyPatch) -> None:
     """Over those that have a value; bands first, down to thirty."""
-    monkeypatch.setattr(spectra_of_page, "MOST_VALUES", 31 * 4)
+    monkeypatch.setattr(page_data, "MOST_VALUES", 31 * 4)
     mosaic = np.random.default_rng(0).random((4, 4, 61)).astype(np.float32)
     mosaic[0, 0] = np.nan
     found = page_spectra([mosaic], mosaic.shape, np.arange(61.0), 4)
@@ -109,7 +116,7 @@ def test_places_of_a_scene_are_its_grids() -> None:
 @pytest.mark.parametrize("name", SHA256)
 def test_the_library_is_as_it_was_published(name: str) -> None:
     """Leaflet 1.9.4 of npm's registry, byte for byte, its licence beside it."""
-    content = (Path(spectra_of_page.__file__).parent / name).read_bytes()
+    content = (Path(page_data.__file__).parent / name).read_bytes()
     assert hashlib.sha256(content).hexdigest() == SHA256[name]
 
 

@@ -10,8 +10,7 @@ from typing import Any
 
 import pytest
 
-from flows.schedule.date_charts import COLOURS, line_chart
-from flows.schedule.field_visits import look_of
+from flows.schedule.field_visits import COLOURS, line_chart, look_of
 from flows.schedule.history import FieldHistory, read_histories, render_history, render_index, way_to
 from storage.archive.archive import Archive
 from storage.archive.ledger import Ledger

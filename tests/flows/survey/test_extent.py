@@ -14,8 +14,7 @@ import pytest
 from flows.survey.extent import Extent, work_done, work_of_map
 from flows.survey.run import SurveyRun
 from flows.survey.stage import Unit
-from models.network.cost import multiply_adds
-from models.network.sizes import SegmenterConfig
+from models.network.sizes import SegmenterConfig, multiply_adds
 from models.policies.policies import score_multiply_adds
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid

@@ -19,8 +19,7 @@ from flows.survey.run import SurveyRun, open_run
 from models.reading.regions import Region, plan_regions, whole_field
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
-from storage.arrays.beliefs import create_belief
-from storage.arrays.class_maps import ClassNames, create_class_map, load_class_map
+from storage.arrays.class_maps import ClassNames, create_belief, create_class_map, load_class_map
 from storage.arrays.layout import consolidate_stores
 from storage.arrays.mosaics import load_attention
 from storage.parallel.crew import Crew

@@ -20,8 +20,16 @@ from pipeline.ground.map_grid import GroundGrid
 from pipeline.ground.view import RigPose, pixel_places
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
-from storage.arrays.beliefs import create_belief, write_belief_tile, write_changes, write_changes_tile
-from storage.arrays.class_maps import ClassMap, ClassNames, load_class_map, write_class_map
+from storage.arrays.class_maps import (
+    ClassMap,
+    ClassNames,
+    create_belief,
+    load_class_map,
+    write_belief_tile,
+    write_changes,
+    write_changes_tile,
+    write_class_map,
+)
 from storage.arrays.ground_maps import GroundMap, load_ground_map
 from storage.arrays.layout import AngularGrid
 from storage.arrays.mosaics import MosaicWriter

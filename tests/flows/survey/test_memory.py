@@ -23,8 +23,8 @@ from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
 from flows.settings.load import load_settings
 from models.network.memory_reader import MemoryReader
 from models.network.sizes import MemorySizes
+from models.weights.companion_files import MemoryWeights, memory_path, save_memory
 from models.weights.files import load_weights
-from models.weights.memory_files import MemoryWeights, memory_path, save_memory
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
 from storage.archive.archive import Archive

@@ -22,9 +22,8 @@ from flows.settings.load import load_settings
 from flows.settings.values import parse_unknown
 from flows.survey.beyond_training import beyond_training
 from models.reading.familiar import Familiar, Limits
-from models.weights.familiar_files import FamiliarWeights, familiar_path, save_familiar
+from models.weights.companion_files import FamiliarWeights, TrainedOn, familiar_path, save_familiar
 from models.weights.files import content_key, describe_weights
-from models.weights.trained_on import TrainedOn
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.class_maps import ClassNames, with_unknown

@@ -17,8 +17,8 @@ from models.network.memory_reader import MemoryReader
 from models.network.sizes import MemorySizes
 from models.reading.remembered import Looked, Remembered, first_belief, recall
 from models.training.memory import MemoryTraining, PastLook, Visit, train_reader
+from models.weights.companion_files import load_memory, memory_path
 from models.weights.files import content_key, describe_weights
-from models.weights.memory_files import load_memory, memory_path
 from pipeline.errors import SettingsError
 
 QUICK = MemoryTraining(minutes=0.5, steps=2, batch=2, crop=64, visits=2)

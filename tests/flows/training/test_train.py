@@ -21,17 +21,15 @@ from flows.survey.run import open_run
 from flows.training import train as flow
 from flows.training import train_scenes
 from flows.training.data import pack_mask, unpack_mask
-from flows.training.measure_familiar import FamiliarRequest, measure_familiar
-from flows.training.train import joined_split, train_weights
-from flows.training.train_command import run_train, usual_crop
+from flows.training.familiarity import FamiliarRequest, measure_familiar
+from flows.training.train import joined_split, run_train, train_weights, usual_crop
 from flows.training.train_scenes import TrainRequest, suggested_patch
 from models.evaluation.expected_scores import MapScores
 from models.network.sizes import PRESETS, Preset
 from models.training.start_weights import StartFile
 from models.training.train import TrainingSettings
-from models.weights.familiar_files import MAP_SCORES, familiar_path, load_familiar
+from models.weights.companion_files import MAP_SCORES, TrainedOn, familiar_path, load_familiar
 from models.weights.files import describe_weights, load_any_weights, load_weights
-from models.weights.trained_on import TrainedOn
 from pipeline.errors import SceneError, SettingsError, WeightsError
 from tests.flows.small_fields import write_field
 

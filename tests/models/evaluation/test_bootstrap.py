@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from models.evaluation.bootstrap import paired_interval
-from models.evaluation.metrics import mean_iou
+from models.evaluation.metrics import mean_iou, paired_interval
 from pipeline.errors import ShapeError
 
 

@@ -9,8 +9,7 @@ import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
-from models.network.cost import control_multiply_adds
-from models.network.sizes import PRESETS
+from models.network.sizes import PRESETS, control_multiply_adds
 from models.reading import control_maps
 from models.reading.control_maps import draw_with_control
 from models.reading.inference import CoarseLook, look_coarsely

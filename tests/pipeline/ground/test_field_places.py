@@ -1,22 +1,36 @@
-"""Where fields lie: ground summed by the numbers of their pixels, whoever knows how large these are."""
+"""Where fields lie and how large they are: ground by pixels' numbers, hand-worked figures and what joins them."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 from affine import Affine
+from hypothesis import given
+from hypothesis import strategies as st
 from odc.geo.geobox import GeoBox
 
-from pipeline.errors import ShapeError
+from pipeline.errors import PoseError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.ground.field_places import NoPlace, PlacedPicture, PosedField, areas_by_number
+from pipeline.ground.field_places import (
+    NoPlace,
+    PlacedPicture,
+    PosedField,
+    areas_by_number,
+    field_of_view_deg,
+    footprint_of,
+    scale_of_angles,
+    scale_of_pixels,
+    scale_of_view,
+)
 from pipeline.ground.georeference import class_areas_m2
 from pipeline.ground.map_grid import ground_grid
-from tests.pipeline.ground.test_ground import view
+from pipeline.ground.view import GroundView, RigPose, pixel_places
+from tests.pipeline.ground.test_view import view
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 SHAPE = (600, 30)  # more rows than are taken at once
 CLASSES = np.random.default_rng(0).choice(np.array([0, 2, UNLABELLED], np.uint8), SHAPE)
+IFOV = 1e-4
 
 
 def test_before_a_rig_they_are_those_of_the_map_on_the_ground() -> None:
@@ -41,3 +55,75 @@ def test_numbers_outside_are_left_out_and_unknown_ground_is_none() -> None:
     assert areas_by_number(NoPlace((2, 3)), numbers, 2) is None
     with pytest.raises(ShapeError, match=r"field of \(2, 3\) px \(y, x\), got \(3, 2\)"):
         areas_by_number(NoPlace((2, 3)), numbers.T, 2)
+
+
+def looking(tilt_deg: float, *, heading_deg: float = 30.0, roll_deg: float = 0.0, height_m: float = 12.0) -> GroundView:
+    """A rig of 0.1 mrad a pixel above level ground."""
+    pose = RigPose(
+        lon_deg=9.5, lat_deg=52.1, heading_deg=heading_deg, tilt_deg=tilt_deg, roll_deg=roll_deg, height_m=height_m
+    )
+    return GroundView(pose, IFOV)
+
+
+def test_straight_down_a_field_is_its_pixels_times_their_side():
+    """From 100 m, pixels of 0.1 mrad are 1 cm: 400 x 600 of them are 4 x 6 m, 1 ha an hour in 8.64 s."""
+    found = scale_of_view(looking(90, height_m=100), (400, 600))
+    assert found.footprint is not None
+    assert found.pixel_m == pytest.approx(0.01)
+    assert (found.footprint.width_m, found.footprint.depth_m) == pytest.approx((6, 4))
+    assert found.area_m2 == pytest.approx(24)
+    assert found.footprint.range_m[0] == pytest.approx(100)
+    assert found.hectares_per_hour(8.64) == pytest.approx(1)
+
+
+def test_the_range_is_that_of_the_slanted_ray():
+    """At 30 deg below the horizon the ground lies twice as far away as the rig is high."""
+    near, middle, far = footprint_of(looking(30), (21, 21)).range_m
+    assert near < middle < far
+    assert middle == pytest.approx(24, rel=1e-4)
+
+
+@given(tilt=st.floats(15, 90), heading=st.floats(-360, 360), roll=st.floats(-20, 20))
+def test_the_footprint_is_as_large_as_its_pixels_together(tilt: float, heading: float, roll: float):
+    """Sum of the pixels' areas and area within the corners agree, whichever way the rig looks."""
+    view, shape = looking(tilt, heading_deg=heading, roll_deg=roll), (60, 90)
+    places = np.stack(np.meshgrid(*pixel_places(shape), indexing="ij"), axis=-1)
+    found = footprint_of(view, shape)
+    assert found.area_m2 == pytest.approx(float(view.area_m2(places).sum()), rel=1e-4)
+    assert found.area_m2 <= found.width_m * found.depth_m * (1 + 1e-9)
+
+
+@given(tilt=st.floats(15, 90), turn=st.floats(-360, 360))
+def test_turning_the_rig_changes_nothing_but_where_it_looks(tilt: float, turn: float):
+    """Width, depth, area and range are of the view, not of the compass."""
+    one, other = (footprint_of(looking(tilt, heading_deg=heading), (80, 50)) for heading in (0, turn))
+    assert (other.width_m, other.depth_m, other.area_m2) == pytest.approx((one.width_m, one.depth_m, one.area_m2))
+    assert other.range_m == pytest.approx(one.range_m)
+
+
+def test_a_view_of_the_horizon_ends_where_the_map_does():
+    """A field that goes beyond the horizon has a finite footprint, of the part that is mapped."""
+    found = footprint_of(looking(1), (800, 400))
+    assert np.isfinite(found.outline_m).all()
+    assert found.range_m[2] < 100 * 12 / np.tan(np.deg2rad(1))
+
+
+def test_without_a_place_there_are_degrees_alone():
+    """Who knows no distance gets pixels and angles, and no hectares."""
+    found = scale_of_angles((512, 640), IFOV)
+    assert found.view_deg == field_of_view_deg((512, 640), IFOV)
+    assert found.view_deg[1] == pytest.approx(np.rad2deg(2 * np.arctan(0.032)))
+    assert (found.pixel_m, found.hectares, found.hectares_per_hour(10)) == (None,) * 3
+
+
+def test_a_picture_with_a_pixel_size_has_its_area():
+    """A georeferenced scene of 100 x 200 px of half a metre is half a hectare."""
+    found = scale_of_pixels((100, 200), IFOV, 0.5)
+    assert found.hectares == pytest.approx(0.5)
+    assert found.hectares_per_hour(0) is None
+
+
+def test_a_rig_that_looks_up_has_no_footprint():
+    """The message says where to tilt."""
+    with pytest.raises(PoseError, match="tilt it further down"):
+        footprint_of(looking(-30), (50, 50))

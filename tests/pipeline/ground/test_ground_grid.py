@@ -21,7 +21,7 @@ from pipeline.ground.map_grid import (
     round_step,
 )
 from pipeline.ground.view import pixel_places
-from tests.pipeline.ground.test_ground import view
+from tests.pipeline.ground.test_view import view
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 

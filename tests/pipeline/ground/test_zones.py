@@ -16,9 +16,8 @@ from odc.geo.geobox import GeoBox
 from pipeline.geometry.grid import SceneGrid
 from pipeline.ground.field_places import NoPlace, PlacedPicture, PosedField
 from pipeline.ground.map_grid import ground_grid
-from pipeline.ground.plot_figures import figures_of_plots
 from pipeline.ground.view import GroundView, RigPose
-from pipeline.ground.zones import field_zones, on_field, pixels_inside
+from pipeline.ground.zones import field_zones, figures_of_plots, on_field, pixels_inside
 
 SHAPE = (60, 80)
 corners = st.lists(st.tuples(st.floats(-20, 100), st.floats(-20, 80)), min_size=3, max_size=8)

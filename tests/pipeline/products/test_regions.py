@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.products.outlines import class_polygons, outline_regions
-from pipeline.products.regions import find_regions, grow_class, merge_small
+from pipeline.products.regions import class_polygons, find_regions, grow_class, merge_small, outline_regions
 
 Classes = NDArray[np.uint8]
 maps = arrays(np.uint8, array_shapes(min_dims=2, max_dims=2, max_side=14), elements=st.sampled_from([0, 1, 2, 255]))

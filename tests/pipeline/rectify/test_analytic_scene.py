@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Axis, Sweep
 from pipeline.planning.coverage import on_scene
-from pipeline.rectify.calibration.calibrate import calibrate
+from pipeline.rectify.calibrate import calibrate
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.lookup import grid_points, lookup
 from pipeline.rectify.mosaic import MosaicPart, edge_distance, mosaic

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from pipeline.errors import PoseError, RigError, ShapeError
 from pipeline.geometry.mirror import mirror_throughput
-from pipeline.rectify.calibration.calibrate import calibrate, judge_elements, of_bands, reflectance
-from pipeline.rectify.calibration.detector import BadElementCriteria, find_bad_elements
+from pipeline.rectify.calibrate import calibrate, judge_elements, of_bands, reflectance
+from pipeline.rectify.detector import BadElementCriteria, find_bad_elements
 from pipeline.source import References
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, rotate
 
-from pipeline.rectify.registration.field_shift import FieldShift, field_shift
+from pipeline.rectify.registration.alignment import FieldShift, field_shift
 
 SIZE = (120, 150)
 REACH = 12.0

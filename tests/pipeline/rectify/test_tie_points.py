@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from pipeline.errors import SettingsError
 from pipeline.rectify.lookup import track_lookup
-from pipeline.rectify.tie_points import tie_table
+from pipeline.rectify.placed import tie_table
 from pipeline.rectify.tracks import Track, make_tracks
 from tests.pipeline.rectify.aiming import CAMERA, aim
 

@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import PoseError, SettingsError, ShapeError
-from pipeline.rectify.line_numbers import number_lines
-from pipeline.rectify.tracks import Track, line_centres, make_tracks, single_track
+from pipeline.rectify.tracks import Track, line_centres, make_tracks, number_lines, single_track
 from tests.pipeline.rectify.aiming import CAMERA, aim
 
 STEPS = st.lists(st.sampled_from([-3.0, -1.0, 0.0, 0.1, 1.0, 1.0, 1.2, 4.0]), min_size=0, max_size=60)

@@ -12,19 +12,19 @@ from hypothesis import strategies as st
 
 from models.reading.remembered import FAINTEST as FAINTEST_BELIEVED
 from pipeline.errors import ChunkError, IncompleteStoreError, ShapeError
-from storage.arrays.beliefs import (
+from storage.arrays.class_maps import (
     DAY_STEP,
     FAINTEST,
     NOTHING,
     STEP,
     BeliefStore,
+    ClassNames,
     create_belief,
     drop_changes,
     write_belief_tile,
     write_changes,
     write_changes_tile,
 )
-from storage.arrays.class_maps import ClassNames
 
 LEGEND = ClassNames(("soil", "maize", "weed"), np.arange(9, dtype=np.uint8).reshape(3, 3))
 SHAPE = (70, 50)

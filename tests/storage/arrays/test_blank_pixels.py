@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from storage.arrays.blank_pixels import NO_VALUE, blank_coarse, blank_pixels
+from storage.arrays.layout import NO_VALUE, blank_coarse, blank_pixels
 from storage.arrays.mosaics import MosaicWriter, load_mosaic
 
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pipeline.errors import IncompleteStoreError, ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_position, scene_to_direction
-from pipeline.rectify.tie_points import TieTable, tie_table
+from pipeline.rectify.placed import TieTable, tie_table
 from pipeline.rectify.tracks import Track, make_tracks
 from storage.arrays.lookups import open_lookup, path_digest, write_lookup
 

@@ -14,7 +14,6 @@ from pyproj import CRS
 
 from pipeline.errors import ChunkError, IncompleteStoreError, PoseError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
-from storage.arrays.blank_pixels import NO_CLASS, blank_pixels
 from storage.arrays.class_maps import (
     ClassMap,
     ClassNames,
@@ -25,7 +24,15 @@ from storage.arrays.class_maps import (
 )
 from storage.arrays.georeference import ON_THE_MAP, load_geobox, map_attributes, write_map_coordinates
 from storage.arrays.ground_maps import BLOCK, GroundMapWriter, load_ground_map
-from storage.arrays.layout import SHARD_COLUMNS, SHARD_ROWS, AngularGrid, create_group, write_image
+from storage.arrays.layout import (
+    NO_CLASS,
+    SHARD_COLUMNS,
+    SHARD_ROWS,
+    AngularGrid,
+    blank_pixels,
+    create_group,
+    write_image,
+)
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 LEGEND = ClassNames(("sugar beet", "bare soil"), np.array([[10, 200, 30], [120, 90, 60]], np.uint8))

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from pipeline.rectify.calibration.detector import find_bad_elements
+from pipeline.rectify.detector import find_bad_elements
 from pipeline.rig.camera.camera_texts import times_of_lines
 from storage.readers.headwall_folders import load_frame_index
 from storage.readers.scan_files import open_cube_source

@@ -14,10 +14,9 @@ import serial
 from pipeline.errors import RigError, SettingsError
 from pipeline.rig.device_settings import MirrorSettings
 from pipeline.rig.devices import SYSTEM_CLOCK, DeadlinePassed, DeviceGone
-from pipeline.rig.emulator.emulated_rig import FastClock
+from pipeline.rig.emulator.emulated_rig import EmulatedPort, FastClock
 from pipeline.rig.emulator.fault_names import make_fault
 from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.emulator.mirror_ports import EmulatedPort
 from pipeline.rig.mirror.mirror_controller import open_mirror
 from tests.pipeline.rig.in_process import InProcessTransport, ManualClock
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from models.network.device import choose_device
+from models.network.machine import choose_device
 from models.network.segmenter import Segmenter, SegmenterConfig
 from models.training.examples import Batch
 from models.training.objective import PHASES, draw_seats

@@ -8,9 +8,8 @@ import pytest
 import torch
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
-from models.network.cost import multiply_adds
 from models.network.segmenter import Segmenter
-from models.network.sizes import SegmenterConfig
+from models.network.sizes import SegmenterConfig, multiply_adds
 from models.policies.policies import score_multiply_adds
 from pipeline.geometry.grid import SceneGrid
 

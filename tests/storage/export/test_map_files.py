@@ -1,4 +1,4 @@
-"""Task data, read again by a library that did not write them and held against the classes made of ISO's schema."""
+"""Task data, read again by a library that did not write them and held against ISO's schema; and QGIS styles."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -15,11 +16,23 @@ from isoxml.models.ddi_entities import DDEntity
 from isoxml.util.isoxml_io import isoxml_from_path
 
 from pipeline.errors import SettingsError
-from storage.export.task_data import UNITS, TaskGrid, TaskWords, write_task_data
+from storage.export.map_files import (
+    REDS,
+    UNITS,
+    TaskGrid,
+    TaskWords,
+    ramp_colour,
+    write_class_style,
+    write_colour_style,
+    write_polygon_style,
+    write_ramp_style,
+    write_task_data,
+)
 
 DOSES = np.array([[0.0, 2.5, np.nan], [200.0, 0.0, 0.01]])
 GRID = TaskGrid(51.960197927, -7.600100835, 2.7e-05, 4.4e-05, DOSES, UNITS["l/ha"])
 WORDS = TaskWords("spot spraying of the northern field", "north", "weed 2.5 l/ha", "0.1.0", 12_345.6)
+ENTRIES = [(0, "soil & stones", (158, 119, 82)), (7, 'weed "wild"', (220, 30, 30))]
 
 
 def schema_problems(found: Any, of: str = "") -> Iterator[str]:
@@ -87,3 +100,49 @@ def test_a_dose_beyond_the_format_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match="doses up to 214748 l/ha, got 300000"):
         write_task_data(tmp_path, replace(GRID, doses=np.array([[3e5]])), WORDS)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_classes_have_names_and_colours(tmp_path: Path) -> None:
+    """A palette's entries by number; letters that XML keeps for itself come back."""
+    write_class_style(tmp_path / "a.qml", ENTRIES)
+    root = ElementTree.parse(tmp_path / "a.qml").getroot()
+    assert root.tag == "qgis"
+    found = [dict(entry.attrib) for entry in root.iterfind("pipe/rasterrenderer[@type='paletted']/colorPalette/*")]
+    assert [(one["value"], one["label"], one["color"]) for one in found] == [
+        ("0", "soil & stones", "#9e7752"),
+        ("7", 'weed "wild"', "#dc1e1e"),
+    ]
+
+
+def test_ramps_go_from_low_to_high(tmp_path: Path) -> None:
+    """Values evenly apart, the outer ones those given; three bands by their numbers with one range."""
+    write_ramp_style(tmp_path / "a.qml", -0.5, 1.5, REDS)
+    items = list(ElementTree.parse(tmp_path / "a.qml").iterfind(".//colorrampshader/item"))
+    assert [(float(item.attrib["value"]), item.attrib["color"]) for item in items][::2] == [
+        (-0.5, "#ffebcd"),
+        (1.5, "#960014"),
+    ]
+    write_colour_style(tmp_path / "a.qml", (7, 4, 1), 0.1, 0.6)
+    (renderer,) = ElementTree.parse(tmp_path / "a.qml").iterfind("pipe/rasterrenderer")
+    assert [renderer.attrib[f"{name}Band"] for name in ("red", "green", "blue")] == ["7", "4", "1"]
+    assert {one.text for one in renderer.iterfind("*/maxValue")} == {"0.6"}
+
+
+def test_polygons_have_a_symbol_each(tmp_path: Path) -> None:
+    """Every category of the column leads to a symbol with its colour."""
+    write_polygon_style(tmp_path / "a.qml", "dose", [(0.0, "none", (215, 215, 215)), (2.5, "2.5 l/ha", (150, 0, 20))])
+    (renderer,) = ElementTree.parse(tmp_path / "a.qml").iterfind("renderer-v2[@attr='dose']")
+    found = {}
+    for category in renderer.iterfind("categories/category"):
+        symbol = renderer.find(f"symbols/symbol[@name='{category.attrib['symbol']}']")
+        assert symbol is not None
+        colour = symbol.find(".//Option[@name='color']")
+        assert colour is not None
+        found[float(category.attrib["value"])] = colour.attrib["value"]
+    assert found == {0.0: "215,215,215,255", 2.5: "150,0,20,255"}
+
+
+@pytest.mark.parametrize(("share", "colour"), [(0, REDS[0]), (0.5, REDS[1]), (1, REDS[2]), (2, REDS[2]), (-1, REDS[0])])
+def test_a_ramp_meets_its_colours(share: float, colour: tuple[int, ...]) -> None:
+    """At its ends and in its middle; beyond the ends those stay."""
+    assert ramp_colour(share, REDS) == colour

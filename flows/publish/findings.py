@@ -1,0 +1,230 @@
+"""What a run finds: hectares of each class, what changed, what is old; its zones and plots; what its map says."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.settings.values import LOOK_WHOLE
+from flows.survey.memory import told_of_memory
+from flows.survey.run import SurveyRun
+from flows.survey.stages.maps import strange_pixels
+from flows.terminal.figures import area_words, counted, format_count, format_percent
+from models.evaluation.expected_scores import expected_counts
+from pipeline.geometry.grid import UNLABELLED
+from pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace, areas_by_number
+from pipeline.ground.georeference import class_areas_m2, crs_name, pixel_side_m
+from pipeline.ground.zones import figures_of_plots
+from storage.archive.keys import StageRef
+from storage.arrays.class_maps import BeliefStore, ClassMap
+from storage.arrays.ground_maps import GroundMap
+
+OLDER_DAYS = (1, 7, 30)  # since a look, of which the hectares are told
+MOST_CHANGES = 4  # told in words
+PLOTS_FILE = "plots.csv"
+LEADING = 3  # classes of a plot that are told in words
+FOREIGN = 0.2  # share of a map that is unknown from which on its weights are the wrong ones
+STRIP_ROWS = 256  # of a belief that are read at a time
+
+
+def find_ground(run: SurveyRun, posed: GroundMap | None, found: ClassMap, belief: BeliefStore) -> dict[str, Any]:
+    """``ground``: grid, hectares of each class, what changed and what is old. Empty where nobody says where it lies."""
+    told = placed_findings(run, found) if posed is None else posed_findings(posed)
+    if told is None:
+        return {}
+    place, drawn = run.zones.place, found.classes != UNLABELLED
+    told |= {"older_ha": older_hectares(place, np.where(drawn, belief.age(), np.nan))}
+    if (old_class := belief.old_class()) is not None:
+        told |= {"changes_ha": changed_hectares(place, old_class, found)}
+    return {"ground": told}
+
+
+def posed_findings(drawn: GroundMap) -> dict[str, Any]:
+    """Of a survey with a pose: the map that was drawn on the ground."""
+    return {
+        "crs": crs_name(drawn.geobox),
+        "resolution_m": abs(float(drawn.geobox.resolution.x)),
+        "shape": [int(size) for size in drawn.geobox.shape],
+        "areas_ha": {name: area["ha"] for name, area in drawn.areas.items()},
+    }
+
+
+def placed_findings(run: SurveyRun, found: ClassMap) -> dict[str, Any] | None:
+    """Of a survey whose scene's file says where it lies: the class map itself; None where it does not.
+
+    Hectares are of the ellipsoid, not of the map's plane.
+    """
+    geobox = run.scene.geobox
+    if geobox is None:
+        return None
+    areas = class_areas_m2(geobox, found.classes, len(found.names)) / M2_PER_HECTARE
+    return {
+        "crs": crs_name(geobox),
+        "resolution_m": pixel_side_m(geobox),
+        "shape": [int(size) for size in geobox.shape],
+        "areas_ha": dict(zip(found.names, areas.tolist(), strict=True)),
+    }
+
+
+def older_hectares(place: FieldPlace, age_days: NDArray[np.float32]) -> dict[str, float]:
+    """Hectares of (y, x) pixels that were looked at longer ago than each of `OLDER_DAYS`, by these; NaN is left out."""
+    passed = np.searchsorted(OLDER_DAYS, age_days, side="left")  # how many of them an age is above
+    areas = areas_by_number(place, np.where(np.isnan(age_days), -1, passed), len(OLDER_DAYS) + 1)
+    assert areas is not None
+    above = areas[::-1].cumsum()[::-1][1:] / M2_PER_HECTARE
+    return {str(days): area for days, area in zip(OLDER_DAYS, above.tolist(), strict=True)}
+
+
+def changed_hectares(place: FieldPlace, old_class: NDArray[np.uint8], found: ClassMap) -> list[list[Any]]:
+    """Hectares, class before and class now of the (y, x) pixels that changed, largest first; 255 did not change."""
+    count = len(found.names)
+    changed = (old_class != UNLABELLED) & (found.classes != UNLABELLED)
+    pairs = np.where(changed, old_class.astype(np.int64) * count + found.classes, -1)
+    areas = areas_by_number(place, pairs, count**2)
+    assert areas is not None
+    largest = [pair for pair in np.argsort(-areas, kind="stable").tolist() if areas[pair] > 0]
+    names = found.names
+    return [[float(areas[pair]) / M2_PER_HECTARE, names[pair // count], names[pair % count]] for pair in largest]
+
+
+def ground_words(ground: Mapping[str, Any]) -> str:
+    """What the classes cover on the ground, what of it changed, and what was not looked at for long."""
+    areas = [f"{_spaced(name)} {area_words(area)}" for name, area in ground["areas_ha"].items() if area]
+    place = f"{ground['crs']}, {ground['resolution_m']:.4g} m a pixel"
+    words = [f"On the ground ({place}) the classes cover {', '.join(areas)}."]
+    if changes := ground.get("changes_ha"):
+        told = [f"{_spaced(old)} to {_spaced(new)} {area_words(area)}" for area, old, new in changes[:MOST_CHANGES]]
+        whole = area_words(sum(area for area, _, _ in changes))
+        words.append(f"Of it {whole} changed since the look before: {', '.join(told)}.")
+    older = {int(days): area for days, area in ground.get("older_ha", {}).items() if area}
+    if older:
+        ago = [f"{area_words(area)} more than {counted(days, 'day')} ago" for days, area in older.items()]
+        words.append(f"Last looked at: {', '.join(ago)}.")
+    return " ".join(words)
+
+
+def _spaced(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def find_zones(run: SurveyRun, drawn: ClassMap) -> dict[str, Any]:
+    """``zones``: how much of the field is kept to; ``plots``: a row each. Empty for a survey without either."""
+    zones, found = run.zones, dict[str, Any]()
+    if zones.kept is not None:
+        kept = zones.kept.kept
+        found["zones"] = {
+            "kept_px": int(np.count_nonzero(kept)),
+            "field_px": kept.size,
+            "no_go_px": 0 if zones.kept.no_go is None else int(np.count_nonzero(zones.kept.no_go)),
+            "kept_m2": _ground_m2(run, kept),
+        }
+    if zones.plots is not None:
+        rows = figures_of_plots(zones.plots, zones.place, drawn.classes, drawn.confidence, drawn.names)
+        found["plots"] = [asdict(row) for row in rows]
+    return found
+
+
+def _ground_m2(run: SurveyRun, kept: NDArray[np.bool_]) -> float | None:
+    rows, columns = (slice(0, size) for size in kept.shape)
+    areas = run.zones.place.pixel_areas_m2(rows, columns)
+    return None if areas is None else float(np.nansum(areas[kept]))
+
+
+def zone_words(zones: Mapping[str, Any]) -> str:
+    """How much of the field a survey kept to."""
+    ground = "" if zones["kept_m2"] is None else f", {area_words(zones['kept_m2'] / M2_PER_HECTARE)}"
+    share = format_percent(zones["kept_px"] / zones["field_px"])
+    no_go = f"; no-go zones touch {format_count(zones['no_go_px'])} px" if zones["no_go_px"] else ""
+    return (
+        f"The survey keeps to {format_count(zones['kept_px'])} px, {share} of the field{ground}{no_go}. Of the rest "
+        "no detail was asked for and no map is drawn."
+    )
+
+
+def plot_rows(plots: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+    """The table of plots in words: name, ground, leading classes, confidence."""
+    return [
+        {
+            "plot": plot["plot"],
+            "area": f"{format_count(plot['pixels'])} px"
+            if plot["area_m2"] is None
+            else area_words(plot["area_m2"] / M2_PER_HECTARE),
+            "classes": _leading(plot["shares"]) if plot["mapped_pixels"] else "not mapped",
+            "confidence": format_percent(plot["confidence"]),
+        }
+        for plot in plots
+    ]
+
+
+def _leading(shares: Mapping[str, float | None]) -> str:
+    """The classes that cover most of a plot."""
+    known = [(share, name) for name, share in shares.items() if share]
+    most = sorted(known, key=lambda one: -one[0])[:LEADING]
+    return ", ".join(f"{name.replace('_', ' ')} {format_percent(share)}" for share, name in most)
+
+
+def plots_csv(plots: Sequence[Mapping[str, Any]]) -> str:
+    """Every figure of every plot, a row each; empty where nothing is known."""
+    names = list(plots[0]["shares"]) if plots else []
+    head = ["plot", "pixels", "mapped_pixels", "area_m2", "confidence"]
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow([*head, *(f"share_{name}" for name in names)])
+    for plot in plots:
+        cells = [*(plot[name] for name in head), *(plot["shares"][name] for name in names)]
+        table.writerow(["" if cell is None else cell for cell in cells])
+    return text.getvalue()
+
+
+def find_map(run: SurveyRun, ref: StageRef, drawn: ClassMap) -> dict[str, Any]:
+    """Findings of a map in the stage ``ref``: ``unknown``, ``pixels`` and ``expected``, each where there is one."""
+    found: dict[str, Any] = {}
+    unclassed, share = drawn.classes == UNLABELLED, 0.0
+    if (rate := run.settings.unknown_rate) is not None and run.familiar is not None:
+        count = int(np.count_nonzero(drawn.classes == run.described.config.classes))
+        told_pixels = int(np.count_nonzero(~unclassed))
+        share = count / told_pixels if told_pixels else 0.0
+        found["unknown"] = {"pixels": count, "share": share, "rate": rate}
+    if run.zones.left_out is not None:
+        unclassed &= ~run.zones.left_out
+    pixels = {
+        "scene_without_a_value": run.scene.filled_px,
+        "coarse_px_no_reading": 0,
+        "fine_px_no_reading": 0,
+        **{f"{name}_no_reading": count for name, count in strange_pixels(ref).items()},
+        "map_without_a_class": int(np.count_nonzero(unclassed)),
+    }
+    if any(pixels.values()):
+        found["pixels"] = pixels
+    expected = None if share > FOREIGN else _expected(run, ref)
+    return found if expected is None else found | {"expected": expected}
+
+
+def _expected(run: SurveyRun, ref: StageRef) -> dict[str, Any] | None:
+    """What the map is likely to score by what it says of itself; None where nobody knows how such comes true.
+
+    That is known of maps of plain scans that are read whole, without a memory.
+    """
+    settings, step = run.settings, run.settings.scan_step
+    memory = told_of_memory(ref.path)
+    remembers = memory is not None and memory["put_aside"] is None
+    if run.map_scores is None or step is None or settings.look != LOOK_WHOLE or run.budget is not None or remembers:
+        return None
+    names = run.described.class_names
+    counts = expected_counts(_strips(BeliefStore(ref.path / "belief.zarr")), len(names))
+    score = run.map_scores.expected(counts, step, settings.scan_exposure_ms or run.camera.exposure_ms)
+    if score is None or not np.isfinite(score.miou):
+        return None
+    of_classes = {name: float(iou) for name, iou in zip(names, score.per_class_iou, strict=True) if np.isfinite(iou)}
+    return {"miou": score.miou, "error": score.error, "per_class_iou": of_classes}
+
+
+def _strips(belief: BeliefStore) -> Iterator[NDArray[np.float32]]:
+    for top in range(0, belief.shape[0], STRIP_ROWS):
+        yield belief.read(slice(top, min(top + STRIP_ROWS, belief.shape[0])))[0]

@@ -1,1 +1,0 @@
-"""From raw numbers to scene values: dark and white frames, detector pixels, the light of each sweep."""

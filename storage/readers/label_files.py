@@ -1,0 +1,306 @@
+"""Which label file belongs to which image, by their names alone, and the names of classes that lie beside label files.
+
+Labels lie beside their images (``001_mask.png``, ``field_a_labels.png``) or in a folder of labels there, or beside a
+folder of images (``labels/001.png``, ``annotations/001_annotation.png``); names are equal, or but for a word such as
+``_mask``. Upper and lower case are alike.
+
+Names of classes come as a list in a text file, as JSON, and as GDAL, QGIS and ENVI write them. Each is read leniently,
+as people write them: ``1 crop``, ``crop: 1``, ``crop, 0, 255, 0``, ``#00ff00 crop``, or names alone, in the order of
+their numbers.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+from pipeline.errors import SceneError
+from storage.readers.envi_cubes import find_envi_pair, load_envi_header
+from storage.readers.raster_files import SCENE_ENDINGS
+from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, is_image_folder
+
+LABEL_WORDS = ("mask", "masks", "label", "labels", "annotation", "annotations", "gt", "groundtruth", "truth", "seg")
+LABEL_FOLDERS = {*LABEL_WORDS, "ground_truth", "segmentation", "segmentations", "targets", "labelimages"}
+IMAGE_WORDS = ("image", "img", "rgb", "picture", "photo", "scene", "ortho", "cube")
+SHOWN = 5  # names in a message
+STEMS = ("classes", "class_names", "classnames", "labels", "label_names", "legend", "categories", "class_dict", "names")
+TEXTS, TABLES = (".txt", ".csv", ".tsv"), (".json",)
+MOST_BYTES = 1 << 20  # of a legend
+_HEX = re.compile(r"^#?([0-9a-fA-F]{6})$")
+
+
+def _word_at_an_end(words: Sequence[str]) -> re.Pattern[str]:
+    either = "|".join(words)
+    return re.compile(rf"^(?:{either})[_\-. ]+|[_\-. ]+(?:{either})$")
+
+
+_LABEL_WORD, _IMAGE_WORD = _word_at_an_end(LABEL_WORDS), _word_at_an_end(IMAGE_WORDS)
+
+
+@dataclass(frozen=True)
+class MatchedFiles:
+    """Images of a folder, and the label files that belong to them."""
+
+    images: tuple[Path, ...]
+    labels: dict[Path, Path]  # of an image
+    alone: tuple[Path, ...]  # label files without an image
+
+    @property
+    def bare(self) -> tuple[Path, ...]:
+        """Images without labels."""
+        return tuple(image for image in self.images if image not in self.labels)
+
+
+def scene_entries(folder: Path) -> list[Path]:
+    """Files and Zarr stores of a folder that may be scenes or labels, by name; hidden ones are nobody's."""
+    return sorted(
+        entry
+        for entry in folder.iterdir()
+        if not entry.name.startswith(".")
+        and ((entry.suffix.lower() in SCENE_ENDINGS and entry.is_file()) or _is_store(entry))
+    )
+
+
+def image_folder(folder: Path) -> Path:
+    """Where the images of a folder lie: in a folder ``images`` in it, where there is one, or in itself."""
+    inner = sorted(entry for entry in folder.iterdir() if is_image_folder(entry) and entry.is_dir())
+    return next((entry for entry in inner if entry.name == "images"), inner[0] if inner else folder)
+
+
+def match_folder(folder: Path) -> MatchedFiles:
+    """Match the images of a folder to their labels.
+
+    Raises SceneError: several files may be an image's labels, or one those of several images; both are named.
+    """
+    own = scene_entries(folder)
+    apart = _in_label_folders(folder)
+    beside = [entry for entry in own if is_label_name(entry)]
+    images = [entry for entry in own if entry not in beside]
+    if not images:  # a folder of labels is asked for as such: they are what there is
+        images, beside = own, []
+    labels = {image: found for image in images if (found := _label_of(image, [*beside, *apart])) is not None}
+    if len(images) == len([*beside, *apart]) == 1:  # they need no name to belong together
+        labels = dict(zip(images, [*beside, *apart], strict=True))
+    _refuse_shared(labels)
+    alone = tuple(entry for entry in (*beside, *apart) if entry not in set(labels.values()))
+    return MatchedFiles(tuple(images), labels, alone)
+
+
+def find_label(scene: Path) -> Path | None:
+    """The label file of one scene by its name; None where there is none (SceneError: there are several)."""
+    if not scene.parent.is_dir() or (scene.is_dir() and not _is_store(scene)):
+        return None
+    try:
+        beside = [entry for entry in scene_entries(scene.parent) if is_label_name(entry) and entry != scene]
+        return _label_of(scene, [*beside, *_in_label_folders(scene.parent)])
+    except PermissionError:  # who may read the file need not be allowed to list the folder
+        return None
+
+
+def is_label_name(path: Path) -> bool:
+    """Whether a file's name says that it holds labels: ``001_mask.png``, ``labels.png``."""
+    stem = path.stem.lower()
+    return stem in LABEL_WORDS or _LABEL_WORD.search(stem) is not None
+
+
+def folders_within(folder: Path) -> str:
+    """Words for the folders of a folder in which images lie, for whoever looks for some; nothing where none does."""
+    inner = [entry for entry in sorted(folder.iterdir()) if entry.is_dir() and not _is_store(entry)]
+    found = [entry for entry in inner if not entry.name.startswith(".") and scene_entries(image_folder(entry))]
+    return f"; there are some in its folders {listed_names(found)}: name one" if found else ""
+
+
+def listed_names(paths: Iterable[Path]) -> str:
+    """The first names, and how many more there are."""
+    names = [path.name for path in paths]
+    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    return ", ".join(names[:SHOWN]) + more
+
+
+def _is_store(entry: Path) -> bool:
+    return entry.suffix.lower() == ".zarr" and entry.is_dir()
+
+
+def _in_label_folders(folder: Path) -> list[Path]:
+    """All that may be labels in folders of labels: in this one, or beside it where it is one of images."""
+    around = [folder, folder.parent] if is_image_folder(folder) else [folder]
+    found = [entry for place in around for entry in sorted(place.iterdir()) if entry.name.lower() in LABEL_FOLDERS]
+    return [entry for inner in found if inner.is_dir() and inner != folder for entry in scene_entries(inner)]
+
+
+def _label_of(image: Path, candidates: Sequence[Path]) -> Path | None:
+    """The one that has the image's name; without one, that differs by a word for images, too."""
+    stem = image.stem.lower()
+    for alike in (lambda name: name, lambda name: _IMAGE_WORD.sub("", name)):
+        wanted = alike(stem)
+        found = [one for one in candidates if wanted in (alike(one.stem.lower()), alike(_bare(one)))]
+        if len(found) > 1:
+            names = " and ".join(str(one) for one in found[:SHOWN])
+            home = image.parent.parent if is_image_folder(image.parent) else image.parent
+            told = Path(os.path.relpath(found[0].parent, home), found[0].name.replace(image.stem, "{name}", 1))
+            raise SceneError(
+                f"{image} has several files of labels by their names: {names}; keep one, or say which in a"
+                f' {SETTINGS_NAME}: labels = "{told.as_posix()}"'
+            )
+        if found:
+            return found[0]
+    return None
+
+
+def _bare(label: Path) -> str:
+    return _LABEL_WORD.sub("", label.stem.lower(), count=1)
+
+
+def _refuse_shared(labels: dict[Path, Path]) -> None:
+    owner: dict[Path, Path] = {}
+    for image, label in labels.items():
+        if label in owner:
+            raise SceneError(
+                f"{owner[label]} and {image} would both have the labels {label}, by their names; rename one of them, or"
+                f" say which files are labels in a {SETTINGS_NAME}"
+            )
+        owner[label] = image
+
+
+@dataclass(frozen=True)
+class Legend:
+    """Names by the value of their class in the label files, or in the order of their numbers where no value is told."""
+
+    path: Path
+    names: Mapping[ClassValue, str]
+    listed: tuple[str, ...] = ()
+
+    def name_of(self, value: ClassValue, place: int, values: Sequence[ClassValue]) -> str | None:
+        """The name of a value, the ``place``-th of the ``values`` that the files hold; None where none is told.
+
+        Names in a list without numbers are those of 0, 1, ...; where there are as many as values, of these in order.
+        """
+        if value in self.names:
+            return self.names[value]
+        if isinstance(value, int) and self.listed and max(v for v in values if isinstance(v, int)) < len(self.listed):
+            return self.listed[value]
+        return self.listed[place] if isinstance(value, int) and len(self.listed) == len(values) else None
+
+
+def find_legend(folders: Sequence[Path], labels: Sequence[Path]) -> Legend | None:
+    """The first legend beside the labels, or one that stands in or beside a label file; None where there is none."""
+    for label in labels[:1]:
+        for found in _of_label(label):
+            if found.names or found.listed:
+                return found
+    for folder in dict.fromkeys(folders):
+        for path in sorted(folder.iterdir()):
+            if path.stem.lower() in STEMS and path.suffix.lower() in (*TEXTS, *TABLES) and path.is_file():
+                legend = read_legend(path)
+                if legend is not None:
+                    return legend
+    return None
+
+
+def read_legend(path: Path) -> Legend | None:
+    """Read one legend; None where nothing in it names a class."""
+    if path.stat().st_size > MOST_BYTES:
+        return None
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        if path.suffix.lower() in TABLES:
+            pairs = list(_of_table(json.loads(text)))
+        else:
+            pairs = [pair for line in text.splitlines() if (pair := _of_line(line)) is not None]
+    except (ValueError, RecursionError):
+        return None
+    names = {value: name for value, name in pairs if value is not None}
+    listed = tuple(name for value, name in pairs if value is None)
+    return Legend(path, names, listed) if names or listed else None
+
+
+def _of_line(line: str) -> tuple[ClassValue | None, str] | None:
+    """Value and name of one line, in any order; None of a heading, a comment or an empty line."""
+    bare = line.strip()
+    if not bare or bare.startswith(("//", "__ignore__")) or (bare.startswith("#") and not _HEX.match(bare.split()[0])):
+        return None
+    parts = next(csv.reader([bare])) if "," in bare else re.split(r"[\t:;=]+", bare)
+    words = [word for part in parts for word in part.split()]
+    numbers = [int(word) for word in words if word.isdecimal()]
+    colours = [found[1] for word in words if (found := _HEX.match(word)) and not word.isdecimal()]
+    name = " ".join(w for w in words if not w.isdecimal() and not (_HEX.match(w) and w.startswith("#")))
+    if not name or name.lower().split()[0] in ("name", "class", "id", "r"):
+        return None
+    if len(numbers) >= 3 and max(numbers[-3:]) < 256:
+        return (numbers[-3], numbers[-2], numbers[-1]), name
+    if not numbers and colours and name != colours[0]:
+        return _colour(colours[0]), name
+    return (numbers[0] if numbers else None), name
+
+
+def _colour(hexadecimal: str) -> ClassValue:
+    red, green, blue = bytes.fromhex(hexadecimal)
+    return red, green, blue
+
+
+def _of_table(content: Any) -> Iterator[tuple[ClassValue | None, str]]:
+    """Pairs of value and name in what a JSON file holds, however they are put."""
+    if isinstance(content, dict):
+        inner = next((content[key] for key in ("classes", "categories", "labels", "legend") if key in content), None)
+        if isinstance(inner, dict | list):
+            yield from _of_table(inner)
+            return
+        for key, value in content.items():
+            if isinstance(value, str):
+                yield _value(key), value
+            elif (found := _value(value)) is not None:
+                yield found, str(key)
+    elif isinstance(content, list):
+        for entry in content:
+            if isinstance(entry, str):
+                yield None, entry
+            elif isinstance(entry, dict):
+                told = [entry.get(key) for key in ("color", "colour", "rgb", "id", "value", "index", "class")]
+                values = [found for one in told if (found := _value(one)) is not None]
+                name = entry.get("name", entry.get("label", entry.get("title")))
+                if isinstance(name, str):
+                    yield (values[0] if values else None), name
+
+
+def _value(told: Any) -> ClassValue | None:
+    if isinstance(told, bool):
+        return None
+    if isinstance(told, int):
+        return told
+    if isinstance(told, str):
+        found = _HEX.match(told)
+        return int(told) if told.isdecimal() else None if found is None else _colour(found[1])
+    if isinstance(told, list) and len(told) >= 3 and all(isinstance(one, int) and 0 <= one < 256 for one in told[:3]):
+        return told[0], told[1], told[2]
+    return None
+
+
+def _of_label(label: Path) -> Iterator[Legend]:
+    """What stands beside one label file: GDAL's .aux.xml, QGIS's .qml; of ENVI, what its header says."""
+    for path in (label.with_name(label.name + ".aux.xml"), label.with_suffix(".qml")):
+        if not path.is_file() or path.stat().st_size > MOST_BYTES:
+            continue
+        try:
+            root = ElementTree.fromstring(path.read_bytes())
+        except ElementTree.ParseError:
+            continue
+        listed = tuple((entry.text or "").strip() for entry in root.iter("Category"))
+        entries = [(entry.get("value", ""), entry.get("label", "")) for entry in root.iter("paletteEntry")]
+        yield Legend(
+            path,
+            {int(value): name for value, name in entries if value.isdecimal() and len(value) < 10 and name},
+            listed,
+        )
+    try:
+        header, _ = find_envi_pair(label)
+        told = load_envi_header(header).fields.get("class names", "") if header.is_file() else ""
+    except SceneError:
+        return
+    yield Legend(header, {}, tuple(name.strip() for name in told.split(",") if name.strip()))
