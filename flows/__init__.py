@@ -1,1 +1,1 @@
-"""Prefect flows and the command line: settings, survey, train, trade-offs, receipt and report."""
+"""What is done with a rig and an archive: verbs of the command line, surveys, what they publish, schedules."""

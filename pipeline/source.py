@@ -1,4 +1,4 @@
-"""Source: what the rig, the simulator and an archive have in common."""
+"""Source of raw lines: what the rig, the simulator and an archive have in common."""
 
 from __future__ import annotations
 

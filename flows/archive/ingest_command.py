@@ -41,7 +41,7 @@ def ingest(
     Parameters
     ----------
     source
-        ENVI header or data file, folder of a Headwall camera, GeoTIFF, .mat, .npy, PNG, or Zarr store.
+        ENVI header or data file, folder of a Headwall camera, GeoTIFF, .mat, .npy, .npz, PNG, JPEG, BMP, or Zarr store.
     name
         What the cube is called; the file's or folder's name by default.
     dark

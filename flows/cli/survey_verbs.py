@@ -79,7 +79,7 @@ NO_RENDERING_FLAGS = RenderingFlags()
 
 
 def survey(settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_json: AsJson = False) -> int:
-    """Survey a field: a coarse look at everything, then a fine look where it changes the map.
+    """Survey a field: by the scan that promises most for the seconds, or coarsely, then finely where that changes it.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def simulate(
     Parameters
     ----------
     scene
-        `farm` (built in; `farm@2`), or an image or cube file: PNG, JPEG, GeoTIFF, .npy, .npz, .mat,
+        `farm` (built in; `farm@2`), or an image or cube file: PNG, JPEG, BMP, GeoTIFF, .npy, .npz, .mat,
         ENVI, Zarr.
     out
         Archive for the raw cubes: a folder, or s3://bucket/prefix.

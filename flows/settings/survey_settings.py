@@ -64,7 +64,7 @@ WORKERS = "one process or thread each; leave it out for one a core"
 EPSG = "the number after EPSG:, such as 32632"
 REPLACED = {  # keys of before
     "optics.polarisation": 'the mirror\'s coating says it now: [mirror] coating = "aluminium"',
-    "rounds": "there is one round of detail: a second never paid (README, Limits) and was removed; leave it out",
+    "rounds": "there is one round of detail: a second never paid and was removed; leave it out",
 }
 
 
@@ -141,7 +141,7 @@ class Settings:
         example="2%",
     )
     scene: SceneName = stated(
-        "farm", "`farm` (built in; `farm@2`), or a file: PNG, JPEG, GeoTIFF, .npy, .npz, .mat, ENVI, Zarr"
+        "farm", "`farm` (built in; `farm@2`), or a file: PNG, JPEG, BMP, GeoTIFF, .npy, .npz, .mat, ENVI, Zarr"
     )
     labels: str | None = stated(
         None, "Class colours or numbers on the scene's pixels; accuracy is reported then", example="labels.png"

@@ -1,4 +1,4 @@
-"""Sealed files beside weights: what is familiar to them, with what they were trained on, and their memory's reader."""
+"""Sealed files beside weights: what is familiar, how what maps expect came true, and their reader of memories."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The two-axis mirror: device position, normal, view direction, and how the line turns. Closed forms, no trigonometry.
+"""The two-axis mirror: device position, normal, view direction, and how the line turns. Closed forms.
 
 Camera frame: the chief ray leaves along k = (0, 0, 1) and the undeflected scene direction is (1, 0, 0); y is the normal
 of the plane of incidence. Scene tangents are xi = o_y / o_x (along the line) and eta = o_z / o_x (the scan). The device
@@ -135,6 +135,8 @@ def line_rotation(direction: ArrayLike) -> Floats:
 
     A property of the pose and not of the path (erratum E8): psi = atan2(o_y, 1 - o_z), anticlockwise from xi to eta,
     for a slit along y. The line stays straight and runs along (cos psi, sin psi) in (xi, eta), exactly. [rad]
+
+    A survey never asks for it: `scan.points_of_scan` turns lines, and `line_centre` with `camera_slope` undo that.
 
     Raises PoseError: a direction is not finite, not of length 1, or is the camera's own ray.
     """

@@ -1,1 +1,1 @@
-"""Drivers of the real rig: bytes to and from devices. No files, no Prefect, no arrays on disk."""
+"""Drivers of the real rig: bytes to and from devices. No Prefect, no arrays on disk."""
