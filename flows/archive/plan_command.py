@@ -104,7 +104,7 @@ class Forecast:
     stages: list[StageForecast]
     refused: str | None = None
     scans: ScanChoice = field(default_factory=ScanChoice)
-    figures: Mapping[str, Any] = field(default_factory=dict)  # see `flows.publish.findings`
+    figures: Mapping[str, Any] = field(default_factory=dict)  # see `flows.archive.field_figures`
     kept: Mapping[str, Any] | None = None  # of a plain scan that is kept and read in part: at most, as receipts tell it
 
 

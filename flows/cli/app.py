@@ -1,12 +1,13 @@
-"""The application of the command line: where each verb stands, what verbs have in common, how they read lists."""
+"""The application of the command line: where each verb stands, what they share, how they read lists; completion."""
 
 from __future__ import annotations
 
 import ast
 import importlib.metadata
 import importlib.util
+import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from cyclopts import App, Parameter
 from rich.markup import escape
@@ -36,7 +37,7 @@ VERBS = {  # by what is typed: the module of the function, loaded once it is ask
     "train": "flows.cli.model_verbs",
     "evaluate": "flows.cli.model_verbs",
     "tradeoff": "flows.cli.model_verbs",
-    "completion": "flows.cli.completion",
+    "completion": "flows.cli.app",
 }
 GOES_ON = ("survey", "train", "evaluate", "export", "reprocess", "simulate", "serve")  # verbs that keep what is done
 stderr = on_stderr()
@@ -112,3 +113,17 @@ def parse_wholes(text: str | None, flag: str) -> list[int] | None:
         return None if text is None else [int(str(one)) for part in split_list(text) for one in numbers_of(part)]
     except ValueError:
         raise SettingsError(f"{flag} expects whole numbers with commas, got {text!r}") from None
+
+
+def completion(shell: Literal["bash", "zsh", "fish"]) -> int:
+    """Print a script by which SHELL completes verbs, flags and choices of spectralzoom.
+
+    For bash: spectralzoom completion bash > ~/.local/share/bash-completion/completions/spectralzoom
+
+    Parameters
+    ----------
+    shell
+        bash, zsh (as _spectralzoom in a folder of its fpath) or fish (in ~/.config/fish/completions).
+    """
+    sys.stdout.write(build_app(listed=False).generate_completion(prog_name="spectralzoom", shell=shell))
+    return 0

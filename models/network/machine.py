@@ -13,7 +13,6 @@ from pipeline.lazy import deferred
 if TYPE_CHECKING:
     import torch
 else:
-    torch = deferred("torch")
     torch = deferred("torch")  # a scan is simulated without
 
 Device = Literal["auto", "cpu", "cuda", "mps"]
