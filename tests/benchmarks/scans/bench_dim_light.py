@@ -100,7 +100,7 @@ def _rows_of(law: str, place: str, files: Sequence[Candidate]) -> list[Row]:
     if not bright or len(bright) != len(dim):
         return [Row(law, f"not run: {len(bright)} weights of full light and {len(dim)} of --darkest-ms, needs pairs")]
     data = open_frames(str(path), (), None, CAMERA, {})
-    scenes = [scene for scene in (scene_of(data, name) for name in data.train) if not _taught(scene, law, own)]
+    scenes = [scene for name in data.train if not _taught(scene := scene_of(data, name), name, law, own)]
     if not scenes:
         return [Row(law, "not run: the weights were trained on all of it, keep frames with --hold-out")]
     by_seed = [sorted(arm, key=lambda one: int(one.described.record["settings"]["seed"])) for arm in (bright, dim)]
@@ -116,8 +116,8 @@ def _reads_dim(one: Candidate) -> bool:
     return float(one.described.record["settings"].get("darkest_ms", REFERENCE_MS)) < REFERENCE_MS
 
 
-def _taught(scene: RasterScene, law: str, files: Sequence[Candidate]) -> bool:
-    return any(one.trained_on(scene, scene.name, law) or one.validated_on(scene.name, law) for one in files)
+def _taught(scene: RasterScene, name: str, law: str, files: Sequence[Candidate]) -> bool:
+    return any(one.trained_on(scene, name, law) or one.validated_on(name, law) for one in files)
 
 
 def _light_rows(
