@@ -200,7 +200,7 @@ def _scan_rows(law: str, weights: Weights, scenes: Sequence[RasterScene]) -> Ite
     for seconds in SECONDS:
         chosen = scans.chosen(seconds)
         ours = Judged(scans.counts(chosen.step, chosen.exposure_ms)[None], np.zeros(1, np.intp))
-        affordable = {scan: plain[scan] for scan in scans.within(tried, chosen.seconds)}
+        affordable = {scan: plain[scan] for scan in scans.within(tried, seconds)}
         best = max(affordable, key=lambda scan: affordable[scan].each)
         shortfalls.append(affordable[best].each[0] - ours.each[0])
         said = f"{chosen.seconds:.1f} s: {ours.words}"
