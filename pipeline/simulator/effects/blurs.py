@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from types import MappingProxyType
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.simulator.effects.effect import OFF, Blur, Bound, Merged
 from pipeline.simulator.effects.probe import UNITS, Probe
+from pipeline.simulator.optics.defocus_disc import disc_points
 from pipeline.simulator.optics.kernel_fit import Moments
 from pipeline.simulator.optics.rays import normals_met, pupil_contrast, spread_of_rays, spread_of_waves
 from pipeline.simulator.rig_model import Rig
@@ -22,6 +24,7 @@ AIRY, GAUSSIAN, ONE_WIDTH = "airy", "gaussian", "one-width"
 THIRD_RING = 10.173468135062722  # third zero of J1
 FIRST_NM, LAST_NM = 400.0, 1000.0  # of the spectrograph
 _ALONE: Floats = np.ones(1)
+_POINT_NS = 0.85  # of each point that stands for a disc
 
 
 def blurred_bound(probe: Probe, cause: str, variance: Floats, share: Floats = _ALONE) -> Bound:
@@ -155,18 +158,22 @@ class Aberration(Blur):
 class Defocus(Blur):
     """Blur by the distance from the plane of focus, that of ``air.distance_m`` for all of the scene.
 
-    A point beside the distance of focus is an image of the pupil: a disc foreshortened along the scan.
+    A point beside the distance of focus is an image of the pupil: a disc foreshortened along the scan. Few points stand
+    for it (`defocus_disc`); the bound is that of any kernel of its variance.
     """
 
     name = "defocus"
-    cost_ns = MappingProxyType({"disc": 0.0})  # as an aberration
+    cost_ns = MappingProxyType({"disc": 5.7})  # of seven points
 
-    def merged(self, rig: Rig) -> Merged:
-        """Give what it costs in the kernels that diffraction needs anyway."""
-        return Merged(DIFFRACTION.name, AIRY, 0.1)
+    def cost_at(self, probe: Probe, rig: Rig) -> Mapping[str, float]:
+        """Give the cost of as many points as stand for the disc; one is a Gaussian, which costs nothing."""
+        along, scan = defocus_px(rig, rig.air.distance_m).tolist()
+        points = disc_points((along, scan))[0].shape[1]
+        return {"disc": _POINT_NS * points if points > 1 else 0.0}
 
     def moments(self, rig: Rig, wavelength_nm: Floats, variant: str, normal: Floats | None = None) -> Moments:
-        return even(defocus_px(rig, rig.air.distance_m, normal) ** 2 / 16, len(wavelength_nm))
+        none, (along, scan) = np.zeros((2, len(wavelength_nm))), defocus_px(rig, rig.air.distance_m, normal).tolist()
+        return Moments(none, none, disc=(along, scan))
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         if rig.distances_m is None:

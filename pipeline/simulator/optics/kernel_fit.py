@@ -17,6 +17,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from pipeline.simulator.optics.defocus_disc import Axes, disc_contrast
 from pipeline.simulator.optics.rays import pupil_contrast
 
 Floats = NDArray[np.float64]
@@ -41,6 +42,8 @@ _RADII = np.concatenate([np.geomspace(0.002, 0.1, 10), np.linspace(0.13, 1.3, 18
 _TURNS = (np.arange(8) + 0.5) * np.pi / 8
 _ALONG = np.concatenate([np.outer(_RADII, np.cos(_TURNS)).ravel(), _RADII, 0 * _RADII])
 _SCAN = np.concatenate([np.outer(_RADII, np.sin(_TURNS)).ravel(), 0 * _RADII, _RADII])
+# What is wrong of waves longer than 20 px adds up over wide fields: they count up to three times.
+_STRICT = 1 + 2 / (1 + (np.hypot(_ALONG, _SCAN) / 0.05) ** 2)
 _ALIKE_PX = 0.3  # by which widths may differ of kernels that share a window
 
 
@@ -57,7 +60,9 @@ class Kernels:
 
 
 @lru_cache(maxsize=64)
-def _fit(told: bytes, bands: int, box: tuple[float, float], held: int) -> tuple[Kernels, Floats, Floats, float]:
+def _fit(
+    told: bytes, bands: int, box: tuple[float, float], held: int, disc: Axes
+) -> tuple[Kernels, Floats, Floats, float]:
     """Kernels, shares and their error for bands (6, band), no two alike: shift, variance and waves."""
     moments = np.frombuffer(told).reshape(6, bands)
     if bands <= _OWN and not moments[4:].any():
@@ -68,6 +73,8 @@ def _fit(told: bytes, bands: int, box: tuple[float, float], held: int) -> tuple[
     steps = np.arange(held) - (held - 1) / 2
     smeared = np.cos(2 * np.pi * np.outer(_SCAN, steps)).mean(axis=1)
     own = np.sinc(_ALONG * box[1]) * np.sinc(_SCAN * box[0]) * smeared  # what slit, pixel and held positions pass
+    own *= disc_contrast(_ALONG, _SCAN, disc)
+    own *= _STRICT
     judged = _some(order, _JUDGED)
     wanted, tried = _wanted(moments[:, judged], own), []
     for kernels in _candidates(moments, place):
@@ -82,10 +89,10 @@ def _fit(told: bytes, bands: int, box: tuple[float, float], held: int) -> tuple[
         fitted = _some(order, count)
         shares = _shares(passed, _wanted(moments[:, fitted], own))
         between = np.stack([np.interp(place, place[fitted], one) for one in np.eye(len(fitted))])
-        error = float(np.abs(passed @ (shares @ between[:, judged]) - wanted).max())
-        if error <= enough or count >= bands:
+        off = np.abs(passed @ (shares @ between[:, judged]) - wanted)
+        if off.max() <= enough or count >= bands:
             break
-    return chosen, shares, between, error
+    return chosen, shares, between, float((off / _STRICT[:, None]).max())
 
 
 def _needed(passed: Transfer, wanted: Transfer, enough: float) -> list[int]:
@@ -141,7 +148,7 @@ def _ladder(widest: Floats, core: float, ratio: float) -> list[tuple[float, int]
     level = 2
     while level == 2 or level <= _FARTHEST * max(wave, 1.0):
         sizes.append((level * _size_at(level), level))
-        level *= 2 if level == 2 else 4
+        level *= 2
     return sizes
 
 
@@ -212,19 +219,27 @@ class Moments:
     """What a blur does to each band, (2, band) each: along the line and the scan.
 
     A shift [px], a Gaussian of a variance [px^2], and diffraction at an elliptic pupil, told by the wavelength over the
-    pupil's widths [px]; None without any. The pattern of a pupil has no variance: no Gaussian stands for it.
+    pupil's widths [px]; None without any. The pattern of a pupil has no variance: no Gaussian stands for it. ``disc``
+    are the diameters along line and scan of what a point out of focus is imaged to, in all bands alike [px].
     """
 
     shift: Floats
     variance: Floats
     waves: Floats | None = None
+    disc: Axes = (0.0, 0.0)
+
+    @property
+    def spread(self) -> Floats:
+        """Variance of Gaussian and disc, (2, band). [px^2]"""
+        return self.variance + np.array(self.disc)[:, None] ** 2 / 16
 
     @staticmethod
     def together(blurs: Sequence[Moments], bands: int) -> Moments:
-        """Those of blurs one after the other. At most one of them is diffraction."""
+        """Those of blurs one after the other. At most one of them is diffraction, and one a disc."""
         none = np.zeros((2, bands))
         shift, variance = sum((one.shift for one in blurs), none), sum((one.variance for one in blurs), none)
-        return Moments(shift, variance, next((one.waves for one in blurs if one.waves is not None), None))
+        waves = next((one.waves for one in blurs if one.waves is not None), None)
+        return Moments(shift, variance, waves, next((one.disc for one in blurs if any(one.disc)), (0.0, 0.0)))
 
 
 @dataclass(frozen=True)
@@ -234,7 +249,8 @@ class Footprint:
     ``shift`` and ``variance`` are (2, kernel) along the line and the scan; ``shares`` (kernel, node) of some bands, and
     ``between`` (node, band) between which two each band lies; ``parts`` how many boxes across and along stand for one
     that lies turned; ``level`` (kernel,) of which pixels each looks at: 1 is all, 2 every second, and so on; ``error``
-    by how much of its amplitude a wave is passed too much or too little at most.
+    by how much of its amplitude a wave is passed too much or too little at most; ``disc`` the diameters along line and
+    scan of what each kernel is blurred by besides.
     """
 
     box: tuple[float, float]  # across and along; 0 is none
@@ -246,6 +262,7 @@ class Footprint:
     between: Floats
     level: NDArray[np.intp]
     error: float
+    disc: Axes = (0.0, 0.0)
 
     @property
     def kernels(self) -> int:
@@ -259,9 +276,11 @@ class Footprint:
     def afar(self, along: Floats, scan: Floats) -> Floats:
         """Give the light at places (place,) some px beyond slit and pixel, (place, band). [1/px^2]
 
-        Box, held positions and pixels count by their variance: there they are small beside the Gaussians that reach.
+        Box, disc, held positions and pixels count by their variance: there they are small beside the Gaussians that
+        reach.
         """
         own = np.array([self.box[1] ** 2, self.box[0] ** 2 + self.held**2 - 1]) / 12 + 1 / 6
+        own += np.array(self.disc) ** 2 / 16
         wide, high = self.variance + own[:, None]
         aside, ahead = along[:, None] - self.shift[0], scan[:, None] - self.shift[1]
         light: Floats = np.exp(-(aside**2 / wide + ahead**2 / high) / 2) / (2 * np.pi * np.sqrt(wide * high))
@@ -289,7 +308,8 @@ class Footprint:
         variance = variance - THINNED * (level**2 - 1)
         variance[1] += (self.held**2 - 1) / 12
         variance, box = np.maximum(variance, 0.0) / level**2, (self.box[0] / level, self.box[1] / level)
-        return replace(some, box=box, parts=(1, 1), held=1, shift=shift / level, variance=variance)
+        disc = (self.disc[0] / level, self.disc[1] / level)
+        return replace(some, box=box, parts=(1, 1), held=1, shift=shift / level, variance=variance, disc=disc)
 
 
 def fold(box: tuple[float, float], parts: tuple[int, int], held: int, blurs: Moments) -> Footprint:
@@ -301,6 +321,8 @@ def fold(box: tuple[float, float], parts: tuple[int, int], held: int, blurs: Mom
     """
     waves = blurs.waves if blurs.waves is not None and blurs.waves.any() else np.zeros_like(blurs.shift)
     told, band = np.unique(np.concatenate([blurs.shift, blurs.variance, waves]), axis=1, return_inverse=True)
-    kernels, shares, between, error = _fit(told.tobytes(), told.shape[1], box, held)
+    kernels, shares, between, error = _fit(told.tobytes(), told.shape[1], box, held, blurs.disc)
     between = between[:, band.ravel()]
-    return Footprint(box, parts, held, kernels.shift, kernels.variance, shares, between, kernels.level, error)
+    return Footprint(
+        box, parts, held, kernels.shift, kernels.variance, shares, between, kernels.level, error, blurs.disc
+    )

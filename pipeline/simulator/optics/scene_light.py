@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -91,7 +90,9 @@ class Looker:
         spectra = scene.electrons * np.float32(exposures)
         levels = np.unique(self.footprint.level).tolist()
         pixels = {level: _pixels(scene, along_y, level) for level in levels}
-        sums = np.where(self.footprint.level == 1, math.prod(self.footprint.parts), 1)
+        sums = np.ones(self.footprint.kernels)
+        for _, some, gatherer in self.gatherers:
+            sums[some] = gatherer.parts
         shares = (self.footprint.shares / np.reshape(len(steps) * sums, (-1, 1))).T.astype(np.float32)
         count, components, kernels = len(steps[0].along), spectra.shape[0], self.footprint.kernels
         light = np.empty((count, spectra.shape[-1]), np.float32)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.lazy import deferred
+from pipeline.simulator.optics.defocus_disc import disc_points
 from pipeline.simulator.optics.kernel_fit import Footprint, Moments, fold
 from pipeline.simulator.optics.rays import RayViews
 from pipeline.simulator.optics.tap_tables import TAIL, TapTable, box_weight
@@ -49,15 +50,19 @@ class Gatherer:
         """``views`` are some that hold the extremes of all that will be gathered."""
         self.footprint = footprint
         width, (across, along) = footprint.box, footprint.parts
+        variance = footprint.variance + disc_points(footprint.disc)[1][:, None]
         scale, off = place_parts(footprint, views)
         reach = np.abs(off).max(axis=(0, 2, 3), initial=0.0) + 0.02
         ranges = [(float(one.min()), float(one.max())) for one in scale.swapaxes(0, 1)]
         tail = TAIL / float(footprint.shares.max(initial=0.0) or 1.0)
         self._kernels = kernels_of(footprint)
-        self._along = TapTable.of(width[1] / along, footprint.variance[0], 1, ranges[0], float(reach[0]), tail)
-        self._scan = TapTable.of(
-            width[0] / across, footprint.variance[1], footprint.held, ranges[1], float(reach[1]), tail
-        )
+        self._along = TapTable.of(width[1] / along, variance[0], 1, ranges[0], float(reach[0]), tail)
+        self._scan = TapTable.of(width[0] / across, variance[1], footprint.held, ranges[1], float(reach[1]), tail)
+
+    @property
+    def parts(self) -> int:
+        """How many boxes each kernel is summed over."""
+        return int(self._kernels.place.shape[1])
 
     def gather(self, pixels: ScenePixels, views: RayViews, out: Light, numbers: NDArray[np.intp], gains: Light) -> None:
         """Add the components that some samples see through every kernel to ``out`` (number, n, component).
@@ -77,8 +82,11 @@ def kernels_of(footprint: Footprint) -> window_sums.PartedKernels:
     """Give a footprint's kernels and the parts of its box as the compiled loops take them."""
     (across, along), (slit, pixel) = footprint.parts, footprint.box
     variance = footprint.variance + np.array([[pixel / along], [slit / across]]) ** 2 / 12
-    shift, variance = np.array(footprint.shift, np.float32, order="C"), np.array(variance, order="C")
-    return window_sums.PartedKernels(shift, variance, slit**2 / 12 * (1 - 1 / across**2), part_places(footprint))
+    points, about = disc_points(footprint.disc)
+    variance = np.array(variance + about[:, None], order="C")
+    between = slit**2 / 12 * (1 - 1 / across**2) + float((points[1] ** 2).mean())
+    shift = np.array(footprint.shift, np.float32, order="C")
+    return window_sums.PartedKernels(shift, variance, between, part_places(footprint))
 
 
 def place_parts(footprint: Footprint, views: RayViews) -> tuple[Floats, Light]:
@@ -88,7 +96,7 @@ def place_parts(footprint: Footprint, views: RayViews) -> tuple[Floats, Light]:
     """
     kernels, count = kernels_of(footprint), len(views.along)
     scale = np.empty((footprint.kernels, 2, count))
-    off = np.empty((footprint.kernels, 2, math.prod(footprint.parts), count), np.float32)
+    off = np.empty((footprint.kernels, 2, kernels.place.shape[1], count), np.float32)
     table, beside = views.table(), np.zeros((2, count), np.float32)
     for kernel in range(footprint.kernels):
         window_sums.place_parts(table, beside, kernel, kernels, scale[kernel], off[kernel])
@@ -96,11 +104,12 @@ def place_parts(footprint: Footprint, views: RayViews) -> tuple[Floats, Light]:
 
 
 def part_places(footprint: Footprint) -> Light:
-    """Give the middles of the parts, (2, part) across and along, in px of the camera."""
+    """Give the middles of the parts, (2, part) across and along, in px of the camera: of boxes at a disc's points."""
     across, along = footprint.parts
     turn = ((np.arange(across) + 0.5) / across - 0.5) * footprint.box[0]
     run = ((np.arange(along) + 0.5) / along - 0.5) * footprint.box[1]
-    return np.stack([np.repeat(turn, along), np.tile(run, across)]).astype(np.float32)
+    boxes, points = np.stack([np.repeat(turn, along), np.tile(run, across)]), disc_points(footprint.disc)[0][::-1]
+    return (boxes[:, :, None] + points[:, None]).reshape(2, -1).astype(np.float32)
 
 
 def fewest_parts(share: float, box: tuple[float, float], views: RayViews) -> Parts:

@@ -103,7 +103,7 @@ def _blur_parts(probe: Probe, rig: Rig, blurs: Sequence[Any]) -> list[tuple[floa
     sizes, waves = [0.0], [0.0]
     for normal in normals_met(probe.sweeps, rig.camera):
         both = Moments.together([one.moments(rig, nm, one.variants[0], normal) for one in blurs], len(nm))
-        sizes.append(float(np.sqrt(both.variance.max(initial=0.0)) + np.abs(both.shift).max(initial=0.0)))
+        sizes.append(float(np.sqrt(both.spread.max(initial=0.0)) + np.abs(both.shift).max(initial=0.0)))
         waves.append(0.0 if both.waves is None else float(both.waves.max(initial=0.0)))
     shares, widths = airy_gaussians() if max(waves) > 0 else (np.ones(1), np.zeros(1))
     return [

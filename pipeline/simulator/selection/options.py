@@ -329,7 +329,8 @@ def _differences(probe: Probe, rig: Rig, blurs: list[Any], normal: Floats) -> tu
         shares, sizes = airy_gaussians()
         widths = sizes[:, None, None] * blurred.waves
     for share, waves in zip(shares.tolist(), widths, strict=True):
-        first, second = _by_gaussian(probe, nm, blurred.shift, blurred.variance + waves**2, waves)
+        near = probe.blurred_by(float(np.sqrt((blurred.spread + waves**2).max(initial=0.0))))
+        first, second = _by_gaussian(near, nm, blurred.shift, blurred.variance + waves**2, waves)
         steep, bend = steep + share * first, bend + share * second
     return steep, bend
 
@@ -341,7 +342,6 @@ def _by_gaussian(probe: Probe, nm: Floats, shift: Floats, variance: Floats, widt
     """
     moved, spread, wider = (steepest_difference(values, nm) for values in (shift, variance, np.sqrt(variance)))
     shift_bend, spread_bend = (np.abs(second_difference(values, nm)) for values in (shift, variance))
-    probe = probe.blurred_by(float(np.sqrt(variance.max(initial=0.0))))
     steep = probe.slope * moved + np.minimum(probe.curvature * spread / 2, probe.slope * wider)
     turned = spread_bend / 2 + (moved + spread * FINEST_PER_PX / 2) ** 2
     bend = probe.slope * shift_bend + probe.curvature * turned

@@ -215,7 +215,7 @@ def _blurs(rig: Rig, wavelength_nm: Floats, sweeps: Sequence[Sweep]) -> list[Mom
 
 
 def _size(blurs: Moments) -> Floats:
-    return blurs.variance if blurs.waves is None else blurs.variance + blurs.waves**2
+    return blurs.spread if blurs.waves is None else blurs.spread + blurs.waves**2
 
 
 def _moments(rig: Rig, wavelength_nm: Floats, normal: Floats) -> Moments:

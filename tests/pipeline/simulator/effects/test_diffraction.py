@@ -109,7 +109,7 @@ def test_rendered_waves_are_those_of_the_pupil(axis: int, cycles: float):
 @pytest.mark.parametrize("aperture_mm", [12.0, 15.0, 25.0])
 @pytest.mark.parametrize("keystone_px", [0.0, 0.15])
 def test_few_kernels_pass_what_the_pupil_passes(aperture_mm: float, keystone_px: float):
-    """Of 60 bands none errs by more than 0.002 of any wave, and none by 0.0015 from 0.1 to 0.2 cycles per px."""
+    """Of 60 bands none errs by more than 0.002 of any wave, 0.0017 from 0.1 to 0.2 cycles per px, 0.0008 below 0.03."""
     rig = Rig(optics=Optics(aperture_mm=aperture_mm, keystone_px=keystone_px))
     nm = np.linspace(400, 1000, 60)
     blurs = Moments.together(
@@ -118,7 +118,7 @@ def test_few_kernels_pass_what_the_pupil_passes(aperture_mm: float, keystone_px:
     found = fold((rig.camera.slit_px, 1.0), (1, 1), 1, blurs)
     rng = np.random.default_rng(0)
     frequency, turn = rng.uniform(0.0, 0.8, 200), rng.uniform(0, np.pi, 200)
-    frequency[:60] = rng.uniform(0.1, 0.2, 60)
+    frequency[:60], frequency[60:90] = rng.uniform(0.1, 0.2, 60), rng.uniform(0.002, 0.03, 30)
     along, scan = (frequency * way(turn) for way in (np.cos, np.sin))
     own = np.sinc(along) * np.sinc(scan * rig.camera.slit_px)
     wanted = (own * (np.sinc(along) * np.sinc(scan)) ** 2)[:, None] * _left(along, scan, blurs.shift, blurs.variance)
@@ -134,7 +134,8 @@ def test_few_kernels_pass_what_the_pupil_passes(aperture_mm: float, keystone_px:
     error = np.abs(kernels @ found.mixing - wanted)
     assert found.mixing.min() >= 0
     assert error.max() < 2e-3
-    assert error[:60].max() < 1.5e-3
+    assert error[:60].max() < 1.7e-3
+    assert error[60:90].max() < 8e-4
 
 
 def _left(along: np.ndarray, scan: np.ndarray, shift: np.ndarray, variance: np.ndarray) -> np.ndarray:
