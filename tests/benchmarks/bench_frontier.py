@@ -5,7 +5,8 @@ A plain scan takes every line, every second or every fourth, not binned, with on
 Surveys in two passes have the coarse pass as long exposed as the fine one or a quarter as long. Farms that training
 never saw, each with noise of its own. Below stands how far what each map says of itself lies from what it scores.
 
-`python tests/benchmarks/bench_frontier.py 1280x1024` draws the map of `survey --seconds` alone, on larger farms.
+`python tests/benchmarks/bench_frontier.py 1280x1024` draws the map of `survey --seconds` alone, on larger farms;
+with a file of weights behind it by these.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ Judged = list[PlanMap]  # of each farm
 def rows() -> list[Row]:
     """Every plan by its seconds; a survey's goal is the best plain scan that takes no longer."""
     plain = {
-        scan_words(step, exposure_ms): [_plain(seed, step, exposure_ms, SHAPE) for seed in SEEDS]
+        scan_words(step, exposure_ms): [_plain(seed, step, exposure_ms) for seed in SEEDS]
         for step in STEPS
         for exposure_ms in EXPOSURES_MS
     }
@@ -78,7 +79,7 @@ def rows() -> list[Row]:
 
     for seconds in SECONDS:
         scan = chosen_scan(SHAPE, seconds)
-        judged = [_plain(seed, scan.step, scan.exposure_ms, SHAPE) for seed in SEEDS]
+        judged = [_plain(seed, scan.step, scan.exposure_ms) for seed in SEEDS]
         found.append(_beside(plain, f"survey --seconds {seconds:g}: {_promise(scan)}", judged, SLACK))
     for budget in BUDGETS:
         for exposure_ms in COARSE_MS:
@@ -105,11 +106,13 @@ def _told_rows(plain: Mapping[str, Judged]) -> Iterator[Row]:
     yield Row(f"what {len(maps)} maps say of themselves", figure, f"<= {RMS:g} rms, {HELD:.0%} within", met)
 
 
-def large_rows(shape: tuple[int, int], goals: dict[float, float]) -> Iterator[Row]:
+def large_rows(shape: tuple[int, int], goals: dict[float, float], weights: Weights) -> Iterator[Row]:
     """The map of `survey --seconds` on farms of (y, x) px, for each of the seconds, beside a goal in mIoU."""
     for seconds, goal in goals.items():
-        scan = chosen_scan(shape, seconds)
-        judged = [_plain(seed, scan.step, scan.exposure_ms, shape) for seed in SEEDS]
+        scan = chosen_scan(shape, seconds, weights)
+        judged = [
+            map_of(farm_scene(seed, shape, camera=CAMERA), seed, scan.step, scan.exposure_ms, weights) for seed in SEEDS
+        ]
         met = _mean(judged) >= goal
         yield Row(f"--seconds {seconds:g}: {_promise(scan)}", _figure(judged), f">= {goal}", met)
 
@@ -119,9 +122,9 @@ def shipped() -> Weights:
     return load_weights(WEIGHTS)
 
 
-def chosen_scan(shape: tuple[int, int], seconds: float) -> PlainScan:
-    """The scan that a survey of so many seconds takes."""
-    weights = shipped()
+def chosen_scan(shape: tuple[int, int], seconds: float, weights: Weights | None = None) -> PlainScan:
+    """The scan that a survey of so many seconds takes, by the farm's weights or others."""
+    weights = weights or shipped()
     grid = SceneGrid(*shape, weights.config.patch, weights.config.factor)
     along, _, _ = cheapest_full(grid, CAMERA, COST)
     record = ScanRecord.read(weights.record["scans"])
@@ -163,14 +166,14 @@ def seconds_of(step: int, exposure_ms: float) -> float:
 
 
 @cache
-def _plain(seed: int, step: int, exposure_ms: float, shape: tuple[int, int]) -> PlanMap:
+def _plain(seed: int, step: int, exposure_ms: float) -> PlanMap:
     """The map of a farm's plain scan."""
-    return map_of(farm_scene(seed, shape, camera=CAMERA), seed, step, exposure_ms)
+    return map_of(farm_scene(seed, SHAPE, camera=CAMERA), seed, step, exposure_ms)
 
 
-def map_of(scene: RasterScene, seed: int, step: int, exposure_ms: float) -> PlanMap:
-    """The map of a scene's plain scan."""
-    weights, rig = shipped(), Rig(CAMERA)
+def map_of(scene: RasterScene, seed: int, step: int, exposure_ms: float, weights: Weights | None = None) -> PlanMap:
+    """The map of a scene's plain scan; what it says of itself by the farm's weights alone."""
+    others, weights, rig = weights is not None, weights or shipped(), Rig(CAMERA)
     grid = SceneGrid(*scene.shape, weights.config.patch, weights.config.factor)
     along, _, _ = cheapest_full(grid, CAMERA, COST)
     sweeps = plain_sweeps(grid, CAMERA, along, step=step, exposure_ms=exposure_ms)
@@ -178,10 +181,13 @@ def map_of(scene: RasterScene, seed: int, step: int, exposure_ms: float) -> Plan
     source = SimulatedSource(scene, rig, seed, chosen, clock=sweep_starts(sweeps, CAMERA, COST))
     look = plain_look(weights, source, sweeps, grid, COST)
     drawn = segment(weights, look.seen, look.columns, look.seats, every_class=True)
+    judged = _judged(scene, drawn.classes, weights)
+    if others:
+        return PlanMap(look.seconds, judged)
     assert drawn.log_probability is not None
     told = scores().expected(expected_counts([drawn.log_probability], weights.config.classes), step, exposure_ms)
     assert told is not None
-    return PlanMap(look.seconds, _judged(scene, drawn.classes, weights), 100 * told.miou, 100 * told.error)
+    return PlanMap(look.seconds, judged, 100 * told.miou, 100 * told.error)
 
 
 def _judged(scene: RasterScene, classes: NDArray[np.uint8], weights: Weights) -> float:
@@ -207,9 +213,10 @@ def _survey(seed: int, budget: float, coarse_ms: float) -> PlanMap:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Draw maps of larger farms, WIDTHxHEIGHT, and print them beside their goals."""
-    width, height = (int(side) for side in arguments[0].split("x"))
-    for row in large_rows((height, width), LARGE):
+    """Draw maps of larger farms, WIDTHxHEIGHT, by some weights, and print them beside their goals."""
+    size, *others = arguments
+    width, height = (int(side) for side in size.split("x"))
+    for row in large_rows((height, width), LARGE, load_weights(Path(others[0]) if others else WEIGHTS)):
         print(f"{row.what}: {row.figure}, goal {row.goal}: {'met' if row.met else 'MISSED'}", flush=True)
     return 0
 
