@@ -78,7 +78,7 @@ def test_every_flag_says_what_it_is(verb: str) -> None:
         (["survey", "--budgt", "1"], "Unknown option: --budgt. Did you mean --budget?; see spectralzoom survey --help"),
         (
             ["plan", "--rounds=2"],
-            "Unknown option: --rounds; there is one round of detail: a second never paid (README, Limits) and was "
+            "Unknown option: --rounds; there is one round of detail: a second never paid and was "
             "removed; leave it out; see spectralzoom plan --help",
         ),
     ],
