@@ -32,7 +32,7 @@ from tests.pipeline.simulator.sparse_cases import sparse_case
 
 CASES = range(1000, 1200)  # none of them was looked at while bounds were made
 SPARSE_CASES = range(1000, 1070)
-TILES = 40
+TILES = 100
 MOST_LOOSE = 6.0  # median of bound over measured change
 MOST_BINNING = 8  # every case is stored as samples, and in sums of 2 to so many
 TOLERANCE = 0.1
