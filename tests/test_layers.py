@@ -56,7 +56,6 @@ DISTRIBUTIONS = {
     "skimage": "scikit-image",
     "odc": "odc-geo",
     "cv2": "opencv-contrib-python-headless",
-    "google_crc32c": "google-crc32c",
 }
 FILE_MODULES = {"pathlib", "shutil", "tempfile", "glob", "io", "fileinput"}
 READS = {"open", "read_text", "read_bytes", "getenv", "load_dotenv", "read_csv", "loadtxt", "load_file"}

@@ -30,7 +30,6 @@ from storage.arrays.layout import (
     write_small,
 )
 from storage.arrays.quicklooks import LineThumbnail, Quicklook, quicklook_of, write_quicklook
-from storage.arrays.shards import ShardWriter
 
 _LINE_COORDINATES = "time mirror_x mirror_y exposure_ms valid_line"
 
@@ -82,8 +81,7 @@ class RawCubeWriter:
         about = {"long_name": "raw numbers of the camera", "units": "1", "coordinates": f"{bands} {_LINE_COORDINATES}"}
         write_counts(self._group, line=header.shape[0], sample=header.shape[1])
         spec = image_spec(("line", "sample", "band"), header.shape, "<u2")
-        self._shards = ShardWriter(create_array(self._group, "dn", spec, about, level=RAW_LEVEL), RAW_LEVEL)
-        self._block = np.empty((SHARD_ROWS, *header.shape[1:]), np.uint16)
+        self._dn = create_array(self._group, "dn", spec, about, level=RAW_LEVEL)
         known = header.references
         _write_references(self._group, known)
         self._seen = LineThumbnail(
@@ -98,11 +96,8 @@ class RawCubeWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        try:
-            if kind is None:
-                self.close()
-        finally:
-            self._shards.close()
+        if kind is None:
+            self.close()
 
     def write(self, lines: Sequence[Line]) -> None:
         """Take the next lines; any number, in order.
@@ -140,8 +135,8 @@ class RawCubeWriter:
     def _flush(self) -> None:
         if self._waiting:
             first = self._waiting[0].number
-            block = np.stack([line.data for line in self._waiting], out=self._block[: len(self._waiting)])
-            self._shards.write(first, block)
+            block = np.stack([line.data for line in self._waiting])
+            self._dn[first : first + len(block)] = block
             self._seen.add(first, block, np.array([line.valid for line in self._waiting], np.bool_))
             self._waiting.clear()
 
