@@ -116,9 +116,9 @@ def test_nothing_is_told_of_maps_of_which_nobody_knows(
 
 def test_nothing_is_told_of_a_field_that_the_weights_do_not_know(survey_png: Survey, weights: Path, tmp_path: Path):
     """Where most of it is unknown the probabilities of the rest say nothing."""
-    path = _judged(weights, tmp_path, SCORES.as_dict(), limit=1e-6)
+    path = _judged(weights, tmp_path, SCORES.as_dict(), limit=0.2)
     receipt: Any = survey_png(tmp_path / "a", weights=str(path), effects="none", budget=None, scan_step="1").receipt
-    assert receipt["unknown"]["share"] == 1
+    assert 0.2 < receipt["unknown"]["share"] < 1
     assert "expected" not in receipt
 
 

@@ -132,6 +132,19 @@ def test_the_error_of_looks_is_that_of_scenes_which_differ():
     assert error_of_looks(mixed) > 3 * error_of_looks(alike)
 
 
+def test_the_error_of_looks_is_judged_by_the_other_scenes():
+    """No map is put right by itself: of two, each by the bias of the other, worked out by hand."""
+    one, other = _scored(1, 0.5), _scored(2, 2.0)
+    off = [
+        expected_score(a.expected, fitted_bias([b]), 0.0).miou - mean_iou(a.counts)
+        for a, b in ((one, other), (other, one))
+    ]
+    explained = [expected_score(a.expected, fitted_bias([b]), 0.0).error for a, b in ((one, other), (other, one))]
+    by_hand = np.sqrt(np.mean(np.square(off) - np.square(explained)))
+    assert by_hand > 0.05
+    assert error_of_looks([one, other]) == pytest.approx(by_hand)
+
+
 def _scores() -> MapScores:
     looks = {(step, ms): [_scored(7 * step + k, 1 + 2 / ms) for k in range(3)] for step in (2, 1) for ms in (4.0, 64.0)}
     return MapScores.fitted(looks)
