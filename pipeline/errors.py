@@ -61,6 +61,10 @@ class BudgetError(PipelineError, ValueError):
     exit_code = 2
 
 
+class NoScanPaidFor(BudgetError):  # noqa: N818 - said of scans
+    """No plain scan that some weights read costs as little; others may read fewer lines."""
+
+
 class SceneError(PipelineError, ValueError):
     """A scene, label or mask file cannot be used."""
 

@@ -14,7 +14,7 @@ from flows.settings.load import of_this_version, parse_settings
 from flows.settings.survey_settings import BUILT_IN_SCENES, OF_THE_MACHINE, Settings
 from flows.survey.stage import versions
 from flows.survey.survey import STAGES
-from flows.survey.survey_model import shipped_weights
+from flows.survey.survey_model import weights_path
 from models.weights.files import content_key
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, USUAL_DAY, USUAL_HOUR, law_of_key
@@ -150,7 +150,10 @@ def check_stage(stage: str) -> None:
 
 def weights_key(settings: Settings) -> str | None:
     """What the weights are called by what they hold, as stages know it; None where they cannot be read."""
-    return file_key(shipped_weights() if settings.weights is None else Path(settings.weights))
+    try:
+        return file_key(weights_path(settings))
+    except SettingsError:  # they came from elsewhere, and nobody says which they are
+        return None
 
 
 def file_key(path: Path) -> str | None:

@@ -29,7 +29,7 @@ class FieldMemory:
     """Where the memory of a field lies, and how it is to be read."""
 
     belief: Path
-    mosaic: Path  # of the last look alone: the days since are those of no other
+    mosaic: Path | None  # of the last look alone, whose days these are; None where its pixels have another size
     days: float
     classes: tuple[int, ...]  # see `flows.survey.memory.Prior`
     shift_px: tuple[int, int] = (0, 0)  # down and to the right, that brings it onto today's look
@@ -45,8 +45,10 @@ class FieldMemory:
         values, age, light = (_framed(part, gaps) for part in store.read(rows[0], columns[0]))
         if self.classes != tuple(range(values.shape[-1])):
             values = in_classes(values, self.classes)
-        coarse = look_at(weights, self.mosaic, region).seen_columns
-        lies = shifted(coarse, _cells(self.shift_px, region.grid.factor))
+        lies = None
+        if self.mosaic is not None:
+            coarse = look_at(weights, self.mosaic, region).seen_columns
+            lies = shifted(coarse, _cells(self.shift_px, region.grid.factor))
         return Remembered(Belief(values, age, np.nan_to_num(light)), lies, self.days)
 
 
@@ -72,12 +74,29 @@ def shifted(image: NDArray[np.float32], by: tuple[int, int]) -> NDArray[np.float
 
 
 def memory_lies(before: Sequence[EarlierLook], now: Path, factor: int) -> FieldShift:
-    """How the field of stored coarse looks, the newest first, lies beside that of another, in fine px."""
+    """How the field of stored coarse looks, the newest first, lies beside that of another, in fine px.
+
+    ``factor``: Fine px to a pixel of the other. Looks by other weights may have other pixels: all are compared in
+    pixels that each of theirs divides.
+    """
+    cell = math.lcm(factor, *(look.factor for look in before))
+
+    def picture(mosaic: Path, own: int) -> NDArray[np.float32]:
+        return coarser(mosaic_brightness(mosaic), cell // own)
+
     pictures = (
-        shifted(mosaic_brightness(look.mosaic.path / "mosaic.zarr"), _cells(look.shift_px, factor)) for look in before
+        shifted(picture(look.mosaic.path / "mosaic.zarr", look.factor), _cells(look.shift_px, cell)) for look in before
     )
-    found = field_shift(mosaic_brightness(now), laid_together(pictures), reach_px=REACH_PX / factor)
-    return replace(found, shift=(factor * found.shift[0], factor * found.shift[1]))
+    found = field_shift(picture(now, factor), laid_together(pictures), reach_px=REACH_PX / cell)
+    return replace(found, shift=(cell * found.shift[0], cell * found.shift[1]))
+
+
+def coarser(image: NDArray[np.float32], times: int) -> NDArray[np.float32]:
+    """An image (y, x) in pixels ``times`` as wide: means of them, the last repeated where there are too few."""
+    whole = np.pad(image, [(0, -size % times) for size in image.shape], mode="edge")
+    y, x = (size // times for size in whole.shape)
+    means: NDArray[np.float32] = whole.reshape(y, times, x, times).mean(axis=(1, 3))
+    return means
 
 
 def whole_pixels(lies: FieldShift) -> tuple[int, int]:

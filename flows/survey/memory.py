@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,7 @@ class EarlierLook:
     """What a run saw of a field coarsely."""
 
     mosaic: StageRef
+    factor: int  # fine px to a pixel of it, along either axis
     shift_px: tuple[int, int] = (0, 0)  # down and to the right, that brings it onto the newest
 
 
@@ -126,7 +127,8 @@ def _usable(
         return f"{error}"
     if store.shape != (grid.height, grid.width):
         return f"it is of {store.shape[1]} x {store.shape[0]} px, this field has {grid.width} x {grid.height}"
-    if coarse != grid.coarse_shape:
+    factor = _factor(coarse, grid)
+    if factor is None:
         rows, columns = grid.coarse_shape
         return f"its coarse look has {coarse[1]} x {coarse[0]} px, these weights read {columns} x {rows}"
     camera = run.settings.get("camera")
@@ -138,11 +140,17 @@ def _usable(
     classes = tuple(names.index(one) if one in names else -1 for one in class_names)
     if all(number < 0 for number in classes):
         return f"it knows none of the classes of these weights, but {', '.join(names)}"
-    looks = (EarlierLook(mosaic), *_looks_before(archive, run, coarse))
+    looks = (EarlierLook(mosaic, factor), *_looks_before(archive, run, grid))
     return Prior(run.folder.name, belief, looks, max(_days_since(run, settings), 0.0), classes)
 
 
-def _looks_before(archive: Archive, run: Run, shape: tuple[int, int]) -> Iterator[EarlierLook]:
+def _factor(coarse: tuple[int, int], grid: SceneGrid) -> int | None:
+    """How many fine px a pixel of an earlier coarse look (y, x) is wide; None where the field has no such grid."""
+    offered = (factor for factor in range(1, grid.patch + 1) if grid.patch % factor == 0)
+    return next((factor for factor in offered if replace(grid, factor=factor).coarse_shape == coarse), None)
+
+
+def _looks_before(archive: Archive, run: Run, grid: SceneGrid) -> Iterator[EarlierLook]:
     """What earlier runs saw of the rest of a field, where a run looked at a part of it and went on from them."""
     down, across = 0, 0
     for _ in range(MOST_LOOKS - 1):
@@ -156,11 +164,12 @@ def _looks_before(archive: Archive, run: Run, shape: tuple[int, int]) -> Iterato
             return
         try:
             mosaic = archive.find(parts[1], parts[2])
-            if mosaic is None or mosaic_shape(mosaic.path / "mosaic.zarr") != shape:
-                return
+            factor = None if mosaic is None else _factor(mosaic_shape(mosaic.path / "mosaic.zarr"), grid)
         except IncompleteStoreError:
             return
-        yield EarlierLook(mosaic, (down, across))
+        if mosaic is None or factor is None:
+            return
+        yield EarlierLook(mosaic, factor, (down, across))
 
 
 def _days_since(run: Run, settings: Settings) -> float:

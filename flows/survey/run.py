@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -32,14 +33,14 @@ from flows.survey.scene import (
     open_scene,
 )
 from flows.survey.seat_budget import SeatBudget
-from flows.survey.survey_model import SurveyModel, vgg_file
+from flows.survey.survey_model import SurveyModel, vgg_file, weights_offered
 from flows.survey.zones import SurveyZones, open_zones, place_of_field
 from models.evaluation.expected_scores import MapScores
 from models.network.machine import PROCESSOR, choose_device
 from models.policies.vgg_file import VggFile
 from models.weights.companion_files import FamiliarFile, ReaderFile
 from models.weights.files import Description, Weights
-from pipeline.errors import SettingsError
+from pipeline.errors import NoScanPaidFor, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
@@ -195,8 +196,17 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     settings = for_rig(settings)
     check_scene_there(settings)
     settings = replace(settings, device=choose_device(settings.device))
-    model = SurveyModel.open(settings, planning=planning)
-    described, path = model.described, model.path
+    offered = weights_offered(settings)
+    for better in offered[:-1]:
+        with suppress(NoScanPaidFor):
+            return _run_by(better, settings, planning=planning, archive=archive)
+    return _run_by(offered[-1], settings, planning=planning, archive=archive)
+
+
+def _run_by(path: Path, settings: Settings, *, planning: bool, archive: Archive | None) -> SurveyRun:
+    """Open what a survey needs that is read with the weights of a file, as `open_run`."""
+    model = SurveyModel.open(settings, path, planning=planning)
+    described = model.described
     refused = farm_refusal(settings)
     if refused is not None and not planning:
         raise SettingsError(refused)

@@ -36,6 +36,8 @@ from models.weights.files import (
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.lazy import Once
 
+PLAIN_STEPS = (1, 2)  # pixels from line to line of what the weights for plain scans read
+
 
 @dataclass(frozen=True)
 class SurveyModel:
@@ -50,13 +52,12 @@ class SurveyModel:
     vgg: VggFile | None
 
     @staticmethod
-    def open(settings: Settings, *, planning: bool) -> SurveyModel:
-        """Open those that the settings name; unless for ``planning`` all tensors are read.
+    def open(settings: Settings, path: Path, *, planning: bool) -> SurveyModel:
+        """Open the weights of a file; unless for ``planning`` all tensors are read.
 
-        Raises WeightsError: what is missing, does not go together, or is not as it was written; SettingsError: no
-        weights are named, and none come with the house for the scene, or the machine lacks the device.
+        Raises WeightsError: what is missing, does not go together, or is not as it was written; SettingsError: the
+        machine lacks the device.
         """
-        path = weights_path(settings)
         described, load = describe_weights(path), Once(lambda: load_weights(path).on(choose_device(settings.device)))
         check_two_scale(described.config, path)
         key = content_key(path)
@@ -109,20 +110,38 @@ class SurveyModel:
 
 
 def weights_path(settings: Settings) -> Path:
-    """Where a survey's weights lie; the house's own for its scenes (SettingsError: none given for one's own scene)."""
+    """Where the weights lie that a survey is read with, as soon as its scan is chosen."""
+    return weights_offered(settings)[0]
+
+
+def weights_offered(settings: Settings) -> tuple[Path, ...]:
+    """Weights that a survey may be read with, the better first; another pays for less where it reads fewer lines.
+
+    Those that the settings name, or the house's own for its scenes. Raises SettingsError: none are given for one's own
+    scene.
+    """
     if settings.weights is not None:
-        return Path(settings.weights)
+        return (Path(settings.weights),)
     if settings.scene not in BUILT_IN_SCENES:
         raise SettingsError(
             f"--weights is missing: the weights that come with SpectralZoom know the built-in farm only;"
             f" train some for {settings.scene} with: spectralzoom train DATASET -o my.safetensors"
         )
-    return shipped_weights(sparing=settings.sparing)
+    plain, two_passes = shipped_weights(plain=True), shipped_weights()
+    if not settings.plain:
+        return (two_passes,)
+    if settings.scan_step is None:
+        return plain, two_passes
+    return (plain,) if settings.scan_step in PLAIN_STEPS else (two_passes,)
 
 
-def shipped_weights(*, sparing: bool = False) -> Path:
-    """The weights that come with the house; ``sparing`` ones read coarse means of 2 x 2 px, for seats bought singly."""
-    name = "farm-sparing.safetensors" if sparing else "farm.safetensors"
+def shipped_weights(*, plain: bool = False) -> Path:
+    """The weights that come with the house: those that ``plain`` scans are read with, or those for two passes.
+
+    The coarse pixels of the first are 2 px wide, which leaves less to be read in detail, but lines farther apart than
+    that no coarse look is made of; those of the other are 4 px wide, so that a coarse pass has few lines.
+    """
+    name = "farm-scan.safetensors" if plain else "farm.safetensors"
     return Path(str(resources.files("models") / "shipped" / name))
 
 

@@ -15,7 +15,7 @@ from flows.settings.load import CHEAP_POLICY
 from flows.survey.reading_costs import ReadingCosts
 from flows.survey.seat_budget import SeatBudget
 from flows.survey.stages.accuracy import columns_of_all_seats
-from flows.survey.survey_model import shipped_weights
+from flows.survey.survey_model import PLAIN_STEPS, shipped_weights
 from flows.tradeoff.entries import Setting, Tradeoff, register_all
 from models.evaluation.metrics import confusion, mean_iou
 from models.network.sizes import multiply_adds
@@ -88,20 +88,20 @@ def part_of(look: PlannedLook, bands: int, compute: str) -> PlannedLook:
 
 
 def _prepare(seed: int) -> PlannedField:
-    weights, camera, cost = load_weights(shipped_weights()), LineCamera(), CostModel()
+    camera, cost = LineCamera(), CostModel()
     scene = farm_scene(seed, SHAPE, camera=camera)
-    grid = SceneGrid(*SHAPE, weights.config.patch, weights.config.factor)
+    weights, of_scans = load_weights(shipped_weights()), load_weights(shipped_weights(plain=True))
+    grid, finer = (SceneGrid(*SHAPE, read.config.patch, read.config.factor) for read in (weights, of_scans))
     source, bands = SimulatedSource(scene, Rig(camera), seed), len(scene.wavelength_nm)
     along, full, full_s = cheapest_full(grid, camera, cost)
-    looks: dict[Setting, PlannedLook] = {
-        words: plain_look(weights, source, _sweeps_of(grid, camera, along, step, exposure_ms), grid, cost)
-        for words, (step, exposure_ms) in SCANS.items()
-    }
-    sparing = load_weights(shipped_weights(sparing=True))
-    finer, sweeps = replace(grid, factor=sparing.config.factor), _sweeps_of(grid, camera, along, *PART_OF)
-    whole = plain_look(sparing, source, sweeps, finer, cost)
+    looks: dict[Setting, PlannedLook] = {}
+    for words, (step, exposure_ms) in SCANS.items():
+        read_with, on = (of_scans, finer) if step in PLAIN_STEPS else (weights, grid)
+        looks[words] = plain_look(read_with, source, _sweeps_of(on, camera, along, step, exposure_ms), on, cost)
+    whole = looks[scan_words(*PART_OF)]
     looks |= {words: part_of(whole, bands, share) for words, share in PARTS.items()}
-    coarse, every = coarse_sweeps(grid, camera, along), looks[scan_words(1, camera.exposure_ms)]
+    coarse = coarse_sweeps(grid, camera, along)
+    every = plain_look(weights, source, _sweeps_of(grid, camera, along, 1, camera.exposure_ms), grid, cost)
     rows = mosaic_rows([SimulatedSweep(source, sweep) for sweep in coarse], camera, grid, rows=64)
     seen = glance(weights, np.concatenate([values for _, values, _ in rows]), scene.wavelength_nm, grid)
     coarse_s, scores = cost.seconds(coarse, camera), score_seats("gain", seen)

@@ -23,7 +23,7 @@ from models.evaluation.metrics import confusion, mean_iou
 from models.network.spectral import patches_of
 from models.reading.inference import glance_of_columns, segment
 from models.reading.remembered import Belief, Looked, Remembered, first_belief, recall
-from models.training.looks import REFERENCE_MS, ColumnNoise, Looks
+from models.training.looks import REFERENCE_MS, ColumnNoise, Looks, drawn_step
 from models.training.memory import MemoryTraining, PastLook, Visit, train_reader
 from models.training.train import Progress
 from models.weights.companion_files import MemoryWeights, save_memory
@@ -118,7 +118,7 @@ def _visit(
     seen = _Land.observed(weights, shape, seed, day, hour)
     drawn = []
     for _ in range(LOOKS):
-        step = int(rng.choice(list(STEPS), p=list(STEPS.values())))
+        step = drawn_step(STEPS, weights.config.factor, rng)
         exposure_ms = float(np.exp(rng.uniform(np.log(DARKEST_MS), np.log(BRIGHTEST_MS))))
         looked = seen.look(weights, looks, step, exposure_ms, rng)
         probability = np.exp(looked.log_probability).astype(np.float16)

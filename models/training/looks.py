@@ -86,9 +86,7 @@ class Looks:
         wide; what comes back has their shapes.
         """
         light = _drawn_light(self.darkest_ms, rng)
-        offered = {step: odds for step, odds in self.steps.items() if factor % step == 0}
-        odds = np.array(list(offered.values()))
-        step = int(rng.choice(list(offered), p=odds / odds.sum()))
+        step = drawn_step(self.steps, factor, rng)
         plain, means = self.scan(fine, noise, factor, light=light, step=step, rng=rng)
         if rng.random() >= self.own_coarse:
             return plain, means
@@ -139,6 +137,13 @@ class Looks:
         mixing = np.linalg.cholesky(noise.correlation() + TINY * np.eye(len(noise.shot))).T.astype(np.float32)
         drawn = rng.standard_normal(scaled.shape, np.float32) @ mixing
         return np.asarray(scaled + size.astype(np.float32) * drawn, np.float32)
+
+
+def drawn_step(steps: Mapping[int, float], factor: int, rng: np.random.Generator) -> int:
+    """Draw how far apart lines are, by odds, among steps that divide ``factor``: coarse pixels are means of lines."""
+    offered = {step: odds for step, odds in steps.items() if factor % step == 0}
+    odds = np.array(list(offered.values()))
+    return int(rng.choice(list(offered), p=odds / odds.sum()))
 
 
 def _drawn_light(darkest_ms: float, rng: np.random.Generator) -> float:

@@ -127,15 +127,15 @@ def train_reader(
 
 def _learn(reader: MemoryReader, visits: Sequence[_Batch], weight: Tensor, rng: np.random.Generator) -> float:
     """Bring memories through visits, and learn at each but the first from its labels, as maps do; the mean loss."""
-    start = visits[0]
+    start, factor = visits[0], reader.sizes.factor
     state, coarse = start.looked, start.coarse
     age = torch.zeros_like(start.seen)
     rests_on = age + _light_a_pixel(start)
     total = 0.0
     for now in visits[1:]:
         age, rests_on = age + now.days, rests_on * torch.exp(-now.days / LIGHT_FADES_DAYS)
-        small = now.seen[:, :, 2 :: reader.sizes.factor, 2 :: reader.sizes.factor]
-        told, told_coarse = _wrong(state, coarse, reader.sizes.factor, rng)
+        small = now.seen[:, :, factor // 2 :: factor, factor // 2 :: factor]
+        told, told_coarse = _wrong(state, coarse, factor, rng)
         images = told, now.looked, now.seen, age, rests_on
         found = reader(*images, now.light, now.step, told_coarse, now.coarse, small * now.comparable)
         losses = F.nll_loss(found, now.labels.where(now.labels != UNLABELLED, 0), reduction="none")

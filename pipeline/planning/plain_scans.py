@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import BudgetError
+from pipeline.errors import BudgetError, NoScanPaidFor
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import CostModel, Sweep
 from pipeline.planning.prices import raw_bytes
@@ -169,12 +169,12 @@ def choose_scan(scans: Sequence[PlainScan], limits: ScanLimits) -> PlainScan:
     """Choose the scan within the limits that is expected to score most; with goals the cheapest that reaches them.
 
     Of those that are as good but for `LOSS` the cheapest is taken, and of those as cheap the better one; ties go to the
-    first. Raises BudgetError: no scan is within the limits, or none reaches the goals; names the least that would, or
-    the best there is.
+    first. Raises NoScanPaidFor: no scan is within the limits; names the least that would be. BudgetError: none reaches
+    the goals; names the best there is.
     """
     paid = [scan for scan in scans if limits.afford(scan)]
     if not paid:
-        raise BudgetError(_too_little(scans, limits))
+        raise NoScanPaidFor(_too_little(scans, limits))
     reaching = [scan for scan in paid if limits.reached_by(scan)]
     if not reaching:
         raise BudgetError(_too_much(scans, paid, limits))

@@ -25,6 +25,7 @@ from rich.console import Console
 
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
+from flows.survey.survey_model import PLAIN_STEPS, shipped_weights
 from flows.tradeoff.plans import plain_look
 from flows.training.look import chosen_effects
 from models.evaluation.expected_scores import MapScores, expected_counts
@@ -51,7 +52,6 @@ SECONDS = (3.5, 5.0, 8.0, 15.0, 28.0)  # of surveys that choose their scan
 SLACK = 0.3  # points of mIoU that such a survey may lie below the best plain scan tried
 LARGE = {107.0: 95.2, 56.0: 95.0, 29.0: 94.3, 20.5: 93.3, 14.0: 91.5, 10.0: 89.0, 8.0: 85.0}  # of 1280 x 1024: goals
 BANDS = 270
-WEIGHTS = Path(__file__).resolve().parents[2] / "models" / "shipped" / "farm.safetensors"
 RMS, WITHIN, HELD = 1.5, 1.645, 0.9  # goals of what maps say of themselves; 90 % lie within so many of their errors
 
 
@@ -117,13 +117,18 @@ def large_rows(shape: tuple[int, int], goals: dict[float, float], weights: Weigh
         yield Row(f"--seconds {seconds:g}: {_promise(scan)}", _figure(judged), f">= {goal}", met)
 
 
+def _path(step: int) -> Path:
+    return shipped_weights(plain=step in PLAIN_STEPS)
+
+
 @cache
-def shipped() -> Weights:
-    return load_weights(WEIGHTS)
+def shipped(step: int = 1) -> Weights:
+    """The weights that plain scans are read with whose lines are so many px apart."""
+    return load_weights(_path(step))
 
 
 def chosen_scan(shape: tuple[int, int], seconds: float, weights: Weights | None = None) -> PlainScan:
-    """The scan that a survey of so many seconds takes, by the farm's weights or others."""
+    """The scan that a survey of so many seconds takes, by the weights for plain scans or others."""
     weights = weights or shipped()
     grid = SceneGrid(*shape, weights.config.patch, weights.config.factor)
     along, _, _ = cheapest_full(grid, CAMERA, COST)
@@ -151,11 +156,11 @@ def _figure(judged: Judged) -> str:
 
 
 @cache
-def scores() -> MapScores:
-    """How what maps by the shipped weights expect of themselves came true."""
-    weights = shipped()
+def scores(step: int) -> MapScores:
+    """How what maps by the shipped weights for such lines expect of themselves came true."""
+    weights = shipped(step)
     described = Description(weights.config, weights.basis, weights.class_names, weights.record)
-    return MapScores.read(load_familiar(WEIGHTS, described).record[MAP_SCORES])
+    return MapScores.read(load_familiar(_path(step), described).record[MAP_SCORES])
 
 
 def seconds_of(step: int, exposure_ms: float) -> float:
@@ -172,8 +177,8 @@ def _plain(seed: int, step: int, exposure_ms: float) -> PlanMap:
 
 
 def map_of(scene: RasterScene, seed: int, step: int, exposure_ms: float, weights: Weights | None = None) -> PlanMap:
-    """The map of a scene's plain scan; what it says of itself by the farm's weights alone."""
-    others, weights, rig = weights is not None, weights or shipped(), Rig(CAMERA)
+    """The map of a scene's plain scan; what it says of itself by the house's own weights alone."""
+    others, weights, rig = weights is not None, weights or shipped(step), Rig(CAMERA)
     grid = SceneGrid(*scene.shape, weights.config.patch, weights.config.factor)
     along, _, _ = cheapest_full(grid, CAMERA, COST)
     sweeps = plain_sweeps(grid, CAMERA, along, step=step, exposure_ms=exposure_ms)
@@ -185,7 +190,7 @@ def map_of(scene: RasterScene, seed: int, step: int, exposure_ms: float, weights
     if others:
         return PlanMap(look.seconds, judged)
     assert drawn.log_probability is not None
-    told = scores().expected(expected_counts([drawn.log_probability], weights.config.classes), step, exposure_ms)
+    told = scores(step).expected(expected_counts([drawn.log_probability], weights.config.classes), step, exposure_ms)
     assert told is not None
     return PlanMap(look.seconds, judged, 100 * told.miou, 100 * told.error)
 
@@ -216,7 +221,7 @@ def main(arguments: Sequence[str]) -> int:
     """Draw maps of larger farms, WIDTHxHEIGHT, by some weights, and print them beside their goals."""
     size, *others = arguments
     width, height = (int(side) for side in size.split("x"))
-    for row in large_rows((height, width), LARGE, load_weights(Path(others[0]) if others else WEIGHTS)):
+    for row in large_rows((height, width), LARGE, load_weights(Path(others[0])) if others else shipped()):
         print(f"{row.what}: {row.figure}, goal {row.goal}: {'met' if row.met else 'MISSED'}", flush=True)
     return 0
 

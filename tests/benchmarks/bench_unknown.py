@@ -20,6 +20,7 @@ from rich.console import Console
 
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
+from flows.survey.survey_model import shipped_weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 
@@ -30,7 +31,7 @@ LOOKS: dict[str, dict[str, Any]] = {
     "two passes, budget 0.5": {"budget": 0.5},
     "every line, 5 ms": {"scan_step": 1, "scan_exposure_ms": 5},
 }
-WEIGHTS = Path(__file__).resolve().parents[2] / "models" / "shipped" / "farm.safetensors"
+WEIGHTS = shipped_weights(plain=True)
 BANDS_NM = np.linspace(405.0, 995.0, 60)
 PINES = data_folder("indian_pines")
 BRIGHTNESS = 0.22  # mean reflectance of farms

@@ -111,8 +111,8 @@ def _drawing(
     prior = run.prior
     memory = None
     if prior is not None and not _is_turned(run, lies):
-        last = prior.looks[0].mosaic
-        belief, coarse = (prior.belief.path / "belief.zarr").resolve(), (last.path / "mosaic.zarr").resolve()
+        last, belief = prior.looks[0], (prior.belief.path / "belief.zarr").resolve()
+        coarse = (last.mosaic.path / "mosaic.zarr").resolve() if last.factor == run.grid.factor else None
         memory = FieldMemory(belief, coarse, prior.days, prior.classes, whole_pixels(lies))
     create_belief(path / "belief.zarr", shape, legend, grid=run.angular_grid(), goes_on=memory is not None)
     seen = (mosaic.path / "mosaic.zarr").resolve(), (patches.path / "patches.zarr").resolve()

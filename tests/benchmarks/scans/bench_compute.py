@@ -94,22 +94,22 @@ def means(image: Columns, step: int) -> Columns:
 
 
 def rows() -> list[Row]:
-    """What budgets lose by the weights of scans that are read whole, then by those that surveys with budgets take."""
+    """What budgets lose by the weights of surveys in two passes, then by those that plain scans are read with."""
     found = []
-    for sparing in (False, True):
-        path = shipped_weights(sparing=sparing)
+    for plain in (False, True):
+        path = shipped_weights(plain=plain)
         weights = load_weights(path)
         fields = [field_of(weights, seed) for seed in SEEDS]
         s = weights.config.factor
         none = [field.miou(weights, field.seen.grid.valid_seats()[:0]) - field.every for field in fields]
         found.append(Row(f"{path.stem}: everything kept and read", _figure([field.every for field in fields])))
         found.append(Row(f"means of {s} x {s} px alone", _figure(none)))
-        found += [*_budget_rows(weights, fields, sparing), *_price_rows(weights, fields)]
-        found += [] if sparing else _less_fine_rows(weights, fields)
+        found += [*_budget_rows(weights, fields, plain), *_price_rows(weights, fields)]
+        found += [] if plain else _less_fine_rows(weights, fields)
     return found
 
 
-def _budget_rows(weights: Weights, fields: Sequence[ReadField], sparing: bool) -> Iterator[Row]:
+def _budget_rows(weights: Weights, fields: Sequence[ReadField], plain: bool) -> Iterator[Row]:
     for compute, kept in BUDGETS:
         for policy in (*POLICIES, "oracle"):
             losses, shares = [], []
@@ -118,7 +118,7 @@ def _budget_rows(weights: Weights, fields: Sequence[ReadField], sparing: bool) -
                 bought = budget.choose(_scores(field, policy, seed))
                 losses.append(field.miou(weights, bought) - field.every)
                 shares.append(_shares(budget, bought))
-            most = GOALS.get((compute, kept)) if sparing and policy == CHEAP_POLICY else None
+            most = GOALS.get((compute, kept)) if plain and policy == CHEAP_POLICY else None
             goal = "" if most is None else f">= -{most:g}"
             met = None if most is None else float(np.mean(losses)) >= -most
             yield Row(f"--compute {compute} --bytes-kept {kept}, {policy}", _figure(losses), goal, met, shares[0])

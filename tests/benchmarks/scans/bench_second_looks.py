@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 from measure import Row
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 from sparse_lands import sparse_land
 
 from flows.survey.stages.accuracy import columns_of_all_seats
+from flows.survey.survey_model import shipped_weights
 from flows.training.look import chosen_effects
 from models.evaluation.metrics import confusion, mean_iou
 from models.reading.doubts import SeatDoubts
@@ -59,7 +59,7 @@ DENSE_GAIN, SPARSE_GAIN = 0.5, 1.5  # points that second looks had to gain in th
 FAR_BELOW = 0.03  # of mIoU by the record: plain scans that are expected to score as much less are not tried
 BANDS, MEMORY, AGAIN_NOISE = 270, 2**30, 100_000_000
 CAMERA, COST = LineCamera(), CostModel()
-WEIGHTS = Path(__file__).resolve().parents[3] / "models" / "shipped" / "farm.safetensors"
+WEIGHTS = shipped_weights()
 
 
 def joint_exposure(first_ms: float, second_ms: float) -> float:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flows.survey.survey_model import shipped_weights
 from flows.tradeoff.plans import plain_look
 from flows.training.look import chosen_effects
 from models.evaluation.metrics import confusion, mean_iou
@@ -32,7 +32,7 @@ CAMERA, COST = LineCamera(), CostModel()
 ANEW, QUICK, REFERENCE = (1, 25.0), (2, 5.0), (1, 12.0)  # step and exposure [ms]
 FIRST_DAY, HOUR = 172, 11.0
 SEASON = [(110 + 6 * number, (11.0, 9.5, 13.0, 15.0)[number % 4]) for number in range(30)]
-WEIGHTS = Path(__file__).resolve().parents[3] / "models" / "shipped" / "farm.safetensors"
+WEIGHTS = shipped_weights(plain=True)
 Classes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
@@ -86,9 +86,11 @@ def seen_by(scene: RasterScene, seed: int, how: tuple[int, float]) -> Seen:
     return Seen(looked, np.asarray(scene.labels, np.uint8), look.seconds)
 
 
-def later(before: Seen, belief: Belief, now: Seen, days: float, *, reader: bool = True) -> Belief:
-    """What is believed after a later look."""
-    memory = Remembered(belief, before.looked.coarse, days)
+def later(
+    before: Seen, belief: Belief, now: Seen, days: float, *, reader: bool = True, comparable: bool = True
+) -> Belief:
+    """What is believed after a later look, whose coarse pixels are ``comparable`` to those of before."""
+    memory = Remembered(belief, before.looked.coarse if comparable else None, days)
     return recall(memory, now.looked, shipped_memory().reader if reader else None)
 
 

@@ -42,6 +42,9 @@ def after_days() -> Iterator[Row]:
                 f"quick look alone, {now.seconds:.1f} s": now.alone,
                 "old class unless surer than .97": _unless_surer(before, now),
                 "memory without a reader": later(before, first_belief(before.looked), now, days, reader=False),
+                "memory left by weights of other coarse pixels": later(
+                    before, first_belief(before.looked), now, days, comparable=False
+                ),
                 "memory": later(before, first_belief(before.looked), now, days),
             }
             scores = found.setdefault(days, {})

@@ -347,12 +347,21 @@ def test_two_visits_at_once_are_both_kept(visited: Path, twice: Any, survey_png:
     assert not problems(visited)
 
 
-def test_weights_of_another_factor_have_no_memory(
+def test_weights_of_another_factor_go_on_from_what_is_believed(
     visited: Path, survey_png: Survey, make_weights: WeightsMaker
 ) -> None:
-    """Their coarse pixels are others, so that both coarse looks cannot be compared: said, and gone on without."""
-    weights = make_weights(factor=2)
-    flags = {"weights": str(weights), "visit": "2026-06-07T10:00:00Z", "prior": "latest"}
+    """Both coarse looks are laid on each other in the larger pixels; what they show is not compared any further."""
+    flags = {"weights": str(make_weights(factor=2)), "visit": "2026-06-07T10:00:00Z", "prior": "latest"}
     words, published = words_of(visited, survey_png, **flags)
-    assert "cannot be used: its coarse look has 32 x 24 px, these weights read 64 x 48" in words
-    assert "memory" not in published.receipt
+    assert "3 days earlier" in words
+    assert published.receipt["memory"]["shift_px"] == [0, 0]
+    assert published.receipt["memory"]["put_aside"] is None
+    assert not problems(visited)
+
+
+def test_a_coarse_look_in_no_pixels_of_ours_is_no_memory(visited: Path) -> None:
+    """Pixels wider than a patch cannot be laid beside today's: said, with both sizes."""
+    settings = load_settings(None, {"prior": "latest", "visit": "2026-06-20T10:00:00Z"})
+    found, notes = memory.find_prior(Archive.open(visited), settings, "north", SceneGrid(96, 128, 2, 2), CLASSES)
+    assert found is None
+    assert "cannot be used: its coarse look has 32 x 24 px, these weights read 64 x 48" in notes[0]

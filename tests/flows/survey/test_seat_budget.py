@@ -17,12 +17,10 @@ from flows.archive.plan_command import kept_words, plan_content
 from flows.settings.load import load_settings, parse_settings
 from flows.survey.reading_costs import ReadingCosts
 from flows.survey.seat_budget import SeatBudget
-from flows.survey.survey_model import shipped_weights, weights_path
 from models.network.sizes import SegmenterConfig
-from models.weights.files import describe_weights, save_weights
+from models.weights.files import save_weights
 from pipeline.errors import BudgetError, SettingsError
 from pipeline.geometry.grid import SceneGrid
-from pipeline.planning.plain_scans import ScanRecord
 from tests.conftest import RGB_NM, Survey, random_weights
 
 COSTS = ReadingCosts(SegmenterConfig(classes=5), SceneGrid(192, 256, 16, 4), 30)
@@ -213,17 +211,6 @@ def test_a_plan_tells_what_the_budgets_pay_for(scene_files: Path, tiny: Path, tm
 def test_scores_are_cheap_where_multiply_adds_are_short(asked: dict[str, str], policy: str) -> None:
     """By default; who names a policy gets it, and a least gain is asked of scores that are gains."""
     assert load_settings(None, {"seconds": "5", **asked}).policy == policy
-
-
-def test_the_house_has_weights_for_budgets() -> None:
-    """Whose coarse pixels are 2 px wide, with a record of scans; of a scan that is read whole those for all surveys."""
-    asked = parse_settings({"scan_step": 1, "compute": "25%"})
-    assert weights_path(asked) == shipped_weights(sparing=True)
-    assert weights_path(replace(asked, compute=None)) == shipped_weights() != shipped_weights(sparing=True)
-    described = describe_weights(shipped_weights(sparing=True))
-    assert described.config.factor == 2
-    assert described.class_names == describe_weights(shipped_weights()).class_names
-    assert ScanRecord.read(described.record["scans"]).steps == (1, 2)
 
 
 def test_scores_without_a_glance_cost_no_glance() -> None:

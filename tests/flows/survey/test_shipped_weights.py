@@ -18,15 +18,17 @@ from flows.evaluate.frames import EvaluateRequest
 from flows.settings.load import load_settings
 from flows.survey.run import open_run
 from flows.survey.stages.accuracy import columns_of_all_seats
-from flows.survey.survey_model import shipped_weights
+from flows.survey.survey_model import PLAIN_STEPS, shipped_weights, weights_offered, weights_path
 from models.evaluation.metrics import mean_iou
 from models.evaluation.placement import Controls, run_controls
 from models.reading.inference import glance
 from models.weights.files import UNSEALED, Weights, content_key, describe_weights, load_weights
 from models.weights.sealed_files import SEAL, TENSORS
+from pipeline.errors import BudgetError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.coverage import coarse_sweeps, full_sweeps
+from pipeline.planning.plain_scans import ScanRecord
 from pipeline.rectify.region import mosaic_rows
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.farm.farm_plan import CLASSES
@@ -71,6 +73,54 @@ def test_file_is_sealed_small_and_tells_its_making(weights: Weights) -> None:
     assert weights.class_names == tuple(entry for entry in CLASSES)
     split = weights.record["split"]
     assert not set(split["train"]) & set(split["validation"])
+
+
+def test_plain_scans_have_weights_of_their_own() -> None:
+    """Their coarse pixels are 2 px wide; what they know of scans is what surveys take them for."""
+    plain, two_passes = (describe_weights(shipped_weights(plain=which)) for which in (True, False))
+    assert (plain.config.factor, two_passes.config.factor) == (2, 4)
+    assert plain.class_names == two_passes.class_names
+    assert ScanRecord.read(plain.record["scans"]).steps == PLAIN_STEPS
+    assert all(plain.config.factor % step == 0 for step in PLAIN_STEPS)
+    assert set(two_passes.record["split"]["validation"]) == set(plain.record["split"]["validation"])
+
+
+@pytest.mark.parametrize(
+    ("asked", "plain"),
+    [
+        ({"budget": "0.5"}, [False]),
+        ({"scan_step": "1"}, [True]),
+        ({"scan_step": "2", "compute": "25%"}, [True]),
+        ({"scan_step": "4"}, [False]),
+        ({"seconds": "9"}, [True, False]),
+    ],
+)
+def test_the_look_says_which_weights_read_it(asked: dict[str, str], plain: list[bool]) -> None:
+    """One's own are taken for all; of the house's those that know lines so far apart."""
+    assert weights_offered(load_settings(None, asked)) == tuple(shipped_weights(plain=which) for which in plain)
+    own = load_settings(None, {**asked, "weights": "mine.safetensors"})
+    assert weights_offered(own) == (Path("mine.safetensors"),)
+
+
+@pytest.mark.parametrize(("seconds", "factor", "step"), [(3.5, 2, 2), (2.4, 4, 4)])
+def test_who_has_few_seconds_gets_the_weights_that_read_fewer_lines(
+    tmp_path: Path, seconds: float, factor: int, step: int
+) -> None:
+    """Every 2nd line of 640 x 512 px takes 2.6 s at least; in less every 4th is read by those that know it."""
+    run = open_run(
+        load_settings(None, {"seconds": str(seconds), "size": "640x512", "out": str(tmp_path)}), planning=True
+    )
+    assert (run.described.config.factor, run.settings.scan_step) == (factor, step)
+    assert weights_path(run.settings) == shipped_weights(plain=factor == 2)
+    assert run.settings.weights is None
+
+
+def test_seconds_that_no_weights_have_a_scan_for_are_refused(tmp_path: Path) -> None:
+    """With the least of those weights that read the fewest lines."""
+    asked = load_settings(None, {"seconds": "1", "size": "640x512", "out": str(tmp_path / "a")})
+    with pytest.raises(BudgetError, match=r"--seconds 1; the least is .*every 4th line"):
+        open_run(asked)
+    assert not (tmp_path / "a").exists()
 
 
 def test_detail_where_the_map_is_unsure_beats_chance(controls: Controls) -> None:

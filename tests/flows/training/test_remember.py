@@ -64,15 +64,18 @@ def test_lands_are_visited_in_the_order_of_their_days() -> None:
         assert days[-1] <= 318
 
 
-def test_the_command_trains_judges_and_says_how(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("plain", [False, True])
+def test_the_command_trains_judges_and_says_how(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, plain: bool) -> None:
     """A file for the weights that it was trained for, with seeds, settings and what it is worth on another land."""
     monkeypatch.setattr(remember, "VISITS", 2)
     monkeypatch.setattr(remember, "JUDGED_AFTER", (3,))
-    out = tmp_path / "farm.memory.safetensors"
-    request = MemoryRequest("farm", shipped_weights(), out, 1, 1, (128, 192), QUICK, "spectralzoom train")
+    monkeypatch.setattr(remember, "STEPS", {4: 0.7, 1: 0.3})  # of which weights with coarse pixels of 2 px read one
+    out, weights = tmp_path / "farm.memory.safetensors", shipped_weights(plain=plain)
+    request = MemoryRequest("farm", weights, out, 1, 1, (128, 192), QUICK, "spectralzoom train")
     record = run_remember(request, Console(quiet=True))
-    found = load_memory(out, describe_weights(shipped_weights()))
-    assert found.weights_key == content_key(shipped_weights())
+    found = load_memory(out, describe_weights(weights))
+    assert found.weights_key == content_key(weights)
+    assert found.reader.sizes.factor == (2 if plain else 4)
     assert dict(found.record) == record
     assert (record["lands"], record["steps"], record["command"]) == ([200_000], 2, "spectralzoom train")
     assert [row["days"] for row in record["validation"]] == [3.0]
@@ -103,11 +106,13 @@ def test_weights_of_other_classes_are_refused(tmp_path: Path, weights: Path) -> 
         train_memory(MemoryRequest("farm", weights, tmp_path / "x.safetensors"))
 
 
-def test_the_shipped_weights_have_a_reader() -> None:
+@pytest.mark.parametrize(("plain", "factor"), [(False, 4), (True, 2)])
+def test_the_shipped_weights_have_a_reader(plain: bool, factor: int) -> None:
     """It fits them, was trained for them, and tells the lands that it has seen."""
-    found = load_memory(memory_path(shipped_weights()), describe_weights(shipped_weights()))
-    assert found.weights_key == content_key(shipped_weights())
+    weights = shipped_weights(plain=plain)
+    found = load_memory(memory_path(weights), describe_weights(weights))
+    assert found.weights_key == content_key(weights)
     assert min(found.record["lands"]) >= 200_000
-    assert found.reader.sizes == MemorySizes(11, 24)
+    assert found.reader.sizes == MemorySizes(11, 24, factor)
     assert isinstance(found.reader, MemoryReader)
     assert all(torch.isfinite(tensor).all() for tensor in found.reader.state_dict().values())
