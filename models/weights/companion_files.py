@@ -13,7 +13,7 @@ from models.evaluation.expected_scores import MapScores
 from models.network.sizes import MemorySizes
 from models.reading.familiar import Familiar, Limits
 from models.weights.files import Description, content_key, unusable
-from models.weights.sealed_files import beside, changed_tensor, key_of_sealed, open_sealed, write_sealed
+from models.weights.sealed_files import beside, changed_tensor, key_of_sealed, open_sealed, own_tensors, write_sealed
 from pipeline.errors import WeightsError
 from pipeline.lazy import deferred
 
@@ -150,7 +150,7 @@ def load_familiar(weights: Path, described: Description) -> FamiliarWeights:
     path = familiar_path(weights)
     with open_sealed(path, "pt", FAMILIAR_FORMAT, _refused) as (file, about):
         _checked(path, about, described, content_key(weights))
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+        tensors = own_tensors(file)
     if wrong := changed_tensor(about, tensors) or unusable(tensors, spreads=("light", "rates")):
         raise _refused(path, wrong)
     try:
@@ -254,7 +254,7 @@ def load_memory(path: Path, described: Description) -> MemoryWeights:
     """
     with open_sealed(path, "pt", MEMORY_FORMAT, _refused_reader) as (file, about):
         sizes = _checked_reader(path, about, described)
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+        tensors = own_tensors(file)
     if wrong := changed_tensor(about, tensors) or unusable(tensors, spreads=()):
         raise _refused_reader(path, wrong)
     with torch.device("meta"):

@@ -20,6 +20,7 @@ from models.weights.sealed_files import (
     broken_seal,
     changed_tensor,
     hash_without_seal,
+    own_tensors,
     read_about,
     write_sealed,
 )
@@ -225,7 +226,7 @@ def read_tensors(path: Path, described: Description) -> dict[str, Tensor]:
         claimed = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
         if wrong := misfit(described.config, claimed):
             raise WeightsError(f"{path}: {wrong}; train it again")
-        tensors = {name: file.get_tensor(name) for name in claimed}
+        tensors = own_tensors(file)
     if wrong := changed_tensor(described.about, tensors) if described.sealed else "":
         raise WeightsError(f"{path} is damaged: {wrong}; copy or train the file again")
     if wrong := unusable(tensors):

@@ -63,6 +63,14 @@ def read_about(file: Any) -> dict[str, Any]:
     return about if isinstance(about, dict) else {}
 
 
+def own_tensors(file: Any) -> dict[str, Tensor]:
+    """Every tensor of a file that `safetensors.safe_open` opened, by name, in memory of its own.
+
+    What safetensors gives lies in the mapped file, and would change with it where that is written over.
+    """
+    return {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 - not a mapping
+
+
 @contextmanager
 def open_sealed(
     path: Path, framework: str, form: str, refused: Callable[[Path, str], WeightsError]
@@ -176,7 +184,7 @@ def read_checkpoint(path: Path) -> Checkpoint | None:
             elif kind != CHECKPOINT:
                 wrong = f"it holds {kind or 'no format mark'}, expected {CHECKPOINT}"
             elif not (wrong := broken_seal(about)):
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+                tensors = own_tensors(file)
                 wrong = changed_tensor(about, tensors)
     except DAMAGED as error:
         raise _refused(path, str(error)[:120]) from error

@@ -27,7 +27,7 @@ from models.weights.companion_files import (
     save_familiar,
     save_memory,
 )
-from models.weights.files import Description, content_key, describe_weights, save_weights
+from models.weights.files import Description, content_key, describe_weights, load_weights, save_weights
 from pipeline.errors import WeightsError
 from tests.models.conftest import make_weights
 from tests.models.reading.test_familiar import some_limits
@@ -80,11 +80,9 @@ def test_what_training_saw_is_read_as_it_was_told() -> None:
     assert [TrainedOn.read(one.as_dict()) for one in (SEEN, bare)] == [SEEN, bare]
 
 
-def reader(folder: Path, **changed: int) -> tuple[Path, Description]:
-    """Weights and a reader beside them."""
-    weights, path = make_weights(), folder / "own.safetensors"
-    save_weights(weights, path)
-    config = weights.config
+def small_reader(described: Description, **changed: int) -> MemoryWeights:
+    """A reader for weights so described."""
+    config = described.config
     sizes = {
         "classes": config.classes,
         "columns": config.columns,
@@ -93,9 +91,16 @@ def reader(folder: Path, **changed: int) -> tuple[Path, Description]:
         "coarse_width": 4,
     }
     built = MemoryReader(MemorySizes(**{**sizes, **changed}))
-    made = MemoryWeights(built, "0123", weights.class_names[: built.sizes.classes], {"seed": 1})
-    save_memory(made, memory_path(path))
-    return path, describe_weights(path)
+    return MemoryWeights(built, "0123", described.class_names[: built.sizes.classes], {"seed": 1})
+
+
+def reader(folder: Path, **changed: int) -> tuple[Path, Description]:
+    """Weights and a reader beside them."""
+    weights, path = make_weights(), folder / "own.safetensors"
+    save_weights(weights, path)
+    described = describe_weights(path)
+    save_memory(small_reader(described, **changed), memory_path(path))
+    return path, described
 
 
 def test_a_reader_lies_beside_its_weights(tmp_path: Path) -> None:
@@ -176,3 +181,22 @@ def test_weights_are_no_reader(tmp_path: Path) -> None:
     memory_path(path).write_text("hello")
     with pytest.raises(WeightsError, match="no readable file"):
         load_memory(memory_path(path), described)
+
+
+def test_what_was_read_stays_where_the_file_is_written_over(tmp_path: Path) -> None:
+    """Copied onto while a survey reads with them, weights, reader and limits are still those that were checked."""
+    path, described = familiar(tmp_path)
+    save_memory(small_reader(described), memory_path(path))
+    weights, told = load_weights(path), load_familiar(path, described).familiar
+    numbers = load_memory(memory_path(path), described).reader.state_dict()
+    kept = [
+        told.read.copy(),
+        weights.normalisation.whitening.copy(),
+        {name: one.clone() for name, one in numbers.items()},
+    ]
+    for file in (path, memory_path(path), familiar_path(path)):
+        with file.open("r+b") as opened:
+            opened.write(bytes(file.stat().st_size))
+    np.testing.assert_array_equal(told.read, kept[0])
+    np.testing.assert_array_equal(weights.normalisation.whitening, kept[1])
+    assert all(torch.equal(numbers[name], one) for name, one in kept[2].items())
