@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
-from matplotlib.transforms import blended_transform_factory
+from matplotlib.transforms import Bbox, blended_transform_factory
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
@@ -120,6 +120,8 @@ _FAMILIES = ("#0072B2", "#007A5A", "#8a6d00", "#D55E00", "#A23B72")
 _FLOOR = "#007A5A"
 _ACROSS = 3  # panels in a row
 _UNITS = ((1e6, "ms"), (1e3, "µs"), (1.0, "ns"))
+_SIDES = tuple(((x, y), "left" if x > 0 else "right", "bottom" if y > 0 else "top") for x in (6, -6) for y in (5, -5))
+_DOT = 11.0  # pixels across a mark
 _SAME = 8  # pixels of the figure apart: a mark lies on another
 _ROOM, _RIGHT_ROOM = 0.18, 0.28  # of the range of the logarithms, beyond points and floors
 
@@ -182,6 +184,7 @@ def _draw_tradeoff(axes: Axes, result: Result) -> None:
 def _draw_families(axes: Axes, result: Result, placed: Sequence[tuple[tuple[float, float], Point]]) -> None:
     """One line a family, with its name in a legend and its members' at their points."""
     families: dict[str, list[tuple[tuple[float, float], Point]]] = {}
+    named: list[tuple[tuple[float, float], str, str]] = []
     for place, point in placed:
         families.setdefault(str(point.setting).rpartition(", ")[0], []).append((place, point))
     for (name, members), colour in zip(families.items(), cycle(_FAMILIES), strict=False):
@@ -190,18 +193,37 @@ def _draw_families(axes: Axes, result: Result, placed: Sequence[tuple[tuple[floa
         for (x, y), point in members:
             fill = "full" if point.pareto else "none"
             axes.plot(x, y, marker="o", color=colour, markersize=8, fillstyle=fill, zorder=3)
-            axes.annotate(
-                str(point.setting).rpartition(", ")[2],
-                (x, y),
-                (6, 5),
+            named.append(((x, y), str(point.setting).rpartition(", ")[2], colour))
+    _name_points(axes, named)
+    axes.legend(frameon=False, labelcolor="linecolor", fontsize=10)
+    return _finish(axes, result, "seconds by the cost model")
+
+
+def _name_points(axes: Axes, named: Sequence[tuple[tuple[float, float], str, str]]) -> None:
+    """Write names of points, in their colours, on the first side of each where none of another point lies."""
+    middles = [axes.transData.transform(at) for at, _, _ in named]
+    dots = [Bbox([middle - _DOT / 2, middle + _DOT / 2]) for middle in middles]
+    written: list[Bbox] = []
+    for number, (at, name, colour) in enumerate(named):
+        taken = [*written, *dots[:number], *dots[number + 1 :]]
+        for beside, ha, va in _SIDES:
+            text = axes.annotate(
+                name,
+                at,
+                beside,
                 textcoords="offset points",
+                ha=ha,
+                va=va,
                 color=colour,
                 size=8.5,
                 zorder=4,
                 path_effects=[withStroke(linewidth=2.5, foreground=PAPER)],
             )
-    axes.legend(frameon=False, labelcolor="linecolor", fontsize=10)
-    return _finish(axes, result, "seconds by the cost model")
+            box = text.get_window_extent()
+            if beside == _SIDES[-1][0] or not any(box.overlaps(other) for other in taken):
+                written.append(box)
+                break
+            text.remove()
 
 
 def _finish(axes: Axes, result: Result, across: str) -> None:
