@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from pipeline.errors import ChunkError, ShapeError
 from storage.arrays.georeference import create_placed_group, write_corners
 from storage.arrays.layout import (
+    QUICK_PACKING,
     SHARD_ROWS,
     AngularGrid,
     ArraySpec,
@@ -33,8 +35,6 @@ from storage.arrays.layout import (
     write_small,
 )
 from storage.arrays.quicklooks import Quicklook, write_quicklook
-
-BLOCK_VALUES = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -114,11 +114,7 @@ class MosaicWriter:
                 f"the mosaic is {self._shape}"
             )
         whole_shards("the mosaic", (rows, columns), self._shape[:2], self.tile_shape)
-        flat = np.ascontiguousarray(values, np.float32).reshape(-1)
-        rounded = np.empty_like(flat)
-        for first in range(0, len(flat), BLOCK_VALUES):  # stays in cache: in one go it costs more than the codec
-            rounded[first : first + BLOCK_VALUES] = round_bits(flat[first : first + BLOCK_VALUES])
-        self._values[rows, columns] = rounded.reshape(values.shape)
+        self._values[rows, columns] = round_bits(values)
         self._coverage[rows, columns] = coverage.astype(np.float32)
 
     def write_quicklook(self, image: NDArray[np.uint8]) -> None:
@@ -165,6 +161,7 @@ def mosaic_brightness(path: Path) -> NDArray[np.float32]:
 
 
 PATCHES_A_SHARD = 64
+CHUNK_BYTES = 1 << 22  # smaller ones cost more calls than they save in reading single patches
 
 
 class PatchWriter:
@@ -224,9 +221,12 @@ class PatchWriter:
 def _create_stack(
     group: zarr.Group, name: str, dims: tuple[str, ...], shape: tuple[int, ...], dtype: str, about: dict[str, Any]
 ) -> zarr.Array[Any]:
-    """One chunk an entry of the first axis, 64 of them a file."""
+    """64 entries of the first axis a file, in equal chunks of up to 4 MB."""
     shard = min(PATCHES_A_SHARD, max(shape[0], 1))
-    return create_array(group, name, ArraySpec(dims, shape, dtype, (1, *shape[1:]), (shard, *shape[1:])), about)
+    fits = CHUNK_BYTES // max(math.prod(shape[1:]) * np.dtype(dtype).itemsize, 1)
+    chunk = max(count for count in range(1, shard + 1) if shard % count == 0 and count <= max(fits, 1))
+    spec = ArraySpec(dims, shape, dtype, (chunk, *shape[1:]), (shard, *shape[1:]))
+    return create_array(group, name, spec, about, packing=QUICK_PACKING)
 
 
 @dataclass(frozen=True)

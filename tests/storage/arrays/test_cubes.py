@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+import zarr
 
 from pipeline.errors import ChunkError, IncompleteStoreError, ShapeError
 from pipeline.geometry.scan import Sweep
@@ -150,6 +151,13 @@ def test_layout_is_one_range_read_a_patch(tmp_path: Path) -> None:
     assert len([path for path in (tmp_path / "raw.zarr" / "dn" / "c").rglob("*") if path.is_file()]) == 3
 
 
+def test_an_image_without_bands_has_a_chunk_a_file(tmp_path: Path) -> None:
+    """Calls for chunks of a few kilobytes would cost more than unpacking them."""
+    coverage = MosaicWriter(tmp_path / "m.zarr", (130, 700), np.array([500.0, 700.0])).group["coverage"]
+    assert isinstance(coverage, zarr.Array)
+    assert coverage.chunks == coverage.shards == (64, 640)
+
+
 def _mosaic(bands: int, shape: tuple[int, int] = (100, 70)) -> Mosaic:
     rng = np.random.default_rng(bands)
     values = rng.lognormal(size=(*shape, bands)).astype(np.float32)
@@ -197,7 +205,7 @@ def test_mosaic_says_where_its_pixels_lie(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("count", [0, 1, 5, 70])
 def test_patches_round_trip(tmp_path: Path, count: int) -> None:
-    """Any number of patches, none included; each is one chunk, and blocks of 64 give the same store."""
+    """Any number of patches, none included; blocks of 64 give the same store."""
     rng = np.random.default_rng(count)
     seats, origin = np.arange(count, dtype=np.int64)[::-1].copy(), rng.integers(0, 900, (count, 2))
     values, valid = rng.random((count, 8, 8, 15)).astype(np.float32), rng.random((count, 8, 8)) > 0.3
@@ -213,6 +221,15 @@ def test_patches_round_trip(tmp_path: Path, count: int) -> None:
         assert {"seat", "seat_y", "seat_x", "wavelength", "fwhm"} <= set(data.coords)
         np.testing.assert_array_equal(data["valid"].values, valid)
         np.testing.assert_array_equal(np.stack([data["seat_y"], data["seat_x"]], axis=-1), origin)
+
+
+@pytest.mark.parametrize(("count", "bands", "chunk"), [(70, 1, 64), (70, 270, 8), (6, 900, 3), (7, 900, 1)])
+def test_chunks_of_patches_have_up_to_4_mb(tmp_path: Path, count: int, bands: int, chunk: int) -> None:
+    """As many patches of 16 x 16 px make a chunk as fit 4 MB and part the file evenly, and one at the least."""
+    origin = np.zeros((count, 2), np.int64)
+    PatchWriter(tmp_path / "p.zarr", np.arange(count), origin, 16, np.linspace(400, 900, bands))
+    chunks = zarr.open_group(tmp_path / "p.zarr", mode="r")["values"].chunks  # type: ignore[union-attr]
+    assert chunks == (chunk, 16, 16, bands)
 
 
 def test_patches_that_split_a_shard_are_refused(tmp_path: Path) -> None:
