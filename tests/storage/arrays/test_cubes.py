@@ -11,7 +11,7 @@ import pytest
 import xarray as xr
 import zarr
 
-from pipeline.errors import ChunkError, IncompleteStoreError, ShapeError
+from pipeline.errors import IncompleteStoreError, ShapeError
 from pipeline.geometry.scan import Sweep
 from pipeline.source import Line, References
 from storage.archive.archive import Archive
@@ -203,15 +203,15 @@ def test_mosaic_says_where_its_pixels_lie(tmp_path: Path) -> None:
         assert data.attrs["zarr_conventions"][0]["uuid"].startswith("689b58e2")
 
 
-@pytest.mark.parametrize("count", [0, 1, 5, 70])
-def test_patches_round_trip(tmp_path: Path, count: int) -> None:
-    """Any number of patches, none included; blocks of 64 give the same store."""
+@pytest.mark.parametrize(("count", "at_once"), [(0, 64), (1, 64), (5, 2), (70, 64), (70, 70), (150, 40), (128, 1)])
+def test_patches_round_trip(tmp_path: Path, count: int, at_once: int) -> None:
+    """Any number of patches, none included, however many are written at once."""
     rng = np.random.default_rng(count)
     seats, origin = np.arange(count, dtype=np.int64)[::-1].copy(), rng.integers(0, 900, (count, 2))
     values, valid = rng.random((count, 8, 8, 15)).astype(np.float32), rng.random((count, 8, 8)) > 0.3
     writer = PatchWriter(tmp_path / "p.zarr", seats, origin, 8, np.linspace(400, 900, 15), fwhm_nm=np.full(15, 4.0))
-    for first in range(0, max(count, 1), 64):
-        writer.write(first, values[first : first + 64], valid[first : first + 64])
+    for first in range(0, max(count, 1), at_once):
+        writer.write(values[first : first + at_once], valid[first : first + at_once])
     found = open_patches(tmp_path / "p.zarr")
     np.testing.assert_array_equal(found.seats, seats)
     np.testing.assert_array_equal(found.read(0, count), round_bits(values))
@@ -232,16 +232,19 @@ def test_chunks_of_patches_have_up_to_4_mb(tmp_path: Path, count: int, bands: in
     assert chunks == (chunk, 16, 16, bands)
 
 
-def test_patches_that_split_a_shard_are_refused(tmp_path: Path) -> None:
-    """A write starts and ends at multiples of 64 patches, or at the end, and has the store's shape."""
+def test_patches_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    """More than there are seats, of another size, or with the validity of others: nothing of them is kept."""
     writer = PatchWriter(tmp_path / "p.zarr", np.arange(70), np.zeros((70, 2), np.int64), 2, np.array([500.0]))
     values, valid = np.zeros((70, 2, 2, 1), np.float32), np.ones((70, 2, 2), bool)
-    with pytest.raises(ChunkError, match="patches 0:10 split shards of 64"):
-        writer.write(0, values[:10], valid[:10])
-    with pytest.raises(ChunkError, match="patches 60:70 split"):
-        writer.write(60, values[:10], valid[:10])
-    with pytest.raises(ShapeError, match="patches 64:134"):
-        writer.write(64, values, valid)
+    writer.write(values[:10], valid[:10])
+    with pytest.raises(ShapeError, match="patches 10:80"):
+        writer.write(values, valid)
+    with pytest.raises(ShapeError, match="patches 10:11"):
+        writer.write(values[:1, :1], valid[:1, :1])
+    with pytest.raises(ShapeError, match="patches 10:12"):
+        writer.write(values[:2], valid[:1])
+    writer.write(values[10:], valid[10:])
+    assert open_patches(tmp_path / "p.zarr").read(0, 70).max() == 0
 
 
 def test_attention_round_trip(tmp_path: Path) -> None:
