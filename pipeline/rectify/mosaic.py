@@ -264,11 +264,13 @@ def cut_runs(looked: Sequence[NDArray[np.float64]], bands: int) -> list[slice]:
         return float(np.nansum(np.prod(high - low + 2 * TAPS, axis=1) * bands + RUN_ELEMENTS))
 
     def cut(run: slice) -> list[slice]:
-        middle = (run.start + run.stop) // 2
-        one, other = slice(run.start, middle), slice(middle, run.stop)
-        if run.stop - run.start > 1 and price(one) + price(other) < price(run):
-            return cut(one) + cut(other)
-        return [run]
+        if run.stop - run.start == 1:
+            return [run]
+        middle = (
+            run.start + run.stop
+        ) // 2  # a half may gain nothing by itself, as where two sweeps meet, but quarters
+        parts = cut(slice(run.start, middle)) + cut(slice(middle, run.stop))
+        return parts if sum(map(price, parts)) < price(run) else [run]
 
     return cut(slice(0, boxes.shape[1]))
 

@@ -183,7 +183,7 @@ def create_belief(
         "_FillValue": NOTHING,
         **place,
     }
-    spec = image_spec(("y", "x", "class"), (*shape, len(legend.names)), "|u1")
+    spec = image_spec(("y", "x", "class"), (*shape, len(legend.names)), "|u1", whole=True)
     create_array(group, "log_probability", spec, about)
     about = {"long_name": "time since the pixel was looked at", "units": "days", "scale_factor": DAY_STEP, **place}
     create_array(group, "age", image_spec(("y", "x"), shape, "<u2"), {**about, "_FillValue": NEVER})

@@ -16,7 +16,7 @@ from pipeline.errors import IncompleteStoreError, ShapeError
 from pipeline.geometry.scan import Sweep
 from pipeline.source import Line, References
 from storage.arrays.layout import (
-    RAW_LEVEL,
+    RAW_PACKING,
     SHARD_ROWS,
     create_array,
     create_group,
@@ -81,7 +81,7 @@ class RawCubeWriter:
         about = {"long_name": "raw numbers of the camera", "units": "1", "coordinates": f"{bands} {_LINE_COORDINATES}"}
         write_counts(self._group, line=header.shape[0], sample=header.shape[1])
         spec = image_spec(("line", "sample", "band"), header.shape, "<u2")
-        self._dn = create_array(self._group, "dn", spec, about, level=RAW_LEVEL)
+        self._dn = create_array(self._group, "dn", spec, about, packing=RAW_PACKING)
         known = header.references
         _write_references(self._group, known)
         self._seen = LineThumbnail(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,9 +12,10 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from pipeline.errors import ChunkError, ShapeError
+from pipeline.errors import ShapeError
 from storage.arrays.georeference import create_placed_group, write_corners
 from storage.arrays.layout import (
+    QUICK_PACKING,
     SHARD_ROWS,
     AngularGrid,
     ArraySpec,
@@ -33,8 +35,6 @@ from storage.arrays.layout import (
     write_small,
 )
 from storage.arrays.quicklooks import Quicklook, write_quicklook
-
-BLOCK_VALUES = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -114,11 +114,7 @@ class MosaicWriter:
                 f"the mosaic is {self._shape}"
             )
         whole_shards("the mosaic", (rows, columns), self._shape[:2], self.tile_shape)
-        flat = np.ascontiguousarray(values, np.float32).reshape(-1)
-        rounded = np.empty_like(flat)
-        for first in range(0, len(flat), BLOCK_VALUES):  # stays in cache: in one go it costs more than the codec
-            rounded[first : first + BLOCK_VALUES] = round_bits(flat[first : first + BLOCK_VALUES])
-        self._values[rows, columns] = rounded.reshape(values.shape)
+        self._values[rows, columns] = round_bits(values)
         self._coverage[rows, columns] = coverage.astype(np.float32)
 
     def write_quicklook(self, image: NDArray[np.uint8]) -> None:
@@ -165,10 +161,11 @@ def mosaic_brightness(path: Path) -> NDArray[np.float32]:
 
 
 PATCHES_A_SHARD = 64
+CHUNK_BYTES = 1 << 22  # smaller ones cost more calls than they save in reading single patches
 
 
 class PatchWriter:
-    """Write patches a few at a time, so that they never have to be in memory together.
+    """Write patches in order, a few at a time, so that they never have to be in memory together.
 
     Values are rounded to 11 bits.
     """
@@ -203,30 +200,44 @@ class PatchWriter:
         self._values = _create_stack(group, "values", ("patch", "y", "x", "band"), (*shape, bands), "<f4", about)
         about = {"long_name": "pixel was seen and lies on the scene", "coordinates": coordinates}
         self._valid = _create_stack(group, "valid", ("patch", "y", "x"), shape, "|b1", about)
+        self._next = 0  # patch that comes
+        shard = min(PATCHES_A_SHARD, max(count, 1))
+        # the shard that it lies in: memory that was used before, where fresh memory would cost more than the rounding
+        self._held = np.empty((shard, *shape[1:], bands), np.float32), np.empty((shard, *shape[1:]), np.bool_)
 
-    def write(self, first: int, values: NDArray[np.floating], valid: NDArray[np.bool_]) -> None:
-        """Store (patch, y, x, band) values and (patch, y, x) validity from patch ``first`` on.
+    def write(self, values: NDArray[np.floating], valid: NDArray[np.bool_]) -> None:
+        """Store the next (patch, y, x, band) values and (patch, y, x) validity, any number of patches.
 
-        Raises ChunkError: the patches split a shard of 64. ShapeError: they do not fit the store.
+        A shard of 64 is written once it is full, the last one once all patches are there. Raises ShapeError: they do
+        not fit the store.
         """
-        last = first + len(values)
+        count, (rounded, seen) = len(values), self._held
+        last = self._next + count
         if values.shape[1:] != self._values.shape[1:] or valid.shape != values.shape[:3] or last > self._count:
-            raise ShapeError(f"patches {first}:{last} are {values.shape} and {valid.shape} in {self._values.shape}")
-        if first % PATCHES_A_SHARD or (last % PATCHES_A_SHARD and last != self._count):
-            raise ChunkError(
-                f"patches {first}:{last} split shards of {PATCHES_A_SHARD}; start and end at their multiples"
+            raise ShapeError(
+                f"patches {self._next}:{last} are {values.shape} and {valid.shape} in {self._values.shape}"
             )
-        if len(values):
-            self._values[first:last] = round_bits(values)
-            self._valid[first:last] = valid
+        taken = 0
+        while taken < count:
+            at = self._next % PATCHES_A_SHARD
+            some = slice(taken, min(taken + PATCHES_A_SHARD - at, count))
+            end = at + some.stop - some.start
+            round_bits(values[some], out=rounded[at:end])
+            seen[at:end] = valid[some]
+            first, taken, self._next = self._next - at, some.stop, self._next - at + end
+            if end == PATCHES_A_SHARD or self._next == self._count:
+                self._values[first : self._next], self._valid[first : self._next] = rounded[:end], seen[:end]
 
 
 def _create_stack(
     group: zarr.Group, name: str, dims: tuple[str, ...], shape: tuple[int, ...], dtype: str, about: dict[str, Any]
 ) -> zarr.Array[Any]:
-    """One chunk an entry of the first axis, 64 of them a file."""
+    """64 entries of the first axis a file, in equal chunks of up to 4 MB."""
     shard = min(PATCHES_A_SHARD, max(shape[0], 1))
-    return create_array(group, name, ArraySpec(dims, shape, dtype, (1, *shape[1:]), (shard, *shape[1:])), about)
+    fits = CHUNK_BYTES // max(math.prod(shape[1:]) * np.dtype(dtype).itemsize, 1)
+    chunk = max(count for count in range(1, shard + 1) if shard % count == 0 and count <= max(fits, 1))
+    spec = ArraySpec(dims, shape, dtype, (chunk, *shape[1:]), (shard, *shape[1:]))
+    return create_array(group, name, spec, about, packing=QUICK_PACKING)
 
 
 @dataclass(frozen=True)
@@ -244,6 +255,8 @@ class PatchStore:
         """Values of the patches with these numbers in the store, ascending, (patch, y, x, band) float32."""
         runs = np.split(entries, np.flatnonzero(np.diff(entries) != 1) + 1) if len(entries) else []
         parts = [self.read(int(run[0]), int(run[-1]) + 1) for run in runs]
+        if len(parts) == 1:
+            return parts[0]
         return np.concatenate(parts) if parts else self.read(0, 0)
 
     @property

@@ -298,14 +298,19 @@ def block_means(
     Sides that ``times`` does not divide end in a smaller block. NaN where nothing of a block was seen.
     """
     beyond = [(0, -size % times) for size in coverage.shape]
-    values = np.pad(values, (*beyond, (0, 0)), constant_values=np.nan)
+    if any(more for _, more in beyond):
+        values = np.pad(values, (*beyond, (0, 0)), constant_values=np.nan)
+        coverage = np.pad(coverage, beyond)
     blocks = values.reshape(values.shape[0] // times, times, values.shape[1] // times, times, -1)
+    covered = coverage.reshape(*blocks.shape[:4]).max(axis=(1, 3))
+    with np.errstate(over="ignore", invalid="ignore"):
+        total = blocks.sum(axis=(1, 3), dtype=np.float32)
+    if np.isfinite(total).all():  # the rule: all was seen
+        return total / np.float32(times**2), covered
     seen = np.isfinite(blocks)
     count = seen.sum(axis=(1, 3), dtype=np.float32)
     total = np.where(seen, blocks, np.float32(0)).sum(axis=(1, 3), dtype=np.float32)
-    means = np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0)
-    covered = np.pad(coverage, beyond).reshape(*blocks.shape[:4]).max(axis=(1, 3))
-    return means, covered
+    return np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0), covered
 
 
 def let_tiles_go() -> None:
@@ -329,14 +334,18 @@ def tile_budget(
     processes = not crew.shares_memory
     most = max(1, min(1 if crew.elsewhere else crew.count, len(tiles)))
     bands = len(work.placed[0].lines.references.panel) if work.placed else 1
-    one = tile_bytes(tile_shape, bands)
+    one, parts = tile_bytes(tile_shape, bands), 0
     if work.finer is not None:
         times = work.grid.spacing_px // work.finer.spacing_px
-        one += tile_bytes((ROWS_OF_MEANS * times, tile_shape[1] * times), bands)
-    budgets = (
-        TileBudget(count, cache_bytes(work.placed, tiles, 1 if processes else count), one, processes)
-        for count in range(most, 0, -1)
-    )
+        part_shape = ROWS_OF_MEANS * times, tile_shape[1] * times
+        one += tile_bytes(part_shape, bands)
+        parts = cache_bytes(work.placed, plan_tiles(work.placed, work.camera, work.finer, part_shape), 2)
+
+    def lines(at_once: int) -> int:
+        """Raw lines that neighbours share: tiles, or parts of each tile of means, which is made a part at a time."""
+        return at_once * parts if work.finer else cache_bytes(work.placed, tiles, at_once)
+
+    budgets = (TileBudget(count, lines(1 if processes else count), one, processes) for count in range(most, 0, -1))
     for budget in budgets:
         if crew.elsewhere or budget.projected <= memory:
             return budget

@@ -269,7 +269,7 @@ def _write_patches(path: Path, grid: SceneGrid, seats: NDArray[np.integer], nm: 
     patches = PatchWriter(path, seats, grid.seat_origin(seats), grid.patch, nm)
     for first in range(0, len(seats), PATCHES_A_SHARD):
         shape = (min(PATCHES_A_SHARD, len(seats) - first), grid.patch, grid.patch)
-        patches.write(first, rng.uniform(0.1, 0.5, (*shape, len(nm))).astype(np.float32), np.ones(shape, np.bool_))
+        patches.write(rng.uniform(0.1, 0.5, (*shape, len(nm))).astype(np.float32), np.ones(shape, np.bool_))
 
 
 def _draw_field(folder: Path, side: int, cut: bool) -> tuple[int, int]:

@@ -266,15 +266,15 @@ def cut_patches(
             fwhm_nm=run.scene.fwhm_nm,
             grid=run.angular_grid(),
         )
-        cache = LineCache(run.settings.memory // CACHE_SHARE)
         if run.plan.plain and len(ordered):
-            _cut_everything(run, sighted(run, raw, _only(registration)), writer, ordered, cache)
+            _cut_everything(run, sighted(run, raw, _only(registration)), writer, ordered)
             return
+        cache = LineCache(run.settings.memory // CACHE_SHARE)
         sweeps = [one.placed(run.camera) for one in sighted(run, raw, _only(registration))]
         for first in range(0, len(ordered), SEATS_AT_ONCE):
             seats = ordered[first : first + SEATS_AT_ONCE]
             seen = read_seats(sweeps, run.camera, run.grid, seats, run.settings.kernel, cache=cache)
-            writer.write(first, *_on_scene(run, seats, *seen))
+            writer.write(*_on_scene(run, seats, *seen))
             run.report((first + len(seats)) / len(ordered))
 
     params = {"grid": asdict(run.grid), "kernel": run.settings.kernel, **run.place_key}
@@ -291,25 +291,21 @@ def _on_scene(
     return np.where(gaps[..., None], np.float32(np.nan), values), valid & ~gaps
 
 
-def _cut_everything(
-    run: SurveyRun, sweeps: Sequence[Sighted], writer: PatchWriter, seats: NDArray[np.integer], cache: LineCache
-) -> None:
+def _cut_everything(run: SurveyRun, sweeps: Sequence[Sighted], writer: PatchWriter, seats: NDArray[np.integer]) -> None:
     """Cut the wanted seats of a plain scan, by tables of its pixels: many times as fast as looking each of them up."""
     placed = [one.placed(run.camera, PixelGrid.of_scene(run.grid, 1)) for one in sweeps]
-    waiting: list[tuple[NDArray[np.float32], NDArray[np.bool_]]] = []
-    done, first, count, every = 0, 0, len(seats), run.grid.valid_seats()
+    done, first, every = 0, 0, run.grid.valid_seats()
     row, column = np.divmod(every, run.grid.seat_shape[1])
     wanted = np.isin(every[np.lexsort((column, row) if run.plan.along == "x" else (row, column))], seats)
-    for band in read_every_seat(placed, run.camera, run.grid, run.settings.kernel, cache=cache):
-        kept = wanted[first : first + len(band[0])]
-        first += len(band[0])
-        waiting.append(band if kept.all() else (band[0][kept], band[1][kept]))
-        values, seen = (np.concatenate(parts) for parts in zip(*waiting, strict=True))
-        whole = len(values) if done + len(values) == count else len(values) // SEATS_AT_ONCE * SEATS_AT_ONCE
-        if whole:
-            writer.write(done, *_on_scene(run, seats[done : done + whole], values[:whole], seen[:whole]))
-        waiting, done = [(values[whole:], seen[whole:])], done + whole
-        run.report(done / count)
+    most_bytes = run.settings.memory // CACHE_SHARE
+    for values, seen in read_every_seat(placed, run.camera, run.grid, run.settings.kernel, most_bytes=most_bytes):
+        kept = wanted[first : first + len(values)]
+        first += len(values)
+        if not kept.all():
+            values, seen = values[kept], seen[kept]
+        writer.write(*_on_scene(run, seats[done : done + len(values)], values, seen))
+        done += len(values)
+        run.report(done / len(seats))
 
 
 def seen_shares(run: SurveyRun, patches: StageRef) -> NDArray[np.float64]:

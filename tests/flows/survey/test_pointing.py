@@ -95,7 +95,7 @@ def test_unseen_pixels_take_the_coarse_look(tmp_path: Path) -> None:
     values[0, :3, 1:], values[1] = np.nan, np.nan
     coarse = np.random.default_rng(1).normal(size=(*np.array(grid.padded_shape) // 2, 2)).astype(np.float32)
     writer = PatchWriter(tmp_path / "patches.zarr", seats, grid.seat_origin(seats), 4, np.array([500.0, 700.0]))
-    writer.write(0, values, np.asarray(np.isfinite(values).all(axis=-1), np.bool_))
+    writer.write(values, np.asarray(np.isfinite(values).all(axis=-1), np.bool_))
     run = SimpleNamespace(grid=grid, weights=weights, scene=SimpleNamespace(wavelength_nm=np.array([500.0, 700.0])))
     seen = Glance(grid, coarse, np.empty(0, np.float32))
     told, columns = patch_columns(run, StageRef("patches", "k", tmp_path), seen)  # type: ignore[arg-type]

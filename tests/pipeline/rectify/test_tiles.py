@@ -195,6 +195,16 @@ def test_turned_lines_are_cut_into_short_runs() -> None:
         assert np.concatenate([np.arange(20)[cut] for cut in cuts]).tolist() == list(range(20))
 
 
+def test_a_cut_that_gains_nothing_by_itself_leads_to_those_that_do() -> None:
+    """Two turned sweeps side by side are cut where they meet, for the sake of the shorter runs of each."""
+    y, x = np.mgrid[:16, :1280]
+    both = np.stack([y + 0.035 * x, x - 0.035 * y], axis=-1)
+    left, right = (np.where((first <= x) & (x < first + 640), 1.0, np.nan)[..., None] * both for first in (0, 640))
+    cuts = cut_runs([part.reshape(16, 40, 32, 2).swapaxes(0, 1) for part in (left, right)], 270)
+    assert len(cuts) >= 4
+    assert 20 in [cut.start for cut in cuts]
+
+
 def test_nearest_gives_raw_spectra() -> None:
     """With references of one, the nearest kernel gives the very numbers that the camera gave."""
     lines = taken(TURNED)

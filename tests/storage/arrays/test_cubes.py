@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+import zarr
 
-from pipeline.errors import ChunkError, IncompleteStoreError, ShapeError
+from pipeline.errors import IncompleteStoreError, ShapeError
 from pipeline.geometry.scan import Sweep
 from pipeline.source import Line, References
 from storage.archive.archive import Archive
@@ -150,6 +151,13 @@ def test_layout_is_one_range_read_a_patch(tmp_path: Path) -> None:
     assert len([path for path in (tmp_path / "raw.zarr" / "dn" / "c").rglob("*") if path.is_file()]) == 3
 
 
+def test_an_image_without_bands_has_a_chunk_a_file(tmp_path: Path) -> None:
+    """Calls for chunks of a few kilobytes would cost more than unpacking them."""
+    coverage = MosaicWriter(tmp_path / "m.zarr", (130, 700), np.array([500.0, 700.0])).group["coverage"]
+    assert isinstance(coverage, zarr.Array)
+    assert coverage.chunks == coverage.shards == (64, 640)
+
+
 def _mosaic(bands: int, shape: tuple[int, int] = (100, 70)) -> Mosaic:
     rng = np.random.default_rng(bands)
     values = rng.lognormal(size=(*shape, bands)).astype(np.float32)
@@ -195,15 +203,15 @@ def test_mosaic_says_where_its_pixels_lie(tmp_path: Path) -> None:
         assert data.attrs["zarr_conventions"][0]["uuid"].startswith("689b58e2")
 
 
-@pytest.mark.parametrize("count", [0, 1, 5, 70])
-def test_patches_round_trip(tmp_path: Path, count: int) -> None:
-    """Any number of patches, none included; each is one chunk, and blocks of 64 give the same store."""
+@pytest.mark.parametrize(("count", "at_once"), [(0, 64), (1, 64), (5, 2), (70, 64), (70, 70), (150, 40), (128, 1)])
+def test_patches_round_trip(tmp_path: Path, count: int, at_once: int) -> None:
+    """Any number of patches, none included, however many are written at once."""
     rng = np.random.default_rng(count)
     seats, origin = np.arange(count, dtype=np.int64)[::-1].copy(), rng.integers(0, 900, (count, 2))
     values, valid = rng.random((count, 8, 8, 15)).astype(np.float32), rng.random((count, 8, 8)) > 0.3
     writer = PatchWriter(tmp_path / "p.zarr", seats, origin, 8, np.linspace(400, 900, 15), fwhm_nm=np.full(15, 4.0))
-    for first in range(0, max(count, 1), 64):
-        writer.write(first, values[first : first + 64], valid[first : first + 64])
+    for first in range(0, max(count, 1), at_once):
+        writer.write(values[first : first + at_once], valid[first : first + at_once])
     found = open_patches(tmp_path / "p.zarr")
     np.testing.assert_array_equal(found.seats, seats)
     np.testing.assert_array_equal(found.read(0, count), round_bits(values))
@@ -215,16 +223,28 @@ def test_patches_round_trip(tmp_path: Path, count: int) -> None:
         np.testing.assert_array_equal(np.stack([data["seat_y"], data["seat_x"]], axis=-1), origin)
 
 
-def test_patches_that_split_a_shard_are_refused(tmp_path: Path) -> None:
-    """A write starts and ends at multiples of 64 patches, or at the end, and has the store's shape."""
+@pytest.mark.parametrize(("count", "bands", "chunk"), [(70, 1, 64), (70, 270, 8), (6, 900, 3), (7, 900, 1)])
+def test_chunks_of_patches_have_up_to_4_mb(tmp_path: Path, count: int, bands: int, chunk: int) -> None:
+    """As many patches of 16 x 16 px make a chunk as fit 4 MB and part the file evenly, and one at the least."""
+    origin = np.zeros((count, 2), np.int64)
+    PatchWriter(tmp_path / "p.zarr", np.arange(count), origin, 16, np.linspace(400, 900, bands))
+    chunks = zarr.open_group(tmp_path / "p.zarr", mode="r")["values"].chunks  # type: ignore[union-attr]
+    assert chunks == (chunk, 16, 16, bands)
+
+
+def test_patches_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    """More than there are seats, of another size, or with the validity of others: nothing of them is kept."""
     writer = PatchWriter(tmp_path / "p.zarr", np.arange(70), np.zeros((70, 2), np.int64), 2, np.array([500.0]))
     values, valid = np.zeros((70, 2, 2, 1), np.float32), np.ones((70, 2, 2), bool)
-    with pytest.raises(ChunkError, match="patches 0:10 split shards of 64"):
-        writer.write(0, values[:10], valid[:10])
-    with pytest.raises(ChunkError, match="patches 60:70 split"):
-        writer.write(60, values[:10], valid[:10])
-    with pytest.raises(ShapeError, match="patches 64:134"):
-        writer.write(64, values, valid)
+    writer.write(values[:10], valid[:10])
+    with pytest.raises(ShapeError, match="patches 10:80"):
+        writer.write(values, valid)
+    with pytest.raises(ShapeError, match="patches 10:11"):
+        writer.write(values[:1, :1], valid[:1, :1])
+    with pytest.raises(ShapeError, match="patches 10:12"):
+        writer.write(values[:2], valid[:1])
+    writer.write(values[10:], valid[10:])
+    assert open_patches(tmp_path / "p.zarr").read(0, 70).max() == 0
 
 
 def test_attention_round_trip(tmp_path: Path) -> None:

@@ -125,7 +125,7 @@ def test_patches_are_picked_by_their_numbers(tmp_path: Path, entries: list[int])
     """Runs and single ones come in the order asked for."""
     values = np.random.default_rng(1).random((10, 4, 4, 2)).astype(np.float16).astype(np.float32)
     writer = PatchWriter(tmp_path / "p.zarr", np.arange(10), np.zeros((10, 2), int), 4, NM[:2])
-    writer.write(0, values, np.ones((10, 4, 4), np.bool_))
+    writer.write(values, np.ones((10, 4, 4), np.bool_))
     store = open_patches(tmp_path / "p.zarr")
     np.testing.assert_allclose(store.pick(np.array(entries, np.int64)), values[entries], rtol=3e-4)
     assert (store.wavelength_nm == NM[:2]).all()

@@ -16,8 +16,9 @@ import pytest
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, line_positions
+from pipeline.rectify.mosaic import LineCache, line_blocks
 from pipeline.rectify.placed import PixelGrid, place
-from pipeline.rectify.region import plan_tiles
+from pipeline.rectify.region import cache_bytes, plan_tiles
 from pipeline.source import Line, References
 from storage.arrays import tile_work
 from storage.arrays.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_cube
@@ -25,6 +26,7 @@ from storage.arrays.mosaics import MosaicWriter, load_mosaic
 from storage.arrays.tile_work import (
     MosaicRecipe,
     MosaicWork,
+    OpenMosaic,
     Thumbnail,
     ThumbnailCut,
     TileMaker,
@@ -214,6 +216,20 @@ def test_each_process_keeps_the_lines_of_one_tile(cubes: list[RawCube]) -> None:
         tile_budget(work, tiles, (64, 640), memory=PLENTY, crew=crew).cache for crew in (ONE, TWO, Crew("processes", 2))
     ]
     assert kept[2] == kept[0] < kept[1]
+
+
+def test_means_keep_the_lines_of_two_parts_of_a_tile(cubes: list[RawCube], tmp_path: Path) -> None:
+    """They are fewer than those of a tile, and enough for each block of lines to be read once."""
+    work = replace(work_of(cubes), grid=PixelGrid((-68.5, -418.5), 4, (35, 225)), finer=GRID)
+    writer = MosaicWriter(tmp_path / "m.zarr", work.grid.shape, BANDS)
+    tiles = plan_tiles(work.placed, CAMERA, work.grid, writer.tile_shape)
+    budget = tile_budget(work, tiles, writer.tile_shape, memory=PLENTY, crew=ONE)
+    assert budget.cache < cache_bytes(work.placed, tiles, 1)
+    kept = LineCache(budget.cache)
+    made = OpenMosaic(work, writer, kept, None)
+    for tile in tiles:
+        made.make(tile.rows, tile.columns)
+    assert kept.reads == sum(len(line_blocks(slice(0, len(cube.valid_line)))) for cube in cubes)
 
 
 def test_a_worker_lets_tiles_go(tmp_path: Path, cubes: list[RawCube]) -> None:
