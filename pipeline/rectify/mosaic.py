@@ -266,9 +266,8 @@ def cut_runs(looked: Sequence[NDArray[np.float64]], bands: int) -> list[slice]:
     def cut(run: slice) -> list[slice]:
         if run.stop - run.start == 1:
             return [run]
-        middle = (
-            run.start + run.stop
-        ) // 2  # a half may gain nothing by itself, as where two sweeps meet, but quarters
+        middle = (run.start + run.stop) // 2
+        # both halves first: one cut may gain nothing by itself, as where two sweeps meet, and those within them much
         parts = cut(slice(run.start, middle)) + cut(slice(middle, run.stop))
         return parts if sum(map(price, parts)) < price(run) else [run]
 

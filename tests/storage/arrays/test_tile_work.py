@@ -277,6 +277,18 @@ def test_block_means_are_those_of_what_was_seen(shape: tuple[int, int]) -> None:
             assert covered[y, x] == coverage[4 * y : 4 * y + 4, 4 * x : 4 * x + 4].max()
 
 
+def test_means_of_a_block_do_not_depend_on_holes_in_others() -> None:
+    """However a mosaic is cut into parts, with or without holes in them, the same bits come out."""
+    values = np.random.default_rng(5).lognormal(size=(8, 12, 3)).astype(np.float32)
+    coverage = np.ones((8, 12), np.intp)
+    whole, _ = block_means(values, coverage, 4)
+    values[0, 0, 1], values[7, 11] = np.nan, np.inf
+    torn, _ = block_means(values, coverage, 4)
+    apart = torn != whole
+    assert set(zip(*np.nonzero(apart), strict=True)) == {(0, 0, 1), (1, 2, 0), (1, 2, 1), (1, 2, 2)}
+    assert np.isfinite(torn).all()
+
+
 @pytest.mark.parametrize("crew", [ONE, THREE, Crew("processes", 2)])
 def test_a_mosaic_of_means_is_the_mean_of_the_finer_one(cubes: list[RawCube], tmp_path: Path, crew: Crew) -> None:
     """Whoever makes its tiles: 4 x 4 finer pixels a pixel, those that no line reached left out."""
