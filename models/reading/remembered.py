@@ -29,6 +29,7 @@ else:
 FAINTEST = -12.7  # of logarithms of probabilities that are kept: one in 330 000
 LIGHT_FADES_DAYS = 30.0  # in which the light that a memory rests on is worth e times less
 FADES_DAYS = 120.0  # in which a memory that nobody looks after is worth e times less, without a reader
+SETTLED_DAYS = 1.0  # from which on a reader has all the say of what nobody looked at
 SURE = 0.97  # of today's look, without a reader, to speak against a memory
 CERTAIN = 0.8  # of memory and map alike, so that a pixel of another class counts as changed
 ROWS = 128  # read at a time
@@ -144,11 +145,24 @@ def _recalled(memory: Remembered, looked: Looked, reader: MemoryReader | None, r
         after = _the_surer(old, new, seen, age)
     else:
         images = old, np.where(seen[..., None], new, 0), seen, age, rests_on
-        after = _read(reader, memory, looked, images, rows)
+        after = _held_until_settled(old, _read(reader, memory, looked, images, rows), seen, memory.days)
     after = np.where(known[..., None], after, today)  # today's look alone; NaN where that has nothing either
     kept = np.maximum(after, np.float32(FAINTEST)).astype(np.float32)
     own_light = np.where(seen, looked.light / looked.step**2, 0).astype(np.float32)
     return Belief(kept, _ages(kept, np.where(seen | ~known, 0, age)), rests_on + own_light)
+
+
+def _held_until_settled(old: Floats, after: Floats, seen: NDArray[np.bool_], days: float) -> Floats:
+    """What a reader makes of pixels (y, x, class), where nobody looked the less of it the less of a day went by.
+
+    A reader was trained on days; of a memory of this minute it has nothing to tell that the memory does not know.
+    """
+    share = min(days / SETTLED_DAYS, 1.0)
+    if share == 1:
+        return after
+    mixed = np.log((1 - share) * np.exp(old) + share * np.exp(after)).astype(np.float32)
+    held: Floats = np.where(seen[..., None], after, mixed)
+    return held
 
 
 def _summing_to_1(log_probability: Floats) -> Floats:

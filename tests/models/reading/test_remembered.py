@@ -94,6 +94,33 @@ def test_ages_count_days_where_nobody_looked(reader: MemoryReader | None, seed: 
 
 
 @READERS
+@given(seed=seeds)
+def test_a_memory_of_this_minute_is_left_alone_where_nobody_looked(reader: MemoryReader | None, seed: int) -> None:
+    """No time went by and nothing was seen: what is believed stays, but for rounding; what was seen is weighed."""
+    rng = np.random.default_rng(seed)
+    memory, look = a_memory(rng, days=0.0), a_look(rng)
+    seen = rng.random(SHAPE) < 0.5
+    after = recall(memory, replace(look, seen=seen), reader).log_probability
+    before = memory.belief.log_probability
+    np.testing.assert_allclose(np.exp(after[~seen]), np.exp(before[~seen]), atol=2e-5)
+    assert np.abs(np.exp(after[seen]) - np.exp(before[seen])).max() > 0.01
+    np.testing.assert_allclose(np.exp(carried(memory, reader).log_probability), np.exp(before), atol=2e-5)
+
+
+@given(seed=seeds, days=st.floats(0, 0.99))
+def test_the_reader_has_its_say_as_the_day_goes_by(seed: int, days: float) -> None:
+    """Each pixel that nobody looked at lies as far between its memory and what a whole day would have made of it."""
+    rng = np.random.default_rng(seed)
+    reader, memory = a_reader(seed), a_memory(rng, days=days)
+    before = np.exp(memory.belief.log_probability)
+    after = np.exp(carried(memory, reader).log_probability)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(remembered, "SETTLED_DAYS", 1e-9)
+        whole = np.exp(carried(replace(memory, days=max(days, 1e-9)), reader).log_probability)
+    np.testing.assert_allclose(after, before + days * (whole - before), atol=3e-5)
+
+
+@READERS
 def test_one_that_knows_nothing_takes_the_other(reader: MemoryReader | None) -> None:
     """Where the memory is empty today's look stands, where the look is the memory does; both empty: nothing."""
     rng = np.random.default_rng(4)
