@@ -296,6 +296,15 @@ class Footprint:
             found += [(int(level), some) for some in (there[~wide], there[wide]) if some.size]
         return found
 
+    def by_parts(self) -> tuple[Footprint, Footprint | None]:
+        """Give the kernels whose box is parted, and those of pixels left out, which lie upright; None without any."""
+        fine = self.level == 1
+        return self._some(fine), None if fine.all() else self._some(~fine)
+
+    def _some(self, which: NDArray[np.bool_]) -> Footprint:
+        shift, variance, shares = self.shift[:, which], self.variance[:, which], self.shares[which]
+        return replace(self, shift=shift, variance=variance, shares=shares, level=self.level[which])
+
     def part(self, level: int, which: NDArray[np.intp]) -> Footprint:
         """Give some kernels of a level, in its px. Beyond level 1 boxes lie upright: they are small beside Gaussians.
 
