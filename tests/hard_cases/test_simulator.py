@@ -79,7 +79,7 @@ def test_gradient_bounds_a_point_of_infinite_curvature() -> None:
     probe = probed(scene_of(TEXTURE), RIG)
     probe = replace(probe, anywhere=None, beside=(), afar=None)  # as where sweeps see all of the scene
     point = replace(probe, curvature=np.full((2, 3), np.inf))
-    width = RIG.optics.aberration_px
+    width = RIG.optics.aberration_px * math.sqrt(2 / math.pi)  # what a Gaussian moves light on average
     by_slope = np.minimum(width * point.slope.sum(axis=0), point.span).max()
     assert ABERRATION.bound(point, RIG).value == pytest.approx(by_slope)
     assert ABERRATION.bound(probe, RIG).value < by_slope

@@ -30,7 +30,7 @@ from storage.archive.manifests import read_table
 from storage.archive.whole_files import to_json
 
 RECORD = "effects.json"
-MANIFEST = Product("effects", version=7, files=(RECORD,))
+MANIFEST = Product("effects", version=8, files=(RECORD,))
 LOOK = {
     ROTATION: ROTATION.variants[0],
     SLIT: SLIT.variants[-1],

@@ -24,15 +24,20 @@ AIRY, GAUSSIAN, ONE_WIDTH = "airy", "gaussian", "one-width"
 THIRD_RING = 10.173468135062722  # third zero of J1
 FIRST_NM, LAST_NM = 400.0, 1000.0  # of the spectrograph
 _ALONE: Floats = np.ones(1)
+GAUSSIAN_WAY, DISC_WAY = math.sqrt(2 / math.pi), 8 / (3 * math.pi)  # mean of |x| over the standard deviation
 _POINT_NS = 0.85  # of each point that stands for a disc
 
 
-def blurred_bound(probe: Probe, cause: str, variance: Floats, share: Floats = _ALONE) -> Bound:
+def blurred_bound(
+    probe: Probe, cause: str, variance: Floats, share: Floats = _ALONE, mean_way: float = GAUSSIAN_WAY
+) -> Bound:
     """Bound what a sum of Gaussians changes, of (kernel, 2, band) variance [px^2] and shares (kernel,).
 
-    ``cause`` says where the blur comes from; the sentence names the band that changes most.
+    ``mean_way``: what light is moved along an axis on average, over the standard deviation. ``cause`` says where the
+    blur comes from; the sentence names the band that changes most.
     """
-    change = sum((part * probe.change_blurred(one) for part, one in zip(share, variance, strict=True)), np.zeros(1))
+    parts = zip(share, variance, strict=True)
+    change = sum((part * probe.change_blurred(one, mean_way) for part, one in parts), np.zeros(1))
     value = float(change.max(initial=0.0))
     if not variance.any():
         return Bound(value, f"{cause}: none")
@@ -181,7 +186,8 @@ class Defocus(Blur):
         normals = normals_met(probe.sweeps, rig.camera)
         worst = np.max([defocus_px(rig, rig.air.distance_m, normal) ** 2 / 16 for normal in normals], axis=0)
         cause = f"defocus at {rig.air.distance_m:g} m, focused at {rig.optics.focus_m:g} m"
-        return blurred_bound(probe, cause, even(worst, len(probe.wavelength_nm)).variance[None])
+        variance = even(worst, len(probe.wavelength_nm)).variance[None]
+        return blurred_bound(probe, cause, variance, mean_way=DISC_WAY)
 
 
 def defocus_px(rig: Rig, distance_m: float | None, normal: Floats | None = None) -> Floats:

@@ -111,27 +111,27 @@ class Probe:
         """Bound what a kernel of mean 0 and (2, band) variance changes in any band."""
         return float(self.change_blurred(variance_px2).max(initial=0.0))
 
-    def change_blurred(self, variance_px2: Floats) -> Floats:
+    def change_blurred(self, variance_px2: Floats, mean_way: float = 1.0) -> Floats:
         """Bound what it changes in each band, (band,): C s^2 / 2, or G E|x| where that is less, or the span.
 
-        E|x| is at most s; the smaller bound takes over where the image is a step or a point. What lies beside the
-        sweeps counts as far as the kernel reaches, and beyond by the share of it that does; a wide Gaussian is a
-        narrow one, and one of the rest of its variance that sees means of several pixels.
+        E|x| is ``mean_way`` times s, at most 1; the smaller bound takes over where the image is a step or a point. What
+        lies beside the sweeps counts as far as the kernel reaches, and beyond by the share of it that does; a wide
+        Gaussian is a narrow one, and one of the rest of its variance that sees means of several pixels.
         """
         widest = float(np.sqrt(np.max(variance_px2, initial=0.0)))
         if self.anywhere is None or widest == 0:
-            return self._changed(variance_px2)
+            return self._changed(variance_px2, mean_way)
         if self.afar is None or widest <= WIDE_PX:
             near = [one for one in self.beside if one.reach_px >= _FAR_SDS * widest]
             beyond = [4 * scipy.special.ndtr(-one.reach_px / widest) for one in near]
             ways = [
-                self.with_detail(one)._changed(variance_px2) + more * self.anywhere
+                self.with_detail(one)._changed(variance_px2, mean_way) + more * self.anywhere
                 for one, more in zip(near, beyond, strict=True)
             ]
             return np.asarray(np.min([*ways, self.anywhere], axis=0))
         narrow = np.minimum(variance_px2, WIDE_PX**2)
-        both = self.change_blurred(narrow) + self.with_detail(self.afar)._changed(variance_px2 - narrow)
-        return np.asarray(np.minimum(both, self.anywhere))
+        wide = self.with_detail(self.afar)._changed(variance_px2 - narrow, mean_way)
+        return np.asarray(np.minimum(self.change_blurred(narrow, mean_way) + wide, self.anywhere))
 
     def with_detail(self, detail: Detail) -> Probe:
         """Give the same probe with the steepest and the most curved light of another place."""
@@ -144,9 +144,9 @@ class Probe:
             spectral_curvature=detail.spectral[1],
         )
 
-    def _changed(self, variance_px2: Floats) -> Floats:
+    def _changed(self, variance_px2: Floats, mean_way: float) -> Floats:
         by_curvature = _times(self.curvature, variance_px2 / 2)
-        by_slope = _times(self.slope, np.sqrt(variance_px2))
+        by_slope = _times(self.slope, mean_way * np.sqrt(variance_px2))
         return np.asarray(np.minimum(np.minimum(by_curvature, by_slope).sum(axis=0), self.span))
 
     def scaled(self, share: float | Floats) -> float:

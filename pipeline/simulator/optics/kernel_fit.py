@@ -44,7 +44,7 @@ _ALONG = np.concatenate([np.outer(_RADII, np.cos(_TURNS)).ravel(), _RADII, 0 * _
 _SCAN = np.concatenate([np.outer(_RADII, np.sin(_TURNS)).ravel(), 0 * _RADII, _RADII])
 # What is wrong of waves longer than 20 px adds up over wide fields: they count up to three times.
 _STRICT = 1 + 2 / (1 + (np.hypot(_ALONG, _SCAN) / 0.05) ** 2)
-_ALIKE_PX = 0.3  # by which widths may differ of kernels that share a window
+_ALIKE_PX = 0.2  # by which widths may differ of kernels that share a window
 
 
 @dataclass(frozen=True)
@@ -292,9 +292,20 @@ class Footprint:
         for level in np.unique(self.level):
             there = np.flatnonzero(self.level == level)
             width = np.sqrt(self.variance[:, there]).max(axis=0)
-            wide = width > width.min() + _ALIKE_PX
-            found += [(int(level), some) for some in (there[~wide], there[wide]) if some.size]
+            while there.size:
+                alike = width <= width.min() + _ALIKE_PX
+                found.append((int(level), there[alike]))
+                there, width = there[~alike], width[~alike]
         return found
+
+    def by_parts(self) -> tuple[Footprint, Footprint | None]:
+        """Give the kernels whose box is parted, and those of pixels left out, which lie upright; None without any."""
+        fine = self.level == 1
+        return self._some(fine), None if fine.all() else self._some(~fine)
+
+    def _some(self, which: NDArray[np.bool_]) -> Footprint:
+        shift, variance, shares = self.shift[:, which], self.variance[:, which], self.shares[which]
+        return replace(self, shift=shift, variance=variance, shares=shares, level=self.level[which])
 
     def part(self, level: int, which: NDArray[np.intp]) -> Footprint:
         """Give some kernels of a level, in its px. Beyond level 1 boxes lie upright: they are small beside Gaussians.

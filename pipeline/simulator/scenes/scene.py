@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 Drawn = tuple[NDArray[np.float32], NDArray[np.uint8] | None]
 _BINOMIAL = (np.array([1, 8, 28, 56, 70, 56, 28, 8, 1]) / 256).astype(np.float32)
+_ROWS_AT_ONCE = 4  # of what is halved: they stay in the processor's cache
 THINNED_MARGIN = 4  # pixels of a level beside the scene: as far as the binomial kernel reaches
 DEFAULT_EXPOSURE_MS = 100.0  # the exposure at which a scene's electrons are stated
 WELL_SHARE = 0.6  # of the full well, filled by the bright end of a scene without a radiance law
@@ -74,8 +75,7 @@ class SceneRaster:
         return once()
 
     def _half_of(self, level: int) -> NDArray[np.float32]:
-        before = 0 if level == 1 else THINNED_MARGIN
-        return _halved(_halved(self.thinned(level), 0, before), 1, before)
+        return _halved(self.thinned(level), 0 if level == 1 else THINNED_MARGIN)
 
     def _checked(self, planes: NDArray[np.float32], labels: NDArray[np.uint8] | None) -> Drawn:
         size = None if labels is None else labels.shape
@@ -84,14 +84,25 @@ class SceneRaster:
         return planes, labels
 
 
-def _halved(planes: NDArray[np.float32], axis: int, before: int) -> NDArray[np.float32]:
-    """Every second pixel of blurred planes, counted from the one that ``before`` others precede."""
-    size, half = planes.shape[axis], len(_BINOMIAL) // 2
-    count = -(-(size - 1 + half - before) // 2) + THINNED_MARGIN + 1
-    total = np.zeros((*planes.shape[:axis], count, *planes.shape[axis + 1 :]), np.float32)
-    for offset, weight in enumerate(_BINOMIAL):
-        at = np.clip(before + 2 * (np.arange(count) - THINNED_MARGIN) + offset - half, 0, size - 1)
-        total += weight * planes.take(at, axis=axis)
+def _halved(planes: NDArray[np.float32], before: int) -> NDArray[np.float32]:
+    """Every second pixel of blurred planes, along either axis, counted from the one that ``before`` others precede."""
+    half = len(_BINOMIAL) // 2
+    counts = [-(-(size - 1 + half - before) // 2) + THINNED_MARGIN + 1 for size in planes.shape[:2]]
+    rows, columns = (before + 2 * (np.arange(count) - THINNED_MARGIN) - half for count in counts)
+    out = np.empty((*counts, planes.shape[2]), np.float32)
+    for first in range(0, counts[0], _ROWS_AT_ONCE):
+        some = slice(first, first + _ROWS_AT_ONCE)
+        out[some] = _binomial(_binomial(planes, rows[some], 0), columns, 1)
+    return out
+
+
+def _binomial(planes: NDArray[np.float32], firsts: NDArray[np.intp], axis: int) -> NDArray[np.float32]:
+    """Sums of nine pixels along an axis, from each of ``firsts`` on; outside of the planes their edge is repeated."""
+    total: NDArray[np.float32] = planes.take(firsts, axis=axis, mode="clip") * _BINOMIAL[0]
+    for offset, weight in enumerate(_BINOMIAL[1:], 1):
+        some = planes.take(firsts + offset, axis=axis, mode="clip")
+        some *= weight
+        total += some
     return total
 
 

@@ -39,10 +39,17 @@ class Ranking:
     def best(self, tier: int, most: int) -> Floats:
         """Give the best of each kind in turns, none twice, (place, 2) rows and columns."""
         offers = [np.concatenate(some, axis=1) for kind, some in self._offers.items() if kind[0] == tier]
-        best = [places[:, np.lexsort(places[::-1])[::-1][:most]] for places in offers]
+        best = [_worst_first(places, most) for places in offers]
         ranked = [list(zip(*places[1:].astype(int).tolist(), strict=True)) for places in best]
         found = dict.fromkeys(place for rank in zip_longest(*ranked) for place in rank if place is not None)
         return np.array(list(found)[:most], np.float64).reshape(-1, 2)
+
+
+def _worst_first(places: Floats, most: int) -> Floats:
+    """The first places, (row, place) of worth and where they lie, by worth and then by where."""
+    if places.shape[1] > most:
+        places = places[:, places[0] >= np.partition(places[0], -most)[-most]]
+    return places[:, np.lexsort(places[::-1])[::-1][:most]]
 
 
 def band_groups(bands: int) -> list[slice]:
@@ -58,24 +65,26 @@ class BandTiles:
         self._scene, self._spectra, self._optics, self._tile = scene, spectra, optics, tile
         self._groups = band_groups(len(spectra))
         self._wavelength_nm = np.asarray(scene.wavelength_nm, np.float64)
-        self._found: dict[Kind, list[tuple[float, int, int, int]]] = {}  # worth, row, column, band of tiles
+        # Of tiers and measures: worth, row, column and band of tiles, (4, group, tile) of each strip.
+        self._found: dict[tuple[int, int], list[Floats]] = {}
 
     def add(self, first: int, planes: Light, tiers: Mapping[int, NDArray[np.bool_]]) -> None:
         """Take the extremes of a strip of tiles: planes (row, column, band) with the optics' halo about them."""
         halo = self._optics.halo
         light = planes[halo - 1 : 1 - halo, halo - 1 : 1 - halo] * self._spectra
-        measures = self._measures(light)
+        measures = [self._worst_of_groups(one) for one in self._measures(light)]
         for tier, taken in tiers.items():
-            held = np.maximum.reduceat(taken.any(axis=0), self._starts(taken.shape[1]))
-            for sort, worth in enumerate(measures[:2] if tier < 0 else measures):
-                for group, some in enumerate(self._groups):
-                    best = worth[:, some].argmax(axis=1) + some.start
-                    rows = ((float(worth[number, best[number]]), number) for number in np.flatnonzero(held).tolist())
-                    found = self._found.setdefault((tier, sort, group), [])
-                    found += [(value, first, number * self._tile, int(best[number])) for value, number in rows]
-                    if len(found) > 1000:
-                        found.sort(reverse=True)
-                        del found[_WINDOWS:]
+            held = np.flatnonzero(np.maximum.reduceat(taken.any(axis=0), self._starts(taken.shape[1])))
+            for sort, (worst, bands) in enumerate(measures[:2] if tier < 0 else measures):
+                columns = held[np.argsort(worst[:, held], axis=1, kind="stable")[:, -_WINDOWS:]]
+                some = (np.take_along_axis(one, columns, axis=1) for one in (worst, bands))
+                rows = np.full(columns.shape, first), columns * self._tile
+                self._found.setdefault((tier, sort), []).append(np.stack([next(some), *rows, next(some)]))
+
+    def _worst_of_groups(self, worth: Light) -> tuple[Light, NDArray[np.intp]]:
+        """Greatest worth of each tile, of worths (tile, band), and its band, (group, tile) both."""
+        bands = np.stack([worth[:, some].argmax(axis=1) + some.start for some in self._groups])
+        return np.take_along_axis(worth.T, bands, axis=0), bands
 
     def rank(self, ranking: Ranking, cells: ReachedCells, reaches: Sequence[float]) -> None:
         """Measure the worst tiles of every measure and group closely, and offer their best places.
@@ -85,8 +94,9 @@ class BandTiles:
         ends = (-1.0, *reaches, np.inf)
         for tier in sorted({kind[0] for kind in self._found}):
             within = (ends[tier], ends[tier + 1]) if tier >= 0 else (ends[-2], ends[-1])
-            worst = [sorted(some, reverse=True)[:_WINDOWS] for kind, some in self._found.items() if kind[0] == tier]
-            windows = sorted({one[1:] for some in worst for one in some})
+            every = [np.concatenate(some, axis=2) for kind, some in self._found.items() if kind[0] == tier]
+            worst = [_worst_first(one, _WINDOWS)[1:] for some in every for one in some.swapaxes(0, 1)]
+            windows = sorted({(row, column, band) for row, column, band in np.hstack(worst).T.astype(int).tolist()})
             light = [self._window(*one) for one in windows]
             taken = [
                 self._taken(cells.rows_within(row, row + self._tile, *within), column) for row, column, _ in windows
@@ -108,14 +118,15 @@ class BandTiles:
             step = np.abs(np.diff(inner, axis=-1)).max(axis=-1) / noise
             bend = np.abs(inner[..., 0] + inner[..., 2] - 2 * inner[..., 1]) / noise
             measures = [*self._optics.worths(middle), step, bend]
+        rows, columns, bands = np.array(windows).T
+        group = np.searchsorted([some.stop for some in self._groups], bands, side="right")
         for sort, worth in enumerate(measures):
             shown = np.where(taken, worth, -np.inf).reshape(-1, len(windows))
-            for number, best in enumerate(shown.argmax(axis=0).tolist()):
-                row, column, band = windows[number]
-                down, right = divmod(best, self._tile)
-                group = next(place for place, some in enumerate(self._groups) if some.start <= band < some.stop)
-                place = np.array([row + down]), np.array([column + right])
-                ranking.offer((tier, sort, group), shown[best, [number]], *place)
+            best = shown.argmax(axis=0)
+            down, right = np.divmod(best, self._tile)
+            offered = shown[best, np.arange(len(windows))], rows + down, columns + right
+            for number in np.unique(group).tolist():
+                ranking.offer((tier, sort, number), *(one[group == number] for one in offered))
 
     def _window(self, row: int, column: int, band: int) -> Light:
         """Light about a tile in a band and its neighbours, (row, column, 3); the scene's edge is repeated."""
@@ -140,10 +151,13 @@ class BandTiles:
         starts = self._starts(inner.shape[1])
 
         def greatest(values: Light) -> Light:
-            most: Light = np.maximum.reduceat(values.max(axis=0), starts, axis=0)
+            ridge = values.max(axis=0)
+            if short := -len(ridge) % self._tile:
+                ridge = np.pad(ridge, [(0, short), (0, 0)], mode="edge")
+            most: Light = ridge.reshape(-1, self._tile, ridge.shape[1]).max(axis=1)
             return most
 
-        high, low = greatest(inner), np.minimum.reduceat(inner.min(axis=0), starts, axis=0)
+        high, low = greatest(inner), -greatest(-inner)
         noise = self._optics.noise(low)
         found = [high, -low]
         for axis in (0, 1):
@@ -151,16 +165,19 @@ class BandTiles:
             step = np.abs(np.diff(light[other], axis=axis))
             beside = (slice(1, None), slice(None)) if axis == 0 else (slice(None), slice(1, None))
             found.append(greatest(step[beside]) / noise)
-        found += self._wide_steps(light, starts, noise)
+        found += self._wide_steps(light, starts, greatest, noise)
         found += self._spectral_steps(inner, greatest, noise)
         return found
 
-    def _wide_steps(self, light: Light, starts: NDArray[np.intp], noise: Light) -> list[Light]:
+    def _wide_steps(
+        self, light: Light, starts: NDArray[np.intp], greatest: Callable[[Light], Light], noise: Light
+    ) -> list[Light]:
         """Between means of half tiles, and between any two pixels: what a slit shows that is wider than a pixel."""
         high, low = light.max(axis=0)[1:-1], light.min(axis=0)[1:-1]
-        span: Light = np.maximum.reduceat(high, starts, axis=0) - np.minimum.reduceat(low, starts, axis=0)
+        span: Light = greatest(high[None]) + greatest(-low[None])
         rows, columns = (_halves(size, self._tile) for size in light.shape[:2])
-        sums = np.add.reduceat(np.add.reduceat(light, rows, axis=0), columns, axis=1)
+        high = [light[first:last].sum(axis=0) for first, last in pairwise([*rows.tolist(), len(light)])]
+        sums = np.add.reduceat(np.stack(high), columns, axis=1)
         counts = np.diff(rows, append=light.shape[0])[:, None] * np.diff(columns, append=light.shape[1])
         means = sums / counts[..., None].astype(np.float32)
         ahead = np.abs(np.diff(means, axis=0, append=means[-1:])).max(axis=0)

@@ -48,7 +48,7 @@ else:
 Floats = NDArray[np.float64]
 Light = NDArray[np.float32]
 MOST_VALUES = 1_000_000  # samples times bands; each is seen a few times over, a fraction of a px apart
-MOST_SAMPLES = 12_000
+MOST_SAMPLES = 6_000
 USUAL_LIGHTS = 101  # quantiles of the light that are kept
 FINEST_SAMPLES = 1000  # at which variants of the slit are held against the finest
 _LEAST_OF_SWEEP = 50
@@ -159,9 +159,12 @@ def _slit_errors(
     errors = dict.fromkeys((*SLIT.variants[1:], OFF), 0.0)
     for moments in _blurs(rig, scene.wavelength_nm, sweeps):
         boxes = {parts: _footprint(SLIT.variants[0], rig, parts, moments, scene) for parts in LADDER}
-        finest = light_seen(scene, rig.camera, views, boxes[LADDER[-1]], _PHASES)
+        parted, alike = boxes[LADDER[-1]].by_parts()
+        sharp = light_seen(scene, rig.camera, views, parted, _PHASES)
+        finest = sharp if alike is None else sharp + light_seen(scene, rig.camera, views, alike, _PHASES)
         scale = unit_at(_stored(finest, views), rig, unit, views.binning)
-        found = {parts: _changes(scene, rig, views, boxes[parts], finest, scale) for parts in LADDER[:-1]}
+        fewer = {parts: boxes[parts].by_parts()[0] for parts in LADDER[:-1]}
+        found = {parts: _changes(scene, rig, views, one, sharp, scale) for parts, one in fewer.items()}
         found[LADDER[-1]] = np.zeros(views.sums)
         for variant in SLIT.variants[1:]:
             taken = [box_parts(variant, rig, one) for one in whole]

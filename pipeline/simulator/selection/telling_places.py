@@ -26,6 +26,7 @@ Light = NDArray[np.float32]
 Floats = NDArray[np.float64]
 TELLING_BANDS = 4
 _TILES = 8192  # at most about so many, each of which offers its best place
+_TILES_HIGH = 3  # strips: what is made of one stays in the processor's cache
 _FAR = -1  # number of what lies beyond all reaches: of it only the brightest and the darkest count
 
 
@@ -72,7 +73,8 @@ def telling_places(
     own_planes = spectra.ndim == 1
     tiles = BandTiles(scene, spectra, optics, tile) if own_planes and len(spectra) > TELLING_BANDS else None
     bands = telling_bands(spectra)
-    for strip in _strips(scene, tile, optics.halo, cells, reaches):
+    high = tile if tiles is not None else _TILES_HIGH * tile
+    for strip in _strips(scene, high, optics.halo, cells, reaches):
         _check_finite(scene, strip.planes, strip.first - optics.halo)
         if not any(taken.any() for taken in strip.tiers.values()):
             continue
@@ -104,16 +106,18 @@ def _offer(
     ranking: Ranking, kind: tuple[int, int], worth: Light, taken: NDArray[np.bool_], first: int, tile: int
 ) -> None:
     """Offer the greatest of every tile and band; worth (row, column, band) of the strip that begins at a row."""
-    _, columns, bands = worth.shape
     shown = worth if taken.all() else np.where(taken[..., None], worth, np.float32(-np.inf))
-    ridge = np.pad(shown.max(axis=0), [(0, -columns % tile), (0, 0)], constant_values=-np.inf)
-    ridge = ridge.reshape(-1, tile, bands)
-    within = ridge.argmax(axis=1)  # (tile, band)
-    column = np.minimum(within + np.arange(len(ridge))[:, None] * tile, columns - 1)
-    greatest = np.take_along_axis(ridge, within[:, None], axis=1)[:, 0]
-    row = first + shown[:, column, np.arange(bands)].argmax(axis=0)
+    (rows, columns, bands), none = worth.shape, -np.inf
+    shown = np.pad(shown, [(0, -rows % tile), (0, -columns % tile), (0, 0)], constant_values=none)
+    tall = shown.reshape(-1, tile, shown.shape[1], bands)  # (row of tiles, row, column, band)
+    ridge = tall.max(axis=1).reshape(len(tall), -1, tile, bands)
+    within = ridge.argmax(axis=2)  # (row of tiles, tile, band)
+    greatest = np.take_along_axis(ridge, within[:, :, None], axis=2)[:, :, 0]
+    column = within + np.arange(ridge.shape[1])[:, None] * tile
+    high = np.arange(len(tall))[:, None, None]
+    row = first + high * tile + tall[high, :, column, np.arange(bands)].argmax(axis=-1)
     for band in range(bands):
-        ranking.offer((*kind, band), greatest[:, band], row[:, band], column[:, band])
+        ranking.offer((*kind, band), *(one[..., band].ravel() for one in (greatest, row, column)))
 
 
 def telling_bands(spectra: Light) -> NDArray[np.intp]:
@@ -131,17 +135,17 @@ def telling_bands(spectra: Light) -> NDArray[np.intp]:
 
 
 def _strips(
-    scene: RasterScene, tile: int, halo: int, cells: ReachedCells, reaches: Sequence[float]
+    scene: RasterScene, high: int, halo: int, cells: ReachedCells, reaches: Sequence[float]
 ) -> Iterator[_Strip]:
     rows, ends = scene.shape[0], [-1.0, 0.0, *reaches]
-    for first in range(0, rows, tile):
-        down = np.arange(first - halo, min(first + tile, rows) + halo).clip(0, rows - 1)
+    for first in range(0, rows, high):
+        down = np.arange(first - halo, min(first + high, rows) + halo).clip(0, rows - 1)
         inner = scene.planes[down[0] : down[-1] + 1][down - down[0]]
-        tiers = {0: cells.rows_within(first, first + tile, -1.0, 0.0)}
+        tiers = {0: cells.rows_within(first, first + high, -1.0, 0.0)}
         if not cells.covers:
             numbers = range(1, len(reaches) + 1)
-            tiers |= {one: cells.rows_within(first, first + tile, ends[one], ends[one + 1]) for one in numbers}
-            tiers[_FAR] = cells.rows_within(first, first + tile, ends[-1], np.inf)
+            tiers |= {one: cells.rows_within(first, first + high, ends[one], ends[one + 1]) for one in numbers}
+            tiers[_FAR] = cells.rows_within(first, first + high, ends[-1], np.inf)
         yield _Strip(first, np.pad(inner, ((0, 0), (halo, halo), (0, 0)), mode="edge"), tiers)
 
 

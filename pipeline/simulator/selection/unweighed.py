@@ -14,7 +14,7 @@ from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.selection.choice import Decision, Reason, Treatment
 from pipeline.simulator.selection.options import ALWAYS_ON, unbounded_menu
 
-CHOOSING_S = 1.2  # CPU seconds of a choice beside those of libraries, measured on scenes of any size
+CHOOSING_S = 0.9  # CPU seconds of a choice beside those of libraries, measured on scenes of any size
 FEWEST_BANDS = 200  # a sample of fewer takes as long: most of it goes into the weights of its pixels
 
 

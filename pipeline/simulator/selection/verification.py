@@ -26,6 +26,7 @@ from pipeline.simulator.selection.options import acts_on_light
 
 Floats = NDArray[np.float64]
 Units = Callable[[Light, int], NDArray[np.floating]]  # of the mean light of so many samples that a number sums
+HARDLY = 1e-3  # units: an effect that changes less is measured together with the others alone
 VERIFIED_LINES = 3  # whole ones, for stray light comes from all of a line
 MOST_CANDIDATES = 40
 Render = Callable[[SweepBlock, Mapping[Effect, str]], Light]
@@ -134,7 +135,8 @@ def verify(decision: Decision, render: Render, blocks: Mapping[str, SweepBlock],
     Draws are paired: the difference is the effect's alone. Effects of the readout change distributions, not expected
     light, and are not measured. ``render`` gives expected electrons (line, sample, band) of a block with some effects
     on, ``units`` one unit of the tolerance at each [e-]. Returns the greatest change of a stored number in units: by
-    the name of each effect that is not exact, and of `TOTAL`; where ``none`` was asked for, of that alone.
+    the name of each effect that is not exact and bounded by more than `HARDLY`, and of `TOTAL`; where ``none`` was
+    asked for, of that alone.
 
     Raises BoundError: a change exceeds the bound that the decision counted on; names effect, bound, change and place.
     """
@@ -144,7 +146,7 @@ def verify(decision: Decision, render: Render, blocks: Mapping[str, SweepBlock],
         for one in decision.taken
         if acts_on_light(one.menu.effect) and one.menu.present and one.option is not one.menu.exact
     ]
-    each = changed if decision.asked != "none" else []
+    each = [one for one in changed if one.option.error > HARDLY] if decision.asked != "none" else []
     trials = [(one.name, [one]) for one in each] + [(TOTAL, changed)]
     measured: dict[str, float] = {}
     for name, inexact in trials:

@@ -21,6 +21,7 @@ from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Optics, Rig
 from pipeline.simulator.scenes.scene import RasterScene
 from tests.pipeline.simulator.fine_image import IMAGES, change, disc, gaussian, probe_of, shifted
+from tests.pipeline.simulator.made_up_effects import steep_probe
 from tests.pipeline.simulator.small_scenes import made_scene
 
 
@@ -36,6 +37,18 @@ def test_bound_holds(name: str, sigma: float):
     image = IMAGES[name]()
     bound = ABERRATION.bound(probe_of(image), rig_of(sigma)).value
     assert bound / 6 <= change(image, gaussian(sigma, sigma)) <= bound + 1e-9
+
+
+def test_a_ridge_changes_by_as_much_as_is_bounded():
+    """At the top of a ridge a blur takes its slope times the mean way of the light: no bound of slopes may be less."""
+    ridge = steep_probe((3.0, 0.0), curvature=(1e9, 0.0))
+    x = np.linspace(-1, 1, 200_001)
+    gauss, half_disc = np.exp(-((8 * x) ** 2) / 2), np.sqrt(1 - x**2)
+    by_lens = 3.0 * 0.4 * np.average(np.abs(8 * x), weights=gauss)
+    assert ABERRATION.bound(ridge, rig_of(0.4)).value == pytest.approx(by_lens, rel=1e-4)
+    radius = defocus_px(rig_at(30.0), 30.0)[0] / 2
+    by_disc = 3.0 * radius * np.average(np.abs(x), weights=half_disc)
+    assert DEFOCUS.bound(ridge, rig_at(30.0)).value == pytest.approx(by_disc, rel=1e-3)
 
 
 NM = np.array([700.0])

@@ -44,6 +44,19 @@ def test_bands_alike_have_one_kernel() -> None:
     np.testing.assert_array_equal(found.mixing, 1.0)
 
 
+@pytest.mark.parametrize("parts", [(1, 1), (3, 1)])
+def test_a_window_is_as_wide_as_all_of_its_kernels_need(parts: tuple[int, int]) -> None:
+    """Each kernel looks through one window, with others of its level that are nearly as wide."""
+    waves, shift = np.array([[0.63], [0.89]]) * np.linspace(0.4, 1.0, 9), np.outer([0.075, 0.0], np.linspace(-1, 1, 9))
+    found = fold((2.7, 1.0), parts, 1, Moments(shift, np.full((2, 9), 0.04), waves))
+    windows = found.windows()
+    assert sorted(np.concatenate([some for _, some in windows]).tolist()) == list(range(found.kernels))
+    assert len(windows) > len(set(found.level.tolist()))
+    for level, some in windows:
+        assert set(found.level[some].tolist()) == {level}
+        assert np.ptp(np.sqrt(found.variance[:, some]).max(axis=0)) <= 0.2
+
+
 @pytest.mark.parametrize("bands", [2, 3])
 def test_few_bands_are_their_own_kernels(bands: int) -> None:
     """As many kernels as bands at most; each band is then one of them, and exact."""

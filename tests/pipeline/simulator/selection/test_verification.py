@@ -107,7 +107,15 @@ def test_light_that_is_no_number_breaks_every_bound():
 def test_rounding_alone_breaks_no_bound():
     """Sums of float32 in another order differ by some millionths."""
     decision = decided(Brightening("drift", 1e-9, share=2e-6))
-    assert verify(decision, render, CHIPS, units)["drift"] == pytest.approx(2.4e-6, rel=0.1)
+    assert verify(decision, render, CHIPS, units)[TOTAL] == pytest.approx(2.4e-6, rel=0.1)
+
+
+def test_what_hardly_changes_anything_is_measured_with_the_others_alone():
+    """An effect bounded by less than a thousandth of a unit has no figure of its own, and counts in that of all."""
+    effects = Brightening("drift", 1e-4, share=1e-4), Brightening("cloud", 0.02, share=0.02)
+    measured = verify(decided(*effects), render, CHIPS, units)
+    assert measured.keys() == {"cloud", TOTAL}
+    assert measured[TOTAL] == pytest.approx(1.2 * (1.0001 * 1.02 - 1), rel=1e-3)
 
 
 def test_sums_are_held_against_the_bound_as_they_are_stored():
