@@ -161,10 +161,11 @@ def test_a_broken_chunk_is_named(machine: Machine) -> None:
 
     def build(path: Path) -> None:
         group = create_group(path / "m.zarr", "m", {})
-        write_image(group, "values", ("y", "x"), np.arange(128 * 64, dtype=np.uint16).reshape(128, 64), {})
+        image = np.arange(128 * 64 * 2, dtype=np.uint16).reshape(128, 64, 2)
+        write_image(group, "values", ("y", "x", "band"), image, {})
 
     ref, _ = archive.produce("rectify", build, version=1, params={})
-    rot(archive, object_of(archive, ref, "m.zarr/values/c/1/0"), at=50)
+    rot(archive, object_of(archive, ref, "m.zarr/values/c/1/0/0"), at=50)
     (found,) = problems(archive)
     assert "values: rows 64 to 127" in found
     assert "unreadable: rows 64 to 95, columns 0 to 31" in found
