@@ -210,18 +210,11 @@ def _run_by(path: Path, settings: Settings, *, planning: bool, archive: Archive 
     refused = farm_refusal(settings)
     if refused is not None and not planning:
         raise SettingsError(refused)
-    scene, notes = open_scene(settings, described.class_names)
-    if not planning:  # what the rig would find there: no stage's work
-        scene.raster.drawn()
-        scene.light()
-    model.check_bands(scene.wavelength_nm)
-    label_notes = check_labels(scene, described)
+    scene, notes, label_notes = _scene_for(model, settings, planning=planning)
     grid = SceneGrid(*scene.shape, described.config.patch, described.config.factor)
     zones = open_zones(settings, place_of_field(settings, scene), grid)
     outside = beyond_training(settings, scene, described, model.trained_on, path)
     familiar = model.asked_familiar(settings)
-    if settings.mask is not None:
-        check_mask(settings.mask, scene.shape)
     name, found = settings.name or Path(scene.name).stem, None
     if planning:  # what a look would be, were there one
         settings = replace(settings, doubt=None)
@@ -266,6 +259,21 @@ def _run_by(path: Path, settings: Settings, *, planning: bool, archive: Archive 
         notes=said,
         refused=refused,
     )
+
+
+def _scene_for(
+    model: SurveyModel, settings: Settings, *, planning: bool
+) -> tuple[RasterScene, tuple[str, ...], tuple[str, ...]]:
+    """Open a scene that the weights can read, drawn unless for ``planning``; what to say of it and of its labels."""
+    scene, notes = open_scene(settings, model.described.class_names)
+    if not planning:  # what the rig would find there: no stage's work
+        scene.raster.drawn()
+        scene.light()
+    model.check_bands(scene.wavelength_nm)
+    label_notes = check_labels(scene, model.described)
+    if settings.mask is not None:
+        check_mask(settings.mask, scene.shape)
+    return scene, notes, label_notes
 
 
 def make_source(scene: RasterScene, settings: Settings) -> SimulatedSource:

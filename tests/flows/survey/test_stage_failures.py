@@ -6,6 +6,7 @@ import io
 import json
 import shutil
 import tempfile
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr, redirect_stdout
@@ -33,6 +34,7 @@ from tests.flows.conftest import Ended, problems
 
 pytestmark = pytest.mark.usefixtures("no_effects")
 
+RECORDED_S = 30.0  # in which a server has heard of a task that ended
 CAPTURES = ("capture_coarse", "capture_fine")
 NO_REPLY = "no reply from the camera after 2 s; is it on?"
 FULL_DISK = "cannot write to the archive: no space left; make room"
@@ -198,8 +200,11 @@ def server(prefect_home: Path) -> Iterator[None]:
         yield
 
 
-def newest_run(flow: str) -> tuple[Any, dict[str, Any]]:
-    """The newest run of a flow, and its task runs by their names."""
+def newest_run(flow: str, count: int) -> tuple[Any, dict[str, Any]]:
+    """The newest run of a flow, and its ``count`` task runs by their names, as soon as the server has them ended.
+
+    It hears of tasks by events, of the last one after the flow has ended.
+    """
     from prefect.client.orchestration import get_client
     from prefect.client.schemas.filters import FlowFilter, FlowFilterName, FlowRunFilter, FlowRunFilterId
     from prefect.client.schemas.sorting import FlowRunSort
@@ -207,7 +212,13 @@ def newest_run(flow: str) -> tuple[Any, dict[str, Any]]:
     with get_client(sync_client=True) as client:
         named = FlowFilter(name=FlowFilterName(any_=[flow]))
         (run,) = client.read_flow_runs(flow_filter=named, sort=FlowRunSort.START_TIME_DESC, limit=1)
-        tasks = client.read_task_runs(flow_run_filter=FlowRunFilter(id=FlowRunFilterId(any_=[run.id])))
+        of_it, latest = FlowRunFilter(id=FlowRunFilterId(any_=[run.id])), time.monotonic() + RECORDED_S
+        tasks = client.read_task_runs(flow_run_filter=of_it)
+        while time.monotonic() < latest and not (
+            len(tasks) >= count and all(task.state is not None and task.state.is_final() for task in tasks)
+        ):
+            time.sleep(0.2)
+            tasks = client.read_task_runs(flow_run_filter=of_it)
     return run, {task.name: task for task in tasks}
 
 
@@ -225,8 +236,8 @@ def test_a_stage_that_fails_by_prefect(
     monkeypatch.setattr(engine, "RETRY_DELAY_S", 0.0)
     with pytest.raises(type(error), match=str(error)[:20]):
         survey_png(tmp_path, engine="prefect")
-    run, tasks = newest_run("survey")
     before = list(STAGES)[: list(STAGES).index(stage)]
+    run, tasks = newest_run("survey", len(before) + 1)
     assert (run.name, run.state.type.value) == ("survey-scene", "FAILED")
     assert str(error) in run.state.message
     assert tasks.keys() == {f"{name}-scene" for name in (*before, stage)}
@@ -262,7 +273,7 @@ def test_a_due_run_of_which_a_stage_fails(
     with monkeypatch.context() as broken:
         broken.setitem(STAGES, "cut_patches", failing("cut_patches", refusal("cut_patches")))
         state = survey_scheduled("north", moment_words(due), return_state=True)
-    run, tasks = newest_run("survey")
+    run, tasks = newest_run("survey", list(STAGES).index("cut_patches") + 1)
     assert (state.is_failed(), state.message, run.name) == (True, FULL_DISK, "survey-north")
     assert tasks["cut_patches-north"].state.type.value == "FAILED"
     line = Ledger(one.archive, "north").lines()[-1]
@@ -289,7 +300,7 @@ def test_a_reprocessing_of_which_a_stage_fails(
     with monkeypatch.context() as broken:
         broken.setitem(STAGES, "draw_map", failing("draw_map", refusal("draw_map")))
         state = reprocess_archive(archive=str(out), return_state=True)
-    run, _ = newest_run("reprocess")
+    run, _ = newest_run("reprocess", 0)
     assert (state.is_failed(), run.name, run.state.message) == (True, f"reprocess-{out}", state.message)
     assert state.message == "no field could be reprocessed; reprocess-TIME.json beside the archive says why"
     (summary,) = tmp_path.glob("reprocess-*.json")
