@@ -6,6 +6,7 @@ import difflib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -305,7 +306,8 @@ def _savings(runs: Rows) -> list[Chart]:
 
 def _summed_seconds(runs: Rows) -> dict[str, list[tuple[float, float]]]:
     """What all visits up to each took, and what scanning everything every time would have."""
-    dated = sorted((moment, row["capture_seconds"]) for row in runs if (moment := day_of(row)) is not None)
+    told = ((moment, row["capture_seconds"]) for row in runs if (moment := day_of(row)) is not None)
+    dated = sorted(told, key=itemgetter(0))
     dated = [(moment, seconds) for moment, seconds in dated if None not in seconds.values()]
     names, spent = {"done": "these visits", "full": "everything, every time"}, {"done": 0.0, "full": 0.0}
     points: dict[str, list[tuple[float, float]]] = {label: [] for label in names.values()}

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from flows.schedule.field_visits import COLOURS, line_chart, look_of
-from flows.schedule.history import FieldHistory, read_histories, render_history, render_index, way_to
+from flows.schedule.history import FieldHistory, _summed_seconds, read_histories, render_history, render_index, way_to
 from storage.archive.archive import Archive
 from storage.archive.ledger import Ledger
 from storage.archive.records import Run
@@ -199,3 +199,10 @@ def test_rare_classes_have_a_scale_of_their_own() -> None:
     assert ">0.2 %<" in weed
     assert ">0.2 %<" not in page.partition('aria-label="soil"')[2].partition("</svg>")[0]
     assert re.findall(r">(2026[^<]*)<", weed)
+
+
+def test_two_visits_of_one_second_are_both_counted() -> None:
+    """Published or looked at in the same moment they stand in the order that they came in."""
+    runs = [{"created": "2026-06-21T11:00:00Z", "capture_seconds": {"done": done, "full": 9.0}} for done in (3.0, 2.0)]
+    summed = _summed_seconds(runs)
+    assert [seconds for _, seconds in summed["these visits"]] == [3.0, 5.0]
