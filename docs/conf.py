@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from flows.settings.documents import settings_table  # noqa: E402
-from flows.survey.stage import all_stages  # noqa: E402
+from flows.tasks.stage import all_stages  # noqa: E402
 
 project = "SpectralZoom"
 version = release = metadata.version("spectralzoom")

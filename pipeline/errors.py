@@ -116,9 +116,6 @@ class BoundError(PipelineError, ArithmeticError):
 class NothingToMend(Exception):  # noqa: N818 - no error: a survey that ends well without a look
     """A field is remembered so surely that nobody has to look; ``run`` is the one whose map stands."""
 
-    def __init__(self, run: str, expected_wrong: float, asked: float) -> None:
-        super().__init__(
-            f"nothing is looked at: {expected_wrong:.1%} of what is remembered is expected to be wrong, and a look is"
-            f" asked for from {asked:.1%} on; the map of {run} stands"
-        )
+    def __init__(self, run: str, why: str) -> None:
+        super().__init__(why)
         self.run = run

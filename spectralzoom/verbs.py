@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     import flows.evaluate.command as evaluate_command
     import flows.evaluate.frames as evaluate_frames
     import flows.publish.survey_command as survey_command
-    import flows.schedule.rig_lock as rig_lock
     import flows.settings.load as settings_load
     import flows.terminal.processes as processes
     import flows.terminal.progress as terminal_progress
@@ -37,7 +36,6 @@ else:
     evaluate_command = deferred("flows.evaluate.command")
     evaluate_frames = deferred("flows.evaluate.frames")
     survey_command = deferred("flows.publish.survey_command")
-    rig_lock = deferred("flows.schedule.rig_lock")
     settings_load = deferred("flows.settings.load")
     processes = deferred("flows.terminal.processes")
     terminal_progress = deferred("flows.terminal.progress")
@@ -79,7 +77,7 @@ def survey(settings: Asked = None, *, progress: Told | None = None, quiet: bool 
         What was expected, what came, where, and what to do; nothing that was captured is lost.
     """
     asked = _settings(settings, flags)
-    with _working(progress, quiet=quiet) as console, rig_lock.rig_to_oneself(asked, "a survey from Python"):
+    with _working(progress, quiet=quiet) as console:
         published = survey_command.run_survey(asked, console)
     return opened.open(asked.out)[published.folder.name]
 

@@ -23,7 +23,7 @@ import pytest
 
 from flows.publish import run_folder
 from flows.publish.quicklook import QuicklookData
-from flows.survey.stages import effects as effect_choice
+from flows.tasks.stages import effects as effect_choice
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.coverage import coarse_sweeps

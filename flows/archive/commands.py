@@ -14,8 +14,8 @@ from rich.console import Console
 from flows.archive.tables import show_clearance, show_contents, show_explanation, show_repair, show_verdict
 from flows.cli.app import ArchiveName, AsJson, Switch, stderr
 from flows.settings.survey_settings import Settings
-from flows.survey.scores import score_of
-from flows.survey.stage import versions, versions_made_again
+from flows.tasks.open_survey import versions, versions_made_again
+from flows.tasks.scores import score_of
 from flows.terminal.figures import known_number
 from flows.terminal.processes import DONE, FAILED, PARTLY
 from flows.terminal.progress import StageProgress, put_out

@@ -16,7 +16,7 @@ from flows.cli.app import ArchiveName, AsJson, OutFolder, check_outside
 from flows.publish.change_pictures import MapPair, draw_difference
 from flows.publish.receipt import areas_on_ground
 from flows.settings.survey_settings import BUILT_IN_SCENES
-from flows.survey.scores import score_of
+from flows.tasks.scores import score_of
 from flows.terminal.figures import DASH, format_count, format_percent, format_points, format_seconds, known_number
 from flows.terminal.processes import DONE
 from flows.terminal.progress import put_out

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from flows.survey.run import SurveyRun
+from flows.tasks.run import SurveyRun
 from flows.terminal.figures import area_words, format_count, format_metres, format_percent, format_seconds, three_digits
 from pipeline.ground.field_places import FieldScale
 from pipeline.planning.fine_pass import FinePlan

@@ -19,12 +19,13 @@ from flows.cli.app import AsJson
 from flows.cli.survey_verbs import NO_FLAGS, SurveyFlags, by_setting
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
-from flows.survey.extent import PastCosts
-from flows.survey.run import SurveyRun, open_run
-from flows.survey.scan_choice import ScanChoice, as_told
-from flows.survey.stage import Stage, Wanted
-from flows.survey.stages.attention import load_plan
-from flows.survey.survey import STAGES, judge, survey
+from flows.tasks.extent import PastCosts
+from flows.tasks.open_survey import JUDGED, STAGES, OpenSurvey
+from flows.tasks.run import SurveyRun, open_run
+from flows.tasks.scan_choice import ScanChoice, as_told
+from flows.tasks.stage import Stage, Wanted
+from flows.tasks.stages.accuracy import evaluate
+from flows.tasks.stages.attention import load_plan
 from flows.terminal.figures import format_bytes, format_percent, format_points, format_seconds
 from flows.terminal.processes import DONE
 from flows.terminal.progress import put_out
@@ -42,10 +43,12 @@ from storage.remote.opening import is_archive, open_archive
 
 if TYPE_CHECKING:
     import flows.archive.plan_preview as plan_preview
+    import flows.survey as survey_flow
 else:
+    survey_flow = deferred("flows.survey")  # Prefect
     plan_preview = deferred("flows.archive.plan_preview")  # matplotlib, for pictures alone
 
-State = Literal["cached", "to run", "blocked", "skipped"]
+State = Literal["cached", "to run", "blocked"]
 
 
 def plan(
@@ -120,9 +123,10 @@ def forecast(settings: Settings, preview: Path | None = None) -> Forecast:
         run = open_run(settings, planning=True, archive=archive)
         catalogue = Catalogue.read(archive.root)
         planner = Planner(run, catalogue)
-        products = survey(planner)
-        judge(planner, products)
-        fine = _planned_fine(products["attend"])
+        survey_flow.draw_class_map(planner)
+        if run.scene.labelled and run.settings.accuracy:
+            evaluate(planner, *planner.products.there(*JUDGED))
+        fine = _planned_fine(planner.products["attend"])
         figures = field_figures(run, fine)
         if preview is not None:
             shown = plan_preview.PlanPicture(run, fine, _last_map(run, catalogue), figure_lines(figures))
@@ -153,30 +157,26 @@ def _last_map(run: SurveyRun, catalogue: Catalogue) -> ClassMap | None:
     return None
 
 
-@dataclass
-class Planner:
-    """An engine for `flows.survey.survey.survey` that asks every stage for its key, and runs none."""
+class Planner(OpenSurvey):
+    """A survey that asks every stage for its key, and runs none."""
 
-    run: SurveyRun
-    catalogue: Catalogue
-    rows: list[StageForecast] = field(default_factory=list)
-    _planned: dict[str, Store] = field(default_factory=dict)  # by address
+    def __init__(self, run: SurveyRun, catalogue: Catalogue) -> None:
+        super().__init__(run)
+        self.catalogue = catalogue
+        self.rows: list[StageForecast] = []
+        self._planned: dict[str, Store] = {}  # by address
+        self._costs = PastCosts(catalogue, run)
 
-    def __post_init__(self) -> None:
-        self._costs = PastCosts(self.catalogue, self.run)
-
-    def __call__(self, stage: str, /, *inputs: StageRef) -> StageRef | None:
-        ref: StageRef | None = None
+    def __call__(self, stage: str, /, *inputs: StageRef) -> StageRef:
+        """Note what would become of a stage, and return where its store would be."""
         try:
-            wanted = STAGES[stage](self.run, *inputs)
-            row = StageForecast(stage, "skipped", None, "nothing to do with these settings")
-            if wanted is not None:
-                row, ref = self._look(STAGES[stage], wanted)
+            row, ref = self._look(STAGES[stage], STAGES[stage].wants(self.run, *inputs))
         except (PipelineError, OSError) as error:  # what is there cannot be used: the survey would stop here
             why = f"waits for {error}" if isinstance(error, _WaitsError) else str(error)
             row = StageForecast(stage, "blocked", None, why, *self._costs.estimate(stage))
             ref = _Awaited(STAGES[stage].product.name, "", Path(), stage)
         self.rows.append(row)
+        self.products[stage] = ref
         return ref
 
     def _look(self, stage: Stage, wanted: Wanted) -> tuple[StageForecast, StageRef]:
@@ -232,7 +232,7 @@ def _shown(value: object) -> str:
 MOST_SCANS = 8  # of the frontier that are shown
 MARKS = {"taken": "this survey", "reference": "nearly as good as any"}
 MOST_LETTERS = 250  # of a reason
-COLOURS = {"cached": "green", "to run": "bold", "blocked": "yellow", "skipped": "dim"}
+COLOURS = {"cached": "green", "to run": "bold", "blocked": "yellow"}
 
 
 def plan_content(settings: Settings, preview: Path | None = None) -> dict[str, Any]:

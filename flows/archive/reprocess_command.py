@@ -32,15 +32,17 @@ from flows.archive.stale_runs import (
 )
 from flows.cli.app import ArchiveName, AsJson, OutFolder, Scheduler, Switch, Workers, check_outside, stderr
 from flows.publish.receipt import Receipt
-from flows.publish.run_folder import add_accuracy, load_receipt
+from flows.publish.run_folder import extend_with_accuracy, load_receipt
 from flows.publish.survey_command import run_survey, show_published
 from flows.settings.load import of_this_version, parse_settings
 from flows.settings.survey_settings import OF_THE_MACHINE, Settings
-from flows.survey.run import SurveyRun, open_run
-from flows.survey.scene import for_rig
-from flows.survey.scores import score_of
-from flows.survey.stage import versions
-from flows.survey.survey import STAGES, TITLES, Products, StageRunner, judge
+from flows.tasks.observer import Observer
+from flows.tasks.open_survey import JUDGED, STAGES, TITLES, OpenSurvey, Products, versions
+from flows.tasks.run import SurveyRun, open_run
+from flows.tasks.scene import for_rig
+from flows.tasks.scores import score_of
+from flows.tasks.stages.accuracy import evaluate
+from flows.tasks.stages.placement import cut_patches
 from flows.terminal.figures import counted, format_points, format_seconds
 from flows.terminal.processes import DONE, FAILED, PARTLY
 from flows.terminal.progress import StageProgress, put_out
@@ -305,28 +307,28 @@ def run_judge(
     with console.status("opening scene and weights"):
         run = open_run(settings)
         run.archive.reclaim()
-        rows = {str(row.get("name")): row for row in found.stages}
-        products = Products()
-        for stage in STAGES.values():
-            if not stage.judges:
-                row = rows.get(stage.name, {})
-                key, what = str(row.get("key") or ""), f"{stage.title} of {found.uri}"
-                skipped = row.get("state") == "skipped"
-                products[stage.name] = None if skipped else _store(catalogue, run.archive, what, key)
-        _check_same(catalogue, found, products, run)
-    with run.archive.in_use(), run.settings.crew.open(), StageProgress(console, TITLES) as progress:
+        survey = OpenSurvey(run)
+        for row in found.stages:
+            stage = STAGES.get(str(row.get("name")))
+            if stage is not None and stage.name != evaluate.name and row.get("key"):
+                what = f"{stage.title} of {found.uri}"
+                survey.products[stage.name] = _store(catalogue, run.archive, what, str(row["key"]))
+        for name in (*JUDGED[:4], "attend"):
+            if name not in survey.products:
+                raise ArchiveError(f"the {TITLES[name]} of {found.uri} is missing or damaged; run verify --repair")
+        _check_same(catalogue, found, survey.products, run)
+    with survey.at_work(captures=False), StageProgress(console, TITLES) as progress:
+        survey.observer = Observer(progress.watch)
         draft = run.archive.extend_run(found.folder.name, wait=False)
         if draft is None:
             raise ArchiveError(f"{found.uri} is being judged by another process; it adds the accuracy")
         with draft:
-            runner = StageRunner(run, progress.watch)
-            for name in {name for stage in STAGES.values() if stage.judges for name in stage.of}:
-                ref = products.get(name)
-                if ref is not None and catalogue.stores[ref.uri].cleared:
-                    products[name] = runner(name, *products.there(STAGES[name].of))
-            judged = judge(runner, products)
-            published = add_accuracy(run, draft, judged, runner.records["evaluate"])
-    show_published(published, run.archive, console)
+            made = survey.products
+            if catalogue.stores[made["cut_patches"].uri].cleared:
+                last = "coarse" if survey.uniform else "fine"
+                cut_patches(survey, made["attend"], *made.there(f"capture_{last}", f"register_{last}"))
+            published = extend_with_accuracy(survey, draft, evaluate(survey, *made.there(*JUDGED)))
+    show_published(published, settings.out, console)
     return published.receipt
 
 

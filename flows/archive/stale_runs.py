@@ -12,9 +12,8 @@ from typing import Any
 from flows.publish.receipt import is_pending
 from flows.settings.load import of_this_version, parse_settings
 from flows.settings.survey_settings import BUILT_IN_SCENES, OF_THE_MACHINE, Settings
-from flows.survey.stage import versions
-from flows.survey.survey import STAGES
-from flows.survey.survey_model import weights_path
+from flows.tasks.open_survey import STAGES, versions
+from flows.tasks.survey_model import weights_path
 from models.weights.files import content_key
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, USUAL_DAY, USUAL_HOUR, law_of_key

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 
 from flows.cli.app import AsJson, OutFolder, Switch, removed, split_list, stderr
-from flows.schedule.rig_lock import rig_to_oneself
 from flows.settings.documents import flag_help
 from flows.settings.load import SURVEY, TABLES, load_settings
 from flows.settings.survey_settings import REPLACED
@@ -88,8 +87,7 @@ def survey(settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, as_js
     """
     asked = load_settings(settings, by_setting(flags))
     try:
-        with rig_to_oneself(asked, "a survey by hand"):
-            published = survey_command.run_survey(asked, stderr)
+        published = survey_command.run_survey(asked, stderr)
     except NothingToMend as said:
         if as_json:
             print_json({"looked": False, "run": said.run, "why": str(said)})

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.survey.scene import check_labels, judged_labels
+from flows.tasks.scene import check_labels, judged_labels
 from flows.training.data import TrainingData, farm_test_data, only_class, open_training_data
 from flows.training.look import observe_scene
 from models.evaluation.metrics import DRAWS

@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from flows.evaluate.rows import ENDS
-from flows.survey.scores import SHOWN, SHOWN_WORDS, definitions_differ
+from flows.tasks.scores import SHOWN, SHOWN_WORDS, definitions_differ
 from flows.terminal.figures import DASH, format_count, format_percent, format_points
 
 SHOWN_SHARE = 0.10  # of the seats, or the nearest one tried: what is shown where one share has to do

@@ -18,7 +18,7 @@ from flows.publish.panels import UNLABELLED_COLOUR, class_palette, class_rgb, ou
 from flows.publish.receipt import Receipt
 from flows.publish.receipt_words import days_words
 from flows.publish.report import Picture
-from flows.survey.memory import Prior
+from flows.tasks.memory import Prior
 from flows.terminal.figures import counted, format_count
 from pipeline.geometry.grid import UNLABELLED
 from storage.archive.keys import StageRef

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.settings.values import LOOK_WHOLE
-from flows.survey.memory import told_of_memory
-from flows.survey.run import SurveyRun
-from flows.survey.stages.maps import strange_pixels
+from flows.tasks.memory import told_of_memory
+from flows.tasks.run import SurveyRun
+from flows.tasks.stages.maps import strange_pixels
 from flows.terminal.figures import area_words, counted, format_count, format_percent
 from models.evaluation.expected_scores import expected_counts
 from pipeline.geometry.grid import UNLABELLED

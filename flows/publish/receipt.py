@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Literal, NotRequired, TypedDict, cast, get_args
 
-from flows.survey.scores import JUDGING
+from flows.tasks.scores import JUDGING
 from pipeline.errors import ShapeError
 from storage.archive.records import StageRecord, State
 from storage.archive.whole_files import to_json

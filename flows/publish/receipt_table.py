@@ -12,7 +12,7 @@ from rich.table import Table
 
 from flows.publish.findings import plot_rows
 from flows.publish.receipt import Accuracy, Receipt, Savings
-from flows.survey.scores import SHOWN, SHOWN_WORDS, definitions_differ, false_class_words
+from flows.tasks.scores import SHOWN, SHOWN_WORDS, definitions_differ, false_class_words
 from flows.terminal.figures import DASH, format_bytes, format_count, format_percent, format_points, format_seconds
 from pipeline.simulator.selection.choice import UNIT_WORDS
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from flows.publish.findings import FOREIGN, MOST_CHANGES, ground_words, zone_words
 from flows.publish.receipt import Receipt, is_pending
-from flows.survey.scores import worst_class_words
+from flows.tasks.scores import worst_class_words
 from flows.terminal.figures import (
     area_words,
     format_count,

@@ -22,7 +22,7 @@ from flows.publish.page_data import LEAFLET, part, policy, scripts
 from flows.publish.receipt import Accuracy, Receipt
 from flows.publish.receipt_table import control_seats, cost_rows, format_change, total_words
 from flows.publish.receipt_words import headline, sentences
-from flows.survey.scores import SHOWN, SHOWN_WORDS, definitions_differ, false_class_words
+from flows.tasks.scores import SHOWN, SHOWN_WORDS, definitions_differ, false_class_words
 from flows.terminal.figures import format_bytes, format_percent, format_points, format_seconds
 from pipeline.errors import visible
 

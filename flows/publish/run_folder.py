@@ -25,17 +25,17 @@ from flows.publish.report import Picture, render_report
 from flows.publish.run_layers import block_of, field_map, read_coarse
 from flows.settings.load import anchor_paths
 from flows.settings.values import LOOK_WHOLE
-from flows.survey.extent import work_done, work_of_map
-from flows.survey.memory import told_of_memory
-from flows.survey.run import SurveyRun, now
-from flows.survey.scan_choice import as_told
-from flows.survey.stages.accuracy import load_accuracy
-from flows.survey.stages.attention import load_orientation, load_plan
-from flows.survey.stages.capture import captured
-from flows.survey.stages.effects import load_manifest
-from flows.survey.stages.on_ground import STORE
-from flows.survey.stages.placement import SEATS_AT_ONCE, line_facts, load_registration, seen_shares
-from flows.survey.survey import STAGES, Products, StageRunner
+from flows.tasks.extent import work_done, work_of_map
+from flows.tasks.memory import told_of_memory
+from flows.tasks.open_survey import STAGES, OpenSurvey, Products
+from flows.tasks.run import SurveyRun, now
+from flows.tasks.scan_choice import as_told
+from flows.tasks.stages.accuracy import load_accuracy
+from flows.tasks.stages.attention import load_orientation, load_plan
+from flows.tasks.stages.capture import captured
+from flows.tasks.stages.effects import load_manifest
+from flows.tasks.stages.on_ground import STORE
+from flows.tasks.stages.placement import SEATS_AT_ONCE, line_facts, load_registration, seen_shares
 from pipeline.errors import IncompleteStoreError
 from pipeline.planning.coverage import on_scene
 from pipeline.planning.fine_pass import FinePlan
@@ -43,7 +43,7 @@ from pipeline.planning.plain_scans import scan_words
 from pipeline.planning.prices import SavingEntry, capture_savings
 from pipeline.rectify.calibrate import of_bands, reflectance
 from storage.archive.keys import StageRef
-from storage.archive.records import StageRecord, read_run
+from storage.archive.records import read_run
 from storage.archive.run_folders import RunDraft
 from storage.archive.whole_files import to_json
 from storage.arrays.class_maps import BeliefStore, load_class_map, load_class_names
@@ -64,29 +64,30 @@ class Published:
     looked_twice: float | None  # None of a plain scan; share of the field's seats captured in detail
 
 
-def publish_run(runner: StageRunner, products: Products, started: str) -> Published:
+def publish_run(survey: OpenSurvey) -> Published:
     """Write receipt.json, quicklook.png and report.html into a run folder and publish it as a whole."""
-    run = runner.run
+    run, products = survey.run, survey.products
     plan = load_plan(products.of("attend"))
     with run.archive.new_run(run.name) as draft:
-        receipt = make_receipt(runner, products, plan, started, f"runs/{draft.id}")
+        receipt = make_receipt(survey, plan, f"runs/{draft.id}")
         return _publish(run, draft, products, plan, receipt)
 
 
-def add_accuracy(run: SurveyRun, draft: RunDraft, products: Products, stage: StageRecord) -> Published:
+def extend_with_accuracy(survey: OpenSurvey, draft: RunDraft, accuracy: StageRef) -> Published:
     """Publish a run again with its accuracy, in the place of what was published before.
 
-    ``draft`` is of `Archive.extend_run`, ``stage`` the record of the judging. All that the receipt says of the survey
-    itself stays as it is.
+    ``draft`` is of `Archive.extend_run`, ``accuracy`` the store of the judging. All that the receipt says of the
+    survey itself stays as it is.
     """
+    run, products, judge = survey.run, survey.products, STAGES["evaluate"]
     before, asked = load_receipt(draft.published), asked_settings(run)
     other_labels = asked["labels"] != before["settings"].get("labels")
     names = ("accuracy", "controls", *(("labels", "notes") if other_labels else ()))
     receipt = with_accuracy(
         before,
-        load_accuracy(products.of("evaluate")),
-        stage,
-        STAGES["evaluate"].addresses(products.of("evaluate"))["accuracy"],
+        load_accuracy(accuracy),
+        survey.records[judge.name],
+        judge.addresses(accuracy)["accuracy"],
         settings={name: asked[name] for name in names},
         judged=now(),
     )
@@ -111,7 +112,7 @@ def _publish(run: SurveyRun, draft: RunDraft, products: Products, plan: FinePlan
     if "plots" in receipt:
         draft.write_file(PLOTS_FILE, plots_csv(receipt["plots"]))
     picture = (draft.folder / "quicklook.png").read_bytes()
-    maps = (load_ground_map(ref.path / STORE) for ref in products.there(["ground"]))
+    maps = (load_ground_map(ref.path / STORE) for ref in products.there("ground"))
     pictures = [Picture(draw_ground(drawn), "The map on the ground, north up.") for drawn in maps]
     before = remembered(run.prior, products.of("draw_map"), receipt)
     field = field_map(run, products, plan, glance, coarse.spectra, before)
@@ -119,22 +120,22 @@ def _publish(run: SurveyRun, draft: RunDraft, products: Products, plan: FinePlan
     pictures += change_pictures(before, field.classes, legend, run.grid.patch)
     page = render_report(receipt, picture, pictures, looked_twice=looked_twice, field=field)
     (draft.folder / "report.html").write_text(page, encoding="utf-8")
-    rests_on = run.archive.manifest_hashes(products.there(products))
+    rests_on = run.archive.manifest_hashes(products.values())
     folder = draft.publish(survey=receipt["survey"], settings=receipt["settings"], rests_on=rests_on)
     return Published(receipt, folder, looked_twice)
 
 
-def make_receipt(runner: StageRunner, products: Products, plan: FinePlan, started: str, folder: str) -> Receipt:
+def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str) -> Receipt:
     """Put together what the run has to say for itself."""
-    run = runner.run
-    accuracy = None if products.get("evaluate") is None else load_accuracy(products.of("evaluate"))
+    run, products = survey.run, survey.products
+    accuracy = load_accuracy(products["evaluate"]) if "evaluate" in products else None
     savings = _savings(run, products, plan)
     simulation = None if not run.source.simulates else load_manifest(products.of("choose_effects"))
     if accuracy is not None and "segment_wall_s" in accuracy:
         savings["segment_wall_s"] = accuracy.pop("segment_wall_s")
     stores: dict[str, str] = {}
     for name, ref in products.items():
-        stores |= {} if ref is None else STAGES[name].addresses(ref)
+        stores |= STAGES[name].addresses(ref)
     files = ("receipt.json", "quicklook.png", "report.html", *([PLOTS_FILE] if run.zones.plots is not None else []))
     unjudged: AccuracyIs = "pending" if run.settings.accuracy else "left out"
     accuracy_is = "judged" if accuracy is not None else unjudged if run.scene.labelled else "without labels"
@@ -142,12 +143,11 @@ def make_receipt(runner: StageRunner, products: Products, plan: FinePlan, starte
     for name in LIBRARIES:
         with suppress(PackageNotFoundError):  # run from a source tree that is not installed
             versions[name] = version(name)
-    header = Header(
-        run.name, run.source.name, run.scene.key, run.settings.seed, started, now(), versions, asked_settings(run)
-    )
+    began, asked = survey.started, asked_settings(run)
+    header = Header(run.name, run.source.name, run.scene.key, run.settings.seed, began, now(), versions, asked)
     return build_receipt(
         header,
-        runner.records.values(),
+        survey.records.values(),
         savings,
         {**stores, **{name: f"{folder}/{name}" for name in files}},
         accuracy=accuracy,
@@ -168,7 +168,7 @@ def _savings(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, An
     bands = len(run.scene.wavelength_nm)
     done = [*run.plan.coarse, *plan.sweeps]
     entries = capture_savings(done, run.plan.full, run.camera, run.grid, cost=run.settings.cost, bands=bands)
-    stored = [run.archive.stored_bytes(ref) for ref in (products.of("capture_coarse"), products.of("capture_fine"))]
+    stored = [run.archive.stored_bytes(ref) for ref in products.there("capture_coarse", "capture_fine")]
     # Fine lines compress like the full scan's would; without any, the coarse ones have to stand for them.
     like, kept = (plan.sweeps, stored[1]) if plan.sweeps else (run.plan.coarse, stored[0])
     of_these = capture_savings(like, run.plan.full, run.camera, run.grid, cost=run.settings.cost, bands=bands)
@@ -323,7 +323,7 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
         found["pointing"] = {"prior_px": run.settings.pointing_px, **pointing}
     class_map = products.of("draw_map")
     drawn = load_class_map(class_map.path / "class_map.zarr")
-    posed = next((load_ground_map(ref.path / STORE) for ref in products.there(["ground"])), None)
+    posed = next((load_ground_map(ref.path / STORE) for ref in products.there("ground")), None)
     found |= find_ground(run, posed, drawn, BeliefStore(class_map.path / "belief.zarr")) | find_zones(run, drawn)
     found |= find_map(run, class_map, drawn)
     troubled = {name: facts for name, facts in line_facts(products.of("rectify")).items() if any(facts.values())}

@@ -14,9 +14,9 @@ from flows.publish.field_map import FieldMap, SweepShown
 from flows.publish.page_data import PagePlaces, PageSpectra, page_spectra, places_of_grid, places_of_pose
 from flows.publish.quicklook import QuicklookData, colours_of
 from flows.publish.receipt_words import days_words
-from flows.survey.run import SurveyRun
-from flows.survey.stages.on_ground import survey_grid
-from flows.survey.survey import Products
+from flows.tasks.open_survey import Products
+from flows.tasks.run import SurveyRun
+from flows.tasks.stages.on_ground import survey_grid
 from flows.terminal.figures import counted, format_seconds
 from pipeline.geometry.scan import Sweep, exposing
 from pipeline.planning.fine_pass import FinePlan

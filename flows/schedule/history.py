@@ -19,7 +19,7 @@ from flows.publish.receipt import areas_on_ground
 from flows.publish.report import render_page
 from flows.schedule.field_schedule import ENDINGS, moment_words, read_moment
 from flows.schedule.field_visits import Chart, VisitPicture, line_chart, look_of, visit_pictures
-from flows.survey.scores import score_of
+from flows.tasks.scores import score_of
 from flows.terminal.figures import DASH, LEAST_HECTARES, area_words, counted, format_percent, known_number
 from flows.terminal.processes import DONE
 from flows.terminal.progress import print_json

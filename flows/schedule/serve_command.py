@@ -21,7 +21,7 @@ from flows.schedule.rig_lock import RigLock, hold_place
 from flows.schedule.served import ServedField, ServeRequest, load_field
 from flows.schedule.server import serve_prefect
 from flows.schedule.times import SystemWallClock, Timetable, WallClock, parse_timetable
-from flows.survey.run import open_run
+from flows.tasks.run import open_run
 from flows.terminal.processes import DONE, terminable
 from pipeline.errors import ArchiveError, PipelineError, RigError, SettingsError
 from pipeline.lazy import deferred

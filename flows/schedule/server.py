@@ -25,7 +25,7 @@ from flows.schedule.guarded_server import HOST, own_origins
 from flows.schedule.served import NAMED_BY, ServeRequest, write_served
 from flows.schedule.times import SystemWallClock
 from flows.schedule.watcher import Watcher
-from flows.survey.prefect_engine import QUIET
+from flows.tasks.prefect_engine import QUIET
 from flows.terminal.processes import KeptProcess, place_pages
 from pipeline.errors import PipelineError, SettingsError
 

@@ -15,12 +15,12 @@ from rich.markup import escape
 from flows.publish.receipt_table import print_effects
 from flows.settings.survey_settings import Settings
 from flows.simulate.effect_comparison import Comparison, compare_with_everything
-from flows.survey.capture_plan import lay_out_sweeps
-from flows.survey.run import CaptureRun, make_source
-from flows.survey.scene import SimulatedField, farm_refusal, open_scene
-from flows.survey.stage import Stage, Wanted
-from flows.survey.stages.capture import capture_coarse, sweeps_wanted
-from flows.survey.stages.effects import choose_effects, load_manifest
+from flows.tasks.capture_plan import lay_out_sweeps
+from flows.tasks.run import CaptureRun, make_source
+from flows.tasks.scene import SimulatedField, farm_refusal, open_scene
+from flows.tasks.stage import Stage, Wanted
+from flows.tasks.stages.capture import capture_coarse, sweeps_wanted
+from flows.tasks.stages.effects import choose_effects, load_manifest
 from flows.terminal.figures import format_bytes, format_seconds
 from flows.terminal.processes import writing
 from flows.terminal.progress import StageProgress
@@ -85,7 +85,7 @@ def run_simulate(
         console.print(f"[dim]note: {escape(note)}[/]")
     with run.archive.in_use(), StageProgress(console, TITLES) as progress:
         make = _Maker(run, progress)
-        wanted = choose_effects.needed(make.watching("effects"))
+        wanted = choose_effects.wants(make.watching("effects"))
         effects = make("effects", choose_effects, _drawn_first(run.scene, wanted, make.spent))
         raw = make("capture", capture_coarse, sweeps_wanted(make.watching("capture"), sweeps, [effects]))
         record = _record(run, sweeps, effects, raw, make.spent)

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.survey.run import CaptureRun
-from flows.survey.stages.effects import chosen_effects, load_manifest, source_with
+from flows.tasks.run import CaptureRun
+from flows.tasks.stages.effects import chosen_effects, load_manifest, source_with
 from pipeline.errors import BoundError
 from pipeline.geometry.camera import bin_samples
 from pipeline.geometry.scan import Sweep

@@ -19,7 +19,7 @@ from rich.markup import escape
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
 from flows.simulate.command import open_simulation
-from flows.survey.stages.effects import choose_effects, source_with
+from flows.tasks.stages.effects import choose_effects, source_with
 from flows.terminal.progress import print_json
 from pipeline.errors import SettingsError
 from pipeline.geometry.mirror import STRAIGHT
@@ -177,5 +177,5 @@ def emulated_source(settings: Settings) -> tuple[SimulatedSource, tuple[str, ...
     with tempfile.TemporaryDirectory(prefix="spectralzoom-") as folder:
         apart = replace(settings, source="sim", out=str(Path(folder) / "effects"))
         run, _, notes = open_simulation(apart)
-        effects, _ = choose_effects.produce(run.archive, choose_effects.needed(run))
+        effects, _ = choose_effects.produce(run.archive, choose_effects.wants(run))
         return source_with(run.simulated, effects), notes

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.survey.stages.accuracy import columns_of_all_seats
-from flows.survey.survey_model import shipped_weights
+from flows.tasks.stages.accuracy import columns_of_all_seats
+from flows.tasks.survey_model import shipped_weights
 from flows.tradeoff.entries import Level, Setting, Tradeoff, register_all
 from models.evaluation.metrics import confusion, mean_iou
 from models.network.machine import keep_freed_memory

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.settings.load import CHEAP_POLICY
-from flows.survey.reading_costs import ReadingCosts
-from flows.survey.seat_budget import SeatBudget
-from flows.survey.stages.accuracy import columns_of_all_seats
-from flows.survey.survey_model import PLAIN_STEPS, shipped_weights
+from flows.tasks.reading_costs import ReadingCosts
+from flows.tasks.seat_budget import SeatBudget
+from flows.tasks.stages.accuracy import columns_of_all_seats
+from flows.tasks.survey_model import PLAIN_STEPS, shipped_weights
 from flows.tradeoff.entries import Setting, Tradeoff, register_all
 from models.evaluation.metrics import confusion, mean_iou
 from models.network.sizes import multiply_adds

@@ -19,10 +19,10 @@ from measure import Row
 
 from flows.schedule.server import LocalServer
 from flows.settings.survey_settings import Settings
-from flows.survey import prefect_engine as engine
-from flows.survey.prefect_engine import QUIET
-from flows.survey.run import open_run
-from flows.survey.survey import STAGES, StageRunner
+from flows.tasks import prefect_engine as engine
+from flows.tasks.prefect_engine import QUIET
+from flows.tasks.run import open_run
+from flows.tasks.survey import STAGES, StageRunner
 
 ROUNDS = 11
 GOAL_S = 0.3

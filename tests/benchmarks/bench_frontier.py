@@ -25,7 +25,7 @@ from rich.console import Console
 
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
-from flows.survey.survey_model import PLAIN_STEPS, shipped_weights
+from flows.tasks.survey_model import PLAIN_STEPS, shipped_weights
 from flows.tradeoff.plans import plain_look
 from flows.training.look import chosen_effects
 from models.evaluation.expected_scores import MapScores, expected_counts

@@ -116,9 +116,9 @@ def _watched(moments: Moments) -> Iterator[None]:
 
 
 def _survey(stack: ExitStack, settings: Settings, moments: Moments) -> None:
-    from flows.survey.run import make_source, open_run
-    from flows.survey.stages.effects import chosen_effects
-    from flows.survey.survey import StageRunner, survey
+    from flows.tasks.run import make_source, open_run
+    from flows.tasks.stages.effects import chosen_effects
+    from flows.tasks.survey import StageRunner, survey
     from pipeline.rig.emulator.emulated_rig import EmulatedRig
     from tests.pipeline.rig.in_process import InProcessRig, ManualClock
 
@@ -142,7 +142,7 @@ def _survey(stack: ExitStack, settings: Settings, moments: Moments) -> None:
     def open_devices(told: Settings, *_: object) -> RigDevices:
         return line.devices(told.rig.mirror(told.cost.vector_pairs))
 
-    stack.enter_context(patch("flows.survey.rig_field.open_devices", open_devices))
+    stack.enter_context(patch("flows.tasks.rig_field.open_devices", open_devices))
     try:
         survey(step)
     except _AskedError:

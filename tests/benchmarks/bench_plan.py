@@ -84,8 +84,8 @@ def _survey(archive: Path, side: int) -> dict[str, Cost]:
     from rich.console import Console
 
     from flows.publish.survey_command import run_survey
-    from flows.survey.run import open_run
-    from flows.survey.survey import StageRunner, survey
+    from flows.tasks.run import open_run
+    from flows.tasks.survey import StageRunner, survey
 
     settings = _settings(archive, side)
     run_survey(settings, Console(quiet=True))

@@ -21,9 +21,9 @@ from rich.console import Console
 
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
-from flows.survey.field_work import FieldWork, WeightsFile
-from flows.survey.reading_costs import SHARD
-from flows.survey.run import SurveyRun, open_run
+from flows.tasks.field_work import FieldWork, WeightsFile
+from flows.tasks.reading_costs import SHARD
+from flows.tasks.run import SurveyRun, open_run
 from models.evaluation.metrics import confusion, mean_iou
 from models.network.machine import use_one_thread
 from models.reading.regions import HALO_CELLS, Region, most_bytes, plan_regions

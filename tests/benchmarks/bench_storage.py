@@ -118,8 +118,8 @@ def _warm(folder: Path) -> Row:
 
     from flows.publish.survey_command import run_survey
     from flows.settings.load import load_settings
-    from flows.survey.run import open_run
-    from flows.survey.survey import StageRunner, survey
+    from flows.tasks.run import open_run
+    from flows.tasks.survey import StageRunner, survey
 
     flags = {"scene": "farm", "out": str(folder / "archive"), "engine": "plain", "controls": False}
     settings = load_settings(None, flags)

@@ -20,7 +20,7 @@ from rich.console import Console
 
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
-from flows.survey.survey_model import shipped_weights
+from flows.tasks.survey_model import shipped_weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 

@@ -33,10 +33,10 @@ GOING_ON = "terminated; the same command goes on from here"
 SYNCS = (2, 60, 110)  # of a survey's files, before which it is stopped
 TAKEN = 9  # lines of a sweep
 CODES = {signal.SIGKILL: -signal.SIGKILL, signal.SIGTERM: TERMINATED}
-BEGUN = ("flows.survey.stages.accuracy:load_class_map", 1)
+BEGUN = ("flows.tasks.stages.accuracy:load_class_map", 1)
 PLACES = {  # function and call before which a survey is stopped that has its map, and with what
     "before the map is looked at": (*BEGUN, signal.SIGTERM),
-    "in the controls": ("flows.survey.stages.accuracy:run_controls", 1, signal.SIGKILL),
+    "in the controls": ("flows.tasks.stages.accuracy:run_controls", 1, signal.SIGKILL),
     "stored and not added": ("flows.publish.survey_command:add_accuracy", 1, signal.SIGKILL),
     "drawn anew": ("flows.publish.run_folder:draw_quicklook", 1, signal.SIGTERM),
     "after the run has changed": ("storage.archive.run_folders:remove_tree", 1, signal.SIGKILL),

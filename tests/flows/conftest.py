@@ -18,8 +18,8 @@ from PIL import Image
 
 from flows.cli.main import main
 from flows.schedule.served import NAMED_BY
-from flows.survey.prefect_engine import PASSWORD, QUIET
-from flows.survey.survey import STAGES
+from flows.tasks.prefect_engine import PASSWORD, QUIET
+from flows.tasks.survey import STAGES
 from storage.archive.archive import Archive
 from storage.remote.opening import verify_archive
 from tests.conftest import Survey

@@ -13,7 +13,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from flows.survey.field_work import seat_columns
+from flows.tasks.field_work import seat_columns
 from models.network.spectral import MOST_COLUMN
 from models.policies.policies import score_seats
 from models.reading.inference import DrawnMap, Glance, decide, glance, glance_of_columns, look_coarsely, segment

@@ -20,7 +20,7 @@ from tests.house.source_tree import ROOMS, ROOT
 
 LINE = 640  # numbers: the samples of a line in one band
 FIRST = 4  # of a sequence that are looked at
-MAP_DRAWN = ("flows/survey/stages/maps.py", "build")  # whose return is the end of the way
+MAP_DRAWN = ("flows/tasks/stages/maps.py", "build")  # whose return is the end of the way
 
 
 @cache

@@ -14,7 +14,7 @@ from PIL import Image
 
 from flows.evaluate.frames import EvaluateRequest, open_candidates, open_frames, sort_frames
 from flows.settings.load import load_settings
-from flows.survey.scene import open_scene
+from flows.tasks.scene import open_scene
 from flows.training.data import alike_notes, open_training_data
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera

@@ -11,7 +11,7 @@ import pytest
 
 from flows.publish.receipt_words import sentences
 from flows.settings.load import load_settings
-from flows.survey.zones import place_of_field
+from flows.tasks.zones import place_of_field
 from pipeline.geometry.camera import LineCamera
 from pipeline.ground.field_places import scale_of_pixels, scale_of_view
 from pipeline.ground.view import GroundView, RigPose

@@ -16,7 +16,7 @@ from PIL import Image
 
 from flows.publish.run_folder import Published
 from flows.settings.load import load_settings, parse_settings
-from flows.survey.run import SurveyRun, open_run
+from flows.tasks.run import SurveyRun, open_run
 from pipeline.errors import SettingsError, ZoneError
 from pipeline.geometry.grid import UNLABELLED
 from storage.archive.archive import Archive

@@ -16,9 +16,9 @@ from measure import Row
 from numpy.typing import NDArray
 
 from flows.settings.load import CHEAP_POLICY
-from flows.survey.reading_costs import ReadingCosts
-from flows.survey.seat_budget import SeatBudget
-from flows.survey.survey_model import shipped_weights
+from flows.tasks.reading_costs import ReadingCosts
+from flows.tasks.seat_budget import SeatBudget
+from flows.tasks.survey_model import shipped_weights
 from flows.tradeoff.plans import plain_look
 from flows.training.look import chosen_effects
 from models.evaluation.metrics import confusion, mean_iou

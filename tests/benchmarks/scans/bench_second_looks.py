@@ -21,8 +21,8 @@ from measure import Row
 from numpy.typing import NDArray
 from sparse_lands import sparse_land
 
-from flows.survey.stages.accuracy import columns_of_all_seats
-from flows.survey.survey_model import shipped_weights
+from flows.tasks.stages.accuracy import columns_of_all_seats
+from flows.tasks.survey_model import shipped_weights
 from flows.training.look import chosen_effects
 from models.evaluation.metrics import confusion, mean_iou
 from models.reading.doubts import SeatDoubts

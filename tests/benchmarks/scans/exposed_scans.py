@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.survey.scene import judged_labels
+from flows.tasks.scene import judged_labels
 from models.evaluation.metrics import confusion
 from models.network.spectral import patches_of
 from models.reading.inference import glance_of_columns, segment

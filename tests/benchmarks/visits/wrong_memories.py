@@ -24,8 +24,8 @@ from visits.farm_visits import (
     shipped_memory,
 )
 
-from flows.survey.field_memory import REACH_PX, whole_pixels
-from flows.survey.stages.maps import MOST_TURN_PX
+from flows.tasks.field_memory import REACH_PX, whole_pixels
+from flows.tasks.stages.maps import MOST_TURN_PX
 from models.reading.remembered import Looked, Remembered, compare, first_belief, recall
 from pipeline.rectify.registration.alignment import field_shift
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene

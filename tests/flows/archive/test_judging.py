@@ -16,8 +16,8 @@ from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
 from flows.cli.model_verbs import _run_address
 from flows.publish import run_folder as publish
 from flows.publish.receipt import check_receipt, comparable, is_pending
-from flows.survey.stages import accuracy as evaluation
-from flows.survey.survey import STAGES
+from flows.tasks.stages import accuracy as evaluation
+from flows.tasks.survey import STAGES
 from models.weights.files import save_weights
 from pipeline.errors import SettingsError
 from storage.archive.archive import Archive

@@ -13,8 +13,8 @@ import pytest
 from flows.archive.plan_command import StageForecast, forecast, plan_content, show_plan
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
-from flows.survey.extent import scaled_cost
-from flows.survey.run import open_run
+from flows.tasks.extent import scaled_cost
+from flows.tasks.run import open_run
 from flows.terminal.progress import put_out
 from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
 from pipeline.simulator.simulated import SimulatedSource

@@ -13,8 +13,8 @@ import pytest
 from flows.cli.main import main
 from flows.publish import survey_command
 from flows.publish.run_folder import Published
-from flows.survey.prefect_engine import EngineUnavailable
-from flows.survey.stage import versions
+from flows.tasks.prefect_engine import EngineUnavailable
+from flows.tasks.stage import versions
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.archive.manifests import _seal, _text

@@ -10,8 +10,8 @@ import pytest
 from flows.evaluate.command import evaluate_weights
 from flows.evaluate.frames import EvaluateRequest
 from flows.settings.load import load_settings
-from flows.survey.run import SurveyRun
-from flows.survey.survey_model import shipped_weights
+from flows.tasks.run import SurveyRun
+from flows.tasks.survey_model import shipped_weights
 from flows.training.train import train_weights
 from flows.training.train_scenes import TrainRequest
 from pipeline.errors import SettingsError

@@ -16,9 +16,9 @@ from flows.simulate import effect_comparison
 from flows.simulate.command import open_simulation
 from flows.simulate.effect_comparison import Comparison, View, compare_with_everything, everything
 from flows.simulate.effect_picture import Words, draw_comparison
-from flows.survey.run import CaptureRun
-from flows.survey.stages import effects as effect_choice
-from flows.survey.stages.effects import choose_effects, chosen_effects, load_manifest, source_with
+from flows.tasks.run import CaptureRun
+from flows.tasks.stages import effects as effect_choice
+from flows.tasks.stages.effects import choose_effects, chosen_effects, load_manifest, source_with
 from pipeline.errors import BoundError, IncompleteStoreError
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.registry import BY_NAME, EFFECTS

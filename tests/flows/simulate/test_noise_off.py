@@ -13,7 +13,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.ndimage import convolve1d
 
-from flows.survey.stages import effects as effect_choice
+from flows.tasks.stages import effects as effect_choice
 from pipeline.geometry.camera import LineCamera, footprint_kernel
 
 SLIT_PX = LineCamera().slit_px

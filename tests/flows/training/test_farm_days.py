@@ -14,7 +14,7 @@ from flows.archive.compare_command import compare, find_run
 from flows.archive.stale_runs import asked_again, newest_runs
 from flows.settings.load import load_settings, parse_settings
 from flows.settings.survey_settings import Settings
-from flows.survey.scene import check_labels, farm_refusal, open_scene
+from flows.tasks.scene import check_labels, farm_refusal, open_scene
 from flows.training.data import farm_data, farm_looks, farm_test_data, read_farm_name
 from flows.training.look import observe_scene
 from models.network.sizes import SegmenterConfig
@@ -181,5 +181,5 @@ def test_training_sees_the_farm_through_the_rig() -> None:
 def test_a_machine_too_small_for_a_farm_is_told(size: str, measured: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """By what a survey of it took; one with a tenth more is enough."""
     for there, refused in ((measured, True), (1.1 * measured, False)):
-        monkeypatch.setattr("flows.survey.scene.machine_bytes", lambda there=there: int(there))
+        monkeypatch.setattr("flows.tasks.scene.machine_bytes", lambda there=there: int(there))
         assert (farm_refusal(_settings(size=size)) is not None) == refused

@@ -10,7 +10,7 @@ import torch
 from rich.console import Console
 
 import flows.training.remember as remember
-from flows.survey.survey_model import shipped_weights
+from flows.tasks.survey_model import shipped_weights
 from flows.training.remember import MemoryRequest, _moments, run_remember, train_memory
 from models.evaluation.metrics import confusion, mean_iou
 from models.network.memory_reader import MemoryReader

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from flows.cli.main import main
 from flows.settings.load import load_settings
-from flows.survey.run import open_run
+from flows.tasks.run import open_run
 from flows.training import train as flow
 from flows.training import train_scenes
 from flows.training.data import pack_mask, unpack_mask

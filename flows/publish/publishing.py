@@ -1,0 +1,174 @@
+"""The tasks that end a survey: publish the run of its map, add its accuracy, and show both on Prefect's pages.
+
+A run is published once its map is drawn, so that nothing that is lost later is the map; the accuracy is added to it. A
+survey that was stopped while its map was judged continues with the run that it had published.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+from flows.publish.receipt import Receipt, is_pending
+from flows.publish.receipt_table import COST_LABELS, cost_rows
+from flows.publish.receipt_words import headline, sentences
+from flows.publish.report import render_markdown
+from flows.publish.run_folder import Published, asked_settings, extend_with_accuracy, load_receipt, publish_run
+from flows.settings.survey_settings import OF_THE_MACHINE
+from flows.tasks.observer import artifact_key
+from flows.tasks.open_survey import JUDGED, STAGES, OpenSurvey, RunRef
+from flows.tasks.prefect_tasks import as_task, inside_flow
+from flows.tasks.stages.accuracy import evaluate
+from flows.terminal.figures import format_percent
+from pipeline.lazy import deferred
+from storage.archive.keys import StageRef, canonical_json
+from storage.archive.records import Run, read_run
+from storage.archive.whole_files import to_json
+
+if TYPE_CHECKING:
+    import prefect.artifacts as prefect_artifacts
+else:
+    prefect_artifacts = deferred("prefect.artifacts")
+
+NOT_ASKED = ("notes", "out", "engine", *OF_THE_MACHINE)  # of a receipt's settings: no byte depends on them
+MOST_BYTES = 100 * 1024  # of the picture, as it stands in the text
+WIDTHS_PX = (1200, 1000, 800, 600, 400, 200)
+
+
+def publish(plan: OpenSurvey) -> RunRef:
+    """Publish the run of a drawn map, with its accuracy where the archive has it already; in a flow as a task."""
+    return as_task(_publish, "publish")(plan, *plan.products.values())
+
+
+def add_accuracy(plan: OpenSurvey, run: RunRef, accuracy: StageRef) -> RunRef:
+    """Publish a run again with its accuracy, in the place of what was published before; in a flow as a task."""
+    return as_task(_add_accuracy, "add_accuracy")(plan, run, accuracy)
+
+
+def _publish(plan: OpenSurvey, *products: StageRef) -> RunRef:
+    stopped = _stopped_run(plan)
+    if stopped is not None:
+        plan.observer.note(f"published before: {stopped.folder}; its accuracy is added to it")
+        return stopped
+    judged = _has_labels(plan)
+    if judged and _accuracy_is_stored(plan):
+        plan(evaluate.name, *plan.products.there(*JUDGED))
+        judged = False
+    published = publish_run(plan)
+    if judged:
+        plan.observer.note(f"published: {published.folder}; its accuracy is judged now and added to it")
+    _show_artifacts(plan, published)
+    return _ref(published, pending=judged)
+
+
+def _add_accuracy(plan: OpenSurvey, run: RunRef, accuracy: StageRef) -> RunRef:
+    draft = plan.run.archive.extend_run(run.name)
+    assert draft is not None
+    with draft:
+        published = extend_with_accuracy(plan, draft, accuracy)
+    _show_artifacts(plan, published)
+    return _ref(published)
+
+
+def _ref(published: Published, *, pending: bool = False) -> RunRef:
+    return RunRef(f"runs/{published.folder.name}", published.folder, published.looked_twice, pending)
+
+
+def _has_labels(plan: OpenSurvey) -> bool:
+    return plan.run.scene.labelled and plan.run.settings.accuracy
+
+
+def _accuracy_is_stored(plan: OpenSurvey) -> bool:
+    try:
+        one = STAGES[evaluate.name]
+        return one.find(plan.run.archive, one.wants(plan.run, *plan.products.there(*JUDGED))) is not None
+    except Exception:  # what is wrong is said when the map is judged: until then it is published
+        return False
+
+
+def _stopped_run(plan: OpenSurvey) -> RunRef | None:
+    """Return the run that the same survey published before it was stopped; None where there is none."""
+    for folder in reversed(plan.run.archive.runs()):
+        if _is_stopped(plan, read_run(folder, {})):
+            return RunRef(f"runs/{folder.name}", folder, pending=True)
+    return None
+
+
+def _is_stopped(plan: OpenSurvey, run: Run) -> bool:
+    if run.problem is not None or not is_pending(run.receipt):
+        return False
+    stores = {name: one.key for name, one in plan.records.items()}
+    found = {str(row.get("name")): row.get("key") for row in run.stages}
+    asked = (
+        canonical_json(json.loads(to_json({name: value for name, value in given.items() if name not in NOT_ASKED})))
+        for given in (run.settings, asked_settings(plan.run))
+    )
+    return found == stores and len(set(asked)) == 1
+
+
+def _show_artifacts(plan: OpenSurvey, published: Published) -> None:
+    """Give text, picture and table of a run to the server of the flow that this is called in, and link its report."""
+    if not inside_flow():
+        return
+    key, where = artifact_key(plan.run.name), f"{plan.run.archive.name}/runs/{published.folder.name}"
+    report = (published.folder / "report.html").absolute().as_uri()
+    with suppress(Exception):  # a server that is gone: the archive has it all
+        text = survey_markdown(published, where)
+        prefect_artifacts.create_markdown_artifact(text, key=f"survey-{key}", description=where)
+        prefect_artifacts.create_table_artifact(
+            savings_rows(published.receipt), key=f"savings-{key}", description=where
+        )
+        prefect_artifacts.create_link_artifact(report, link_text="report.html", key=f"report-{key}", description=where)
+        plan.observer.progress("published", 1.0)
+
+
+def survey_markdown(published: Published, where: str) -> str:
+    """Return headline, quicklook (at most 100 KiB), receipt, and where the report lies."""
+    picture = small_jpeg((published.folder / "quicklook.png").read_bytes())
+    return render_markdown(
+        "survey.md",
+        survey=published.receipt["survey"],
+        headline=headline(published.receipt, published.looked_twice),
+        picture=base64.b64encode(picture).decode("ascii"),
+        rows=savings_rows(published.receipt),
+        findings=sentences(published.receipt),
+        where=where,
+    )
+
+
+def savings_rows(receipt: Receipt) -> list[dict[str, str]]:
+    """Return the receipt's savings, a row each, in words."""
+    return [
+        {
+            "cost": row["label"],
+            "this survey": row["done"],
+            "everything": row["full"],
+            "share": format_percent(row["ratio"]),
+        }
+        for row in cost_rows(receipt["savings"])[: len(COST_LABELS)]
+    ]
+
+
+def small_jpeg(png: bytes) -> bytes:
+    """Return a picture as a JPEG that takes at most 100 KiB in base64, as large as that lets it be."""
+    from PIL import Image
+
+    with Image.open(io.BytesIO(png)) as opened:
+        picture = opened.convert("RGB")
+    for width in WIDTHS_PX:
+        smaller = picture.copy()
+        smaller.thumbnail((width, 10 * width))
+        for quality in (85, 70):
+            file = io.BytesIO()
+            smaller.save(file, "JPEG", quality=quality, optimize=True)
+            if len(file.getvalue()) * 4 / 3 <= MOST_BYTES - 4:
+                return file.getvalue()
+    return file.getvalue()
+
+
+def published_run(run: RunRef) -> Published:
+    """Return a published run with its receipt (IncompleteStoreError: it is not as it was published)."""
+    return Published(load_receipt(run.folder), run.folder, run.captured_again)

@@ -1,0 +1,107 @@
+"""The survey as a Prefect flow: from raw sweeps to a class map and its receipt, in the order of the mission.
+
+    from flows.settings.parameters import SurveySettings
+    from flows.survey import survey
+
+    survey(SurveySettings(scene="farm", seconds=25))                              # once, now
+    survey.serve("north", cron="0 6 * * *", parameters={"settings": {...}})       # every day at six
+
+Every step is a task that takes and returns addresses of stores, never arrays. A store that is there is not made again,
+so that a survey that was stopped continues where it stopped. `survey.fn` runs the same steps without a server.
+
+No ``from __future__ import annotations`` here: Prefect reads the signatures.
+"""
+
+from prefect import flow
+
+from flows.publish.publishing import add_accuracy, publish
+from flows.settings.parameters import SurveySettings
+from flows.tasks.captures import capture_pass, plan_capture
+from flows.tasks.open_survey import JUDGED, OpenSurvey, RunRef
+from flows.tasks.stages.accuracy import evaluate
+from flows.tasks.stages.attention import attend, compare_turned
+from flows.tasks.stages.effects import choose_effects
+from flows.tasks.stages.maps import draw_map
+from flows.tasks.stages.on_ground import ground
+from flows.tasks.stages.placement import cut_patches, locate, rectify, register_coarse, register_fine
+
+
+@flow(name="survey", flow_run_name="survey-{settings.name_of_run}", validate_parameters=True, persist_result=False)
+def survey(settings: SurveySettings, capture_deployment: str | None = None) -> RunRef:
+    """Survey a field: capture, rectify, decide where detail changes the map, capture again, segment and publish.
+
+    Parameters
+    ----------
+    settings
+        What a settings file may say, each checked; all have defaults. A run of a deployment is a visit named by its
+        due time, and starts from what the field's newest run left.
+    capture_deployment
+        Deployment of the flow `capture` on the rig's machine, such as ``capture/rig``, which takes the sweeps into the
+        archive of the settings. Without one this machine takes them.
+
+    Returns
+    -------
+    The address of the published run; of an earlier one where its map is sure enough that nothing was captured.
+
+    Raises
+    ------
+    PipelineError : a message for the user: what is wrong, what is allowed, what to do.
+    """
+    plan = plan_capture(settings)
+    if isinstance(plan, RunRef):  # an earlier map is sure enough
+        return plan
+    plan.capture_deployment = capture_deployment
+    with plan.at_work():
+        draw_class_map(plan)
+        run = publish(plan)
+        return judge(plan, run)
+
+
+def draw_class_map(plan: OpenSurvey) -> None:
+    """Run the stages from the first pass to the class map; their stores are the products of the plan."""
+    effects = choose_effects(plan)
+    raw = capture_pass(plan, "coarse", effects)
+    seams = register_coarse(plan, raw) if plan.registers else None
+    lookup = locate(plan, raw, seams)
+    mosaic = rectify(plan, raw, lookup, seams)
+    request = attend(plan, mosaic)
+    if not plan.uniform:  # go back for what the plan requests
+        raw = capture_pass(plan, "fine", request, effects)
+        seams = register_fine(plan, raw, mosaic) if plan.registers else None
+    patches = cut_patches(plan, request, raw, seams)
+    class_map = draw_map(plan, mosaic, patches)
+    compare_turned(plan, mosaic, request)
+    if plan.on_the_ground:
+        ground(plan, class_map, mosaic)
+
+
+def judge(plan: OpenSurvey, run: RunRef) -> RunRef:
+    """Judge a published class map by the labels, where there are any; none of it counts as the survey's cost."""
+    if not run.pending:
+        return run
+    return add_accuracy(plan, run, evaluate(plan, *plan.products.there(*JUDGED)))
+
+
+@flow(name="capture", flow_run_name="capture-{settings.name_of_run}", validate_parameters=True, persist_result=False)
+def capture(settings: SurveySettings, sweeps: str = "coarse", inputs: list[str] | None = None) -> str:
+    """Take the sweeps of one pass into the archive of the settings: what the rig's machine is asked for.
+
+    Parameters
+    ----------
+    settings
+        Those of the survey.
+    sweeps
+        ``coarse``, the first pass or all of a uniform scan, or ``fine``.
+    inputs
+        Addresses of the stores that the pass follows from; those of a first pass are made here.
+
+    Returns
+    -------
+    The address of the stored sweeps.
+    """
+    plan = plan_capture(settings)
+    if isinstance(plan, RunRef):
+        return plan.uri
+    with plan.at_work():
+        known = [plan.run.archive.ref(*address.split("/")[1:]) for address in inputs or []]
+        return capture_pass(plan, sweeps, *(known or [choose_effects(plan)])).uri

@@ -1,0 +1,103 @@
+"""The tasks that begin a survey: open and plan it, and take the sweeps of a pass, here or on the rig's machine.
+
+No ``from __future__ import annotations`` here: Prefect reads signatures.
+"""
+
+from dataclasses import replace
+from datetime import datetime
+from typing import TYPE_CHECKING, Any
+
+from flows.settings.parameters import SurveySettings, at_due_time
+from flows.tasks.observer import current_observer
+from flows.tasks.open_survey import OpenSurvey, RunRef
+from flows.tasks.prefect_tasks import as_task, inside_flow
+from flows.tasks.run import open_run
+from flows.tasks.stages.capture import capture_coarse, capture_fine
+from pipeline.errors import ArchiveError, NothingToMend, RigError, SettingsError
+from pipeline.lazy import deferred
+from storage.archive.keys import StageRef
+from storage.remote.opening import open_archive
+
+if TYPE_CHECKING:
+    import prefect.context as prefect_context
+    import prefect.deployments as prefect_deployments
+else:
+    prefect_context = deferred("prefect.context")
+    prefect_deployments = deferred("prefect.deployments")
+
+OPENING = "plan"
+PASSES = {"coarse": capture_coarse, "fine": capture_fine}
+
+
+def plan_capture(settings: SurveySettings) -> OpenSurvey | RunRef:
+    """Open scene, weights and archive, and plan the first pass; in a flow as a task.
+
+    Returns an earlier run where its map is sure enough that the settings ask for no capture. Raises PipelineError: the
+    first thing that cannot be used, before anything is captured.
+    """
+    return as_task(_plan_capture, "plan_capture")(settings)
+
+
+def _plan_capture(settings: SurveySettings) -> OpenSurvey | RunRef:
+    observer = current_observer()
+    observer.watch(OPENING, "running", 0.0)
+    asked, due = settings.settings(), _due_time()
+    try:
+        run = open_run(asked if due is None else at_due_time(asked, due))
+    except NothingToMend as known:
+        observer.watch(OPENING, "ran", 1.0)
+        observer.log(str(known))
+        return RunRef(f"runs/{known.run}", open_archive(asked.out).root / "runs" / known.run, unchanged=str(known))
+    except BaseException:
+        observer.watch(OPENING, "failed", 1.0)
+        raise
+    run.archive.reclaim()  # what a killed run left half made
+    observer.watch(OPENING, "ran", 1.0)
+    for note in run.notes:
+        observer.note(note)
+    return OpenSurvey(replace(run, source=run.source.saying(observer.say)), observer)
+
+
+def _due_time() -> datetime | None:
+    """Return when a deployment's run was due; None of a run that no deployment asked for."""
+    context = prefect_context.FlowRunContext.get() if inside_flow() else None
+    flow_run = None if context is None else context.flow_run
+    if flow_run is None or flow_run.deployment_id is None or flow_run.expected_start_time is None:
+        return None
+    return datetime.fromisoformat(flow_run.expected_start_time.isoformat()).replace(microsecond=0)
+
+
+def capture_pass(plan: OpenSurvey, sweeps: str, *inputs: StageRef) -> StageRef:
+    """Return the stored sweeps of a pass, ``coarse`` or ``fine``, taken where the archive does not have them.
+
+    A deployment for captures takes them, on the rig's machine, where the plan names one, else the settings' source.
+    Raises SettingsError: there is no such pass; RigError, ArchiveError: the deployment did not take it.
+    """
+    if sweeps not in PASSES:
+        raise SettingsError(f"there is no pass {sweeps!r}: expected {' or '.join(PASSES)}")
+    if plan.capture_deployment is not None:
+        as_task(_captured_elsewhere, "capture_elsewhere")(plan, sweeps, *inputs)
+    return PASSES[sweeps](plan, *inputs)
+
+
+def _captured_elsewhere(plan: OpenSurvey, sweeps: str, *inputs: StageRef) -> str:
+    """Have the deployment for captures take a pass, and return the address of the stored sweeps."""
+    assert plan.capture_deployment is not None
+    parameters: dict[str, Any] = {
+        "settings": SurveySettings.of(plan.run.settings).model_dump(exclude_none=True),
+        "sweeps": sweeps,
+        "inputs": [ref.uri for ref in inputs],
+    }
+    run: Any = prefect_deployments.run_deployment(plan.capture_deployment, parameters=parameters)
+    if run.state is None or not run.state.is_completed():
+        why = "it has not ended" if run.state is None else run.state.message or run.state.name
+        raise RigError(f"the deployment {plan.capture_deployment} did not take the {sweeps} pass: {why}")
+    stage = PASSES[sweeps]
+    wanted = stage.wants(plan.run, *inputs)
+    ref = plan.run.archive.ref(stage.product.name, stage.key(wanted))
+    if stage.find(plan.run.archive, wanted) is None:
+        raise ArchiveError(
+            f"the deployment {plan.capture_deployment} took the {sweeps} pass, and {ref.uri} is not in "
+            f"{plan.run.archive.name}: both machines need the same archive and settings"
+        )
+    return ref.uri

@@ -1,0 +1,281 @@
+"""A Prefect server in this process: for this machine alone, gone with the process, its files in a folder.
+
+A server in a thread needs no second set of imports, and no guard that ends it when its parent was killed. It answers
+its own address only, wants a password, and refuses what pages of other origins ask for.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import secrets
+import socket
+import sqlite3
+import stat
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Awaitable, Callable, Iterator, MutableMapping, Sequence
+from contextlib import contextmanager, suppress
+from contextvars import copy_context
+from http.client import HTTPException
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from flows.terminal.processes import place_pages
+from pipeline.errors import SettingsError
+from pipeline.lazy import deferred
+
+if TYPE_CHECKING:
+    import prefect
+    import prefect.client.orchestration as prefect_client
+    import prefect.client.schemas.filters as prefect_filters
+    import prefect.server.api.server as prefect_server
+    import prefect.settings as prefect_settings
+    import starlette.middleware.trustedhost as trustedhost
+    import uvicorn
+else:
+    prefect = deferred("prefect")
+    prefect_client = deferred("prefect.client.orchestration")
+    prefect_filters = deferred("prefect.client.schemas.filters")
+    prefect_server = deferred("prefect.server.api.server")
+    prefect_settings = deferred("prefect.settings")
+    trustedhost = deferred("starlette.middleware.trustedhost")
+    uvicorn = deferred("uvicorn")
+
+HOST = "127.0.0.1"
+NAMES = (HOST, "localhost")  # by which a browser of this machine may ask for it
+STARTED_WITHIN_S, ENDED_WITHIN_S = 120.0, 10.0
+PATIENCE_S = 10.0  # with a server that is named
+RECORDED_WITHIN_S = 5.0  # the states of a flow's last tasks
+OF_SCHEDULES = (  # services that a single survey does not use
+    *("CANCELLATION_CLEANUP", "CLEANUP_RECONCILER", "DB_VACUUM", "EVENT_LOGGER", "FOREMAN", "LATE_RUNS"),
+    *("PAUSE_EXPIRATIONS", "REPOSSESSOR", "SCHEDULER", "TRIGGERS"),
+)
+QUIET = {  # nothing outside this machine is asked; the terminal is left to the survey, run logs go to the server
+    "DO_NOT_TRACK": "1",
+    "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
+    "PREFECT_SERVER_UI_V2_ENABLED": "false",
+    "PREFECT_SERVER_UI_SHOW_PROMOTIONAL_CONTENT": "false",
+    "PREFECT_LOGGING_HANDLERS_CONSOLE_LEVEL": "CRITICAL",
+    "PREFECT_LOGGING_INTERNAL_LEVEL": "CRITICAL",
+    "PREFECT_SERVER_LOGGING_LEVEL": "CRITICAL",
+    "PREFECT_LOGGING_TO_API_WHEN_MISSING_FLOW": "ignore",
+    "PREFECT_CLI_PROMPT": "false",
+}
+Scope = MutableMapping[str, Any]
+App = Callable[[Scope, Callable[[], Awaitable[Any]], Callable[[Any], Awaitable[None]]], Awaitable[None]]
+
+
+class ServerUnavailable(RuntimeError):  # noqa: N818 - a state of affairs: a survey runs without it
+    """No Prefect server could be started or reached."""
+
+
+@contextmanager
+def quiet_environment(home: Path) -> Iterator[None]:
+    """Name Prefect's folder and quiet settings in the environment; what the user set there stays."""
+    added = {name: value for name, value in {**QUIET, "PREFECT_HOME": str(home)}.items() if name not in os.environ}
+    os.environ.update(added)
+    try:
+        yield
+    finally:
+        for name in added:
+            os.environ.pop(name, None)
+
+
+@contextmanager
+def local_server(home: Path, port: int = 0, *, schedules: bool = False) -> Iterator[str]:
+    """Run a server while the block runs, give the address of its API, and have Prefect use it.
+
+    Parameters
+    ----------
+    home
+        Folder for its database and its password.
+    port
+        Of this machine; any that is free where it is 0.
+    schedules
+        Whether it plans and watches the runs of deployments, and shows its pages.
+
+    Raises
+    ------
+    ServerUnavailable : it does not start; SettingsError : the port is taken.
+    """
+    with _listening(port) as listening, _using(home, listening.getsockname()[1], schedules=schedules) as api:
+        started = _start(listening, schedules=schedules)
+        try:
+            yield api
+        finally:
+            started.should_exit = True
+
+
+@contextmanager
+def _using(home: Path, port: int, *, schedules: bool) -> Iterator[str]:
+    """Have clients and server of this process, and processes that it starts, use a server of this port."""
+    password = password_in(home / "password") if schedules else f"spectralzoom:{secrets.token_urlsafe(24)}"
+    create_database(home / "prefect.db")
+    services = {} if schedules else {f"PREFECT_SERVER_SERVICES_{name}_ENABLED": "false" for name in OF_SCHEDULES}
+    api = f"http://{HOST}:{port}/api"
+    wanted = {
+        **services,
+        **(place_pages() if schedules else {"PREFECT_SERVER_UI_ENABLED": "false"}),
+        "PREFECT_API_URL": api,
+        "PREFECT_API_DATABASE_CONNECTION_URL": f"sqlite+aiosqlite:///{home / 'prefect.db'}",
+        "PREFECT_API_BLOCKS_REGISTER_ON_START": "true" if schedules else "false",
+        "PREFECT_SERVER_API_AUTH_STRING": password,
+        "PREFECT_API_AUTH_STRING": password,
+        "PREFECT_SERVER_CORS_ALLOWED_ORIGINS": ",".join(own_origins(port)),
+    }
+    before = {name: os.environ.get(name) for name in wanted}
+    os.environ.update(wanted)
+    try:
+        known = {getattr(prefect_settings, name): value for name, value in wanted.items()}
+        with prefect_settings.temporary_settings(
+            updates={**known, prefect_settings.PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}
+        ):
+            yield api
+    except ImportError as error:
+        raise ServerUnavailable(f"Prefect cannot be imported ({error})") from error
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name, None)
+            if value is not None:
+                os.environ[name] = value
+
+
+def _start(listening: socket.socket, *, schedules: bool) -> uvicorn.Server:
+    """Start the server in a thread and wait until it answers (ServerUnavailable)."""
+    collects = gc.isenabled()
+    gc.disable()  # the 2000 modules of the server make no garbage, which is looked for a third of their time
+    try:
+        made: Any = prefect_server.create_app(final=schedules, ephemeral=not schedules)
+    finally:
+        if collects:
+            gc.enable()
+    app: Any = guarded(made, listening.getsockname()[1])
+    server = uvicorn.Server(uvicorn.Config(app, log_level="critical", lifespan="on"))
+    thread = threading.Thread(
+        target=copy_context().run, args=(server.run, [listening]), name="prefect-server", daemon=True
+    )
+    thread.start()
+    end = time.monotonic() + STARTED_WITHIN_S
+    while not server.started:
+        if not thread.is_alive() or time.monotonic() > end:
+            raise ServerUnavailable("the Prefect server did not start")
+        time.sleep(0.02)
+    return server
+
+
+def create_database(path: Path) -> None:
+    """Create the server's database with the tables of the pinned version; one that is there is left as it is.
+
+    Prefect would make it by 90 migrations, in 9 s. A newer version migrates it on from here.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    schema = resources.files("flows.tasks").joinpath("prefect_schema.sql").read_text(encoding="utf-8")
+    if path.exists() or f"Prefect {prefect.__version__}\n" not in schema:
+        return
+    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    with sqlite3.connect(part) as made:
+        made.execute("PRAGMA journal_mode = WAL")
+        made.executescript(schema)
+    made.close()
+    part.replace(path)
+
+
+@contextmanager
+def _listening(port: int) -> Iterator[socket.socket]:
+    with socket.socket() as found:
+        found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            found.bind((HOST, port))
+        except (OSError, OverflowError) as error:
+            raise SettingsError(
+                f"--port {port} cannot be used ({error}): give another, or name the server there in PREFECT_API_URL"
+            ) from error
+        yield found
+
+
+def check_answers(url: str) -> None:
+    """Refuse a server that is named and does not answer (ServerUnavailable)."""
+    try:
+        with suppress(urllib.error.HTTPError):  # it is there, and wants to know who asks
+            urllib.request.urlopen(f"{url.rstrip('/')}/health", timeout=PATIENCE_S).close()
+    except (OSError, ValueError, HTTPException) as error:
+        raise ServerUnavailable(f"no Prefect server answers at {url}, which PREFECT_API_URL names ({error})") from error
+
+
+def wait_until_recorded(flow_run: Any) -> None:
+    """Wait until the server has heard how the tasks of a flow run ended, for 5 s at most.
+
+    Tasks report to it in batches, which would be lost with a process that ends at once.
+    """
+    of_run = prefect_filters.FlowRunFilter(id=prefect_filters.FlowRunFilterId(any_=[flow_run]))
+    end = time.monotonic() + RECORDED_WITHIN_S
+    with suppress(Exception), prefect_client.get_client(sync_client=True) as client:  # a server that is gone
+        while time.monotonic() < end:
+            states = [run.state for run in client.read_task_runs(flow_run_filter=of_run)]
+            if all(state is not None and state.is_final() for state in states):
+                return
+            time.sleep(0.1)
+
+
+def own_origins(port: int) -> list[str]:
+    """Return the origins of the server's own pages, as browsers send them."""
+    return [f"http://{name}:{port}" for name in NAMES]
+
+
+class OwnPagesOnly:
+    """Refuse what a page from elsewhere asks for (403), before the application sees it.
+
+    A browser names the page that asks in the header ``Origin``, for every request that may change something and for web
+    sockets; a request without one comes from no page, and has to know the password.
+    """
+
+    def __init__(self, app: App, origins: Sequence[str]) -> None:
+        self._app, self._origins = app, [origin.encode("ascii") for origin in origins]
+
+    async def __call__(
+        self, scope: Scope, receive: Callable[[], Awaitable[Any]], send: Callable[[Any], Awaitable[None]]
+    ) -> None:
+        """Answer, or hand on to the application."""
+        origins = [value for name, value in scope.get("headers", ()) if name == b"origin"]
+        if all(origin in self._origins for origin in origins):
+            await self._app(scope, receive, send)
+        elif scope["type"] == "websocket":
+            await send({"type": "websocket.close", "code": 1008})
+        else:
+            text = b"refused: asked for by a page of another address"
+            await send({"type": "http.response.start", "status": 403, "headers": [(b"content-type", b"text/plain")]})
+            await send({"type": "http.response.body", "body": text})
+
+
+def guarded(app: App, port: int) -> App:
+    """Return an application that answers its own address (400 else: foreign DNS may point here) and pages alone."""
+    pages: Any = OwnPagesOnly(app, own_origins(port))
+    return trustedhost.TrustedHostMiddleware(pages, allowed_hosts=list(NAMES), www_redirect=False)
+
+
+def password_in(path: Path) -> str:
+    """Return the password that a file keeps for this user alone; make one where there is none (SettingsError)."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        number = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
+        with os.fdopen(number, "w", encoding="ascii") as file:
+            file.write(f"spectralzoom:{secrets.token_urlsafe(24)}\n")
+    except FileExistsError:
+        pass
+    except OSError as error:
+        raise SettingsError(f"cannot keep the password of Prefect's pages in {path}: {error.strerror}") from error
+    why = "is empty"
+    try:
+        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), encoding="utf-8") as file:
+            kept = os.fstat(file.fileno())
+            if not stat.S_ISREG(kept.st_mode) or kept.st_mode & 0o077 or kept.st_uid not in (os.geteuid(), 0):
+                why = "is not a plain file that only you can read"
+            elif text := file.read(1000).strip():
+                return text
+    except (OSError, ValueError) as error:
+        why = f"cannot be read ({error})"
+    raise SettingsError(f"{path}, the password of Prefect's pages, {why}: remove it, a new one is made")

@@ -1,0 +1,184 @@
+"""An opened survey: what its stages look at, and a record of each stage that ran."""
+
+from __future__ import annotations
+
+import resource
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from flows.tasks.observer import Observer, current_observer
+from flows.tasks.prefect_tasks import inside_flow
+from flows.tasks.rig_lock import rig_to_oneself
+from flows.tasks.run import SurveyRun, now
+from flows.tasks.stage import Stage
+from flows.tasks.stages.accuracy import evaluate
+from flows.tasks.stages.attention import attend, compare_turned
+from flows.tasks.stages.capture import capture_coarse, capture_fine
+from flows.tasks.stages.effects import choose_effects
+from flows.tasks.stages.maps import draw_map
+from flows.tasks.stages.on_ground import ground
+from flows.tasks.stages.placement import cut_patches, locate, rectify, register_coarse, register_fine
+from pipeline.lazy import deferred
+from storage.archive.keys import StageRef
+from storage.archive.records import StageRecord
+
+if TYPE_CHECKING:
+    import prefect.concurrency.sync as prefect_concurrency
+else:
+    prefect_concurrency = deferred("prefect.concurrency.sync")
+
+RIG_LIMIT = "rig"  # Prefect's global concurrency limit, where the server has one of that name
+
+OF_THE_SURVEY = (
+    *(choose_effects, capture_coarse, register_coarse, locate, rectify, attend, capture_fine, register_fine),
+    *(cut_patches, draw_map, compare_turned, ground, evaluate),
+)
+JUDGED = ("rectify", "cut_patches", "draw_map", "choose_effects", "register_coarse")  # whose stores `evaluate` takes
+STAGES: dict[str, Stage] = {one.name: one for one in OF_THE_SURVEY}
+TITLES = {"plan": "scene, weights and plan", **{name: one.title for name, one in STAGES.items()}}
+
+
+def versions() -> dict[str, int]:
+    """Return the present version of every product."""
+    return {one.product.name: one.product.version for one in STAGES.values()}
+
+
+def versions_made_again() -> dict[str, int]:
+    """Return the present version of every product whose files may be cleared away, since they are soon made again."""
+    return {one.product.name: one.product.version for one in STAGES.values() if one.product.made_again}
+
+
+@dataclass(frozen=True)
+class RunRef:
+    """Address of a published run."""
+
+    uri: str  # relative to the archive
+    folder: Path
+    captured_again: float | None = None  # fraction of the field's patches; None of a uniform scan
+    pending: bool = False  # its map is judged next
+    unchanged: str | None = None  # why nothing was captured: the run is an earlier one
+
+    @property
+    def name(self) -> str:
+        """Return the name of the run's folder."""
+        return self.folder.name
+
+
+class Products(dict[str, StageRef]):
+    """The stores of a survey, by the stages that left them."""
+
+    def of(self, stage: str) -> StageRef:
+        """Return the store of a stage that ran."""
+        return self[stage]
+
+    def there(self, *stages: str) -> list[StageRef]:
+        """Return the stores of those of these stages that ran."""
+        return [self[name] for name in stages if name in self]
+
+
+class OpenSurvey:
+    """Run a survey's stages in this process, and keep a record of each. No dataclass: Prefect passes it as it is."""
+
+    def __init__(self, run: SurveyRun, observer: Observer | None = None) -> None:
+        self.run, self.started = run, now()
+        self.observer = current_observer() if observer is None else observer
+        self.capture_deployment: str | None = None  # which takes the sweeps, on the rig's machine
+        self.products = Products()
+        self.records: dict[str, StageRecord] = {}
+
+    @property
+    def name_of_run(self) -> str:
+        """Return the field's name, by which Prefect's runs are called."""
+        return self.run.name
+
+    @property
+    def uniform(self) -> bool:
+        """Return whether one scan of everything is all that is captured."""
+        return self.run.plan.plain
+
+    @property
+    def registers(self) -> bool:
+        """Return whether the mirror may look beside the plan, so that sweeps are laid onto each other."""
+        return self.run.settings.pointing_px > 0
+
+    @property
+    def on_the_ground(self) -> bool:
+        """Return whether the map is drawn on the ground too."""
+        return self.run.settings.pose is not None
+
+    @contextmanager
+    def at_work(self, *, captures: bool = True) -> Iterator[None]:
+        """Hold the archive against cleaning, the workers open, and the rig where this machine ``captures``.
+
+        Raises RigError: another survey of this machine holds the rig. In a flow the survey waits before that for its
+        turn, where Prefect's server has a global concurrency limit ``rig``.
+        """
+        with ExitStack() as held:
+            if captures and self.run.settings.source == "rig" and self.capture_deployment is None:
+                if inside_flow():
+                    held.enter_context(prefect_concurrency.concurrency(RIG_LIMIT, occupy=1, lease_duration=60))
+                held.enter_context(rig_to_oneself(self.run.settings, f"a survey of {self.run.name}"))
+            held.enter_context(self.run.archive.in_use())
+            held.enter_context(self.run.settings.crew.open())
+            yield
+
+    def __call__(self, stage: str, /, *inputs: StageRef) -> StageRef:
+        """Return the store of a stage, found or built."""
+
+        def watch(stage: str, state: str, done: float) -> None:
+            self.observer.watch(stage, state, done)
+            self.observer.progress(TITLES[stage], (list(STAGES).index(stage) + done) / len(STAGES))
+
+        watch(stage, "running", 0.0)
+        meter, reached = _Meter(), 0.0
+
+        def report(done: float) -> None:
+            nonlocal reached
+            reached = done
+            watch(stage, "running", done)
+
+        try:
+            wanted = STAGES[stage].wants(replace(self.run, report=report), *inputs)
+            ref, built = STAGES[stage].produce(self.run.archive, wanted)
+        except BaseException:
+            watch(stage, "failed", reached)
+            raise
+        state: Literal["ran", "cached"] = "ran" if built else "cached"
+        wall, cpu, peak = meter.read() if built else (None, None, None)
+        size, known = self.run.archive.stored_bytes, self.run.archive.manifest_hash(ref)
+        bytes_in = sum(size(given) for given in inputs)
+        self.records[stage] = StageRecord(stage, ref.key, state, wall, cpu, peak, bytes_in, size(ref), known)
+        self.products[stage] = ref
+        watch(stage, state, 1.0)
+        self.observer.log(self._summary(stage, ref))
+        return ref
+
+    def _summary(self, stage: str, ref: StageRef) -> str:
+        record, title = self.records[stage], TITLES[stage]
+        took = "found" if record.wall_s is None else f"{record.wall_s:.1f} s"
+        return f"{title}: {took}, {(record.bytes_out or 0) / 1e6:.1f} MB, {ref.uri}"
+
+
+class _Meter:
+    """Wall and CPU seconds and the highest memory since it was made."""
+
+    def __init__(self) -> None:
+        with suppress(OSError):  # Linux: start the peak anew
+            Path("/proc/self/clear_refs").write_text("5")
+        self._wall, self._cpu = time.perf_counter(), time.process_time()
+
+    def read(self) -> tuple[float, float, int]:
+        return time.perf_counter() - self._wall, time.process_time() - self._cpu, peak_bytes()
+
+
+def peak_bytes() -> int:
+    """Return the highest resident memory of this process [bytes]."""
+    with suppress(OSError, ValueError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

@@ -1,0 +1,289 @@
+"""One survey's context: scene, source, weights, grid, plan of captures and archive, checked before anything runs."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.settings.survey_settings import Settings
+from flows.settings.values import LOOK_PART
+from flows.tasks.beyond_training import beyond_training
+from flows.tasks.capture_plan import CapturePlan, plan_capture
+from flows.tasks.look_choice import LookChoice, choose_look
+from flows.tasks.memory import AUTO, NONE, Prior, find_prior
+from flows.tasks.reading_costs import ReadingCosts
+from flows.tasks.scan_choice import ScanChoice, choose_plain_scan
+from flows.tasks.scene import (
+    FieldSource,
+    check_labels,
+    check_mask,
+    check_scene_there,
+    farm_refusal,
+    field_source,
+    for_rig,
+    judged_labels,
+    open_scene,
+)
+from flows.tasks.seat_budget import SeatBudget
+from flows.tasks.survey_model import SurveyModel, vgg_file, weights_offered
+from flows.tasks.zones import SurveyZones, open_zones, place_of_field
+from models.evaluation.expected_scores import MapScores
+from models.network.machine import PROCESSOR, choose_device
+from models.policies.vgg_file import VggFile
+from models.weights.companion_files import FamiliarFile, ReaderFile
+from models.weights.files import Description, Weights
+from pipeline.errors import NoScanPaidFor, SettingsError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import Sweep
+from pipeline.ground.georeference import georeference_record
+from pipeline.lazy import Once
+from pipeline.rectify.placed import PixelGrid, place
+from pipeline.rectify.region import plan_tiles
+from pipeline.simulator.effects.pointing import PointingErrors
+from pipeline.simulator.scenes.scene import RasterScene
+from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
+from pipeline.source import References
+from storage.archive.archive import Archive
+from storage.archive.keys import array_digest
+from storage.arrays.layout import AngularGrid, image_spec
+from storage.arrays.tile_work import MosaicWork, tile_budget
+from storage.readers.raster_files import load_raster
+from storage.remote.opening import is_archive, open_archive
+
+
+def check_memory(settings: Settings, source: SimulatedSource, grid: SceneGrid, plan: CapturePlan) -> None:
+    """Refuse memory for not one tile of the mosaic, before anything is captured (SettingsError, with the least)."""
+    pixels, finer = PixelGrid.of_scene(grid, grid.factor), PixelGrid.of_scene(grid, 1) if plan.plain else None
+    placed = [place(_PlannedSweep(source, sweep), settings.camera) for sweep in plan.coarse]
+    rows, columns = image_spec(("y", "x"), pixels.shape, "<f4").shard or pixels.shape
+    tiles = plan_tiles(placed, settings.camera, pixels, (rows, columns))
+    work = MosaicWork(placed, settings.camera, pixels, finer=finer)
+    tile_budget(work, tiles, (rows, columns), memory=settings.memory, crew=replace(settings.crew, workers=1))
+
+
+class _PlannedSweep(SimulatedSweep):
+    """The path of a sweep and the size of its lines, which is all that memory depends on; no light is asked for."""
+
+    @property
+    def references(self) -> References:
+        """Frames of a detector without a fault, as the simulated one is."""
+        white = np.ones((self.source.camera.samples // self.sweep.binning, len(self.source.wavelength_nm)), np.float32)
+        return References(dark=np.zeros_like(white), white=white, panel=white[0])
+
+
+Report = Callable[[float], None]  # how far a stage is, 0..1
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureRun:
+    """What deciding on effects and capturing need to know."""
+
+    settings: Settings
+    archive: Archive
+    source: FieldSource  # who takes the lines
+    simulated: SimulatedSource  # without effects; beside a rig it stands for the plan: sizes, paths and memory
+    scene: RasterScene
+    planned: tuple[Sweep, ...]  # that stand for all the rig may take: the coarse pass and the scan of everything
+    report: Report = field(default=lambda done: None)
+    weighs_small: bool = True  # chooses effects even where that takes longer than it can save
+
+    @property
+    def camera(self) -> LineCamera:
+        """The camera of the settings."""
+        return self.settings.camera
+
+    @property
+    def name(self) -> str:
+        """What the survey is called: its field, or its scene."""
+        return self.settings.name or Path(self.scene.name).stem
+
+    def source_key(self) -> dict[str, Any]:
+        """What the captured light depends on, beside the sweeps and the effects."""
+        return {
+            "source": self.source.name,
+            "scene": self.scene.key,
+            "seed": self.settings.seed,
+            "camera": asdict(self.camera),
+            "pointing_px": self.settings.pointing_px,
+            **({} if self.settings.visit is None else {"visit": self.settings.visit}),
+            **self.source.key(self.name),
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurveyRun(CaptureRun):
+    """Everything a stage may look at. Made by `open_run`, which refuses what cannot work."""
+
+    described: Description  # what the weights say of themselves
+    load: Once[Weights]
+    weights_key: str
+    grid: SceneGrid
+    plan: CapturePlan
+    scans: ScanChoice
+    zones: SurveyZones  # what the survey keeps to, and plots
+    budget: SeatBudget | None = None  # of seats of a plain scan, where a part of them alone is kept and read
+    look: LookChoice | None = None  # the part of a remembered field that is looked at, where one was chosen
+    prior: Prior | None = None  # the run whose belief is gone on from
+    reader: ReaderFile | None = None  # the reader of memories beside the weights, where there is one
+    familiar: FamiliarFile | None = None  # what is familiar to the weights, where pixels may be called unknown
+    map_scores: MapScores | None = None  # how what maps expect of themselves came true, where that was measured
+    notes: tuple[str, ...] = ()
+    refused: str | None = None  # why this machine would refuse the survey; it is planned nevertheless
+
+    @property
+    def weights(self) -> Weights:
+        """The weights, read when they are first asked for."""
+        return self.load()
+
+    @property
+    def device(self) -> str:
+        """Where the network computes."""
+        return self.settings.device
+
+    @property
+    def model_key(self) -> dict[str, Any]:
+        """What is made with the weights depends on: these, and the device, where it is not the processor."""
+        return {"weights": self.weights_key, **({} if self.device == PROCESSOR else {"device": self.device})}
+
+    @property
+    def controls(self) -> bool:
+        """Whether other placements of seats are judged too; a plain scan that is read whole places none."""
+        return self.settings.controls and (not self.plan.plain or self.budget is not None)
+
+    @cached_property
+    def labels(self) -> NDArray[np.uint8] | None:
+        """What to judge by, (y, x) in the weights' classes: trained pixels taken out. Draws the scene."""
+        return judged_labels(self.scene, self.described)
+
+    @cached_property
+    def mask(self) -> NDArray[np.generic] | None:
+        """The mask of policy ``mask``, (y, x) or (y, x, channel)."""
+        return None if self.settings.mask is None else load_raster(self.settings.mask, dims=2).values
+
+    @cached_property
+    def vgg(self) -> VggFile | None:
+        """VGG19 for the policies ``vgg-static`` and ``vgg-trained``."""
+        return vgg_file(self.settings)
+
+    @property
+    def place_key(self) -> dict[str, Any]:
+        """What images on the scene's pixels depend on beside what was seen: where they lie, and what is no scene."""
+        missing = self.scene.missing
+        gaps = {} if missing is None else {"missing": array_digest(missing)}
+        return {**georeference_record(self.scene.geobox), **gaps}
+
+    def angular_grid(self, factor: int = 1) -> AngularGrid:
+        """Where pixels of ``factor`` fine px lie."""
+        return AngularGrid(self.camera.ifov_rad, self.scene.shape, factor, self.scene.geobox)
+
+
+def open_run(settings: Settings, *, planning: bool = False, archive: Archive | None = None) -> SurveyRun:
+    """Open everything that a survey needs; the archive last, so that bad input leaves no trace of itself.
+
+    With ``planning`` a scene that this machine cannot hold is no error: ``refused`` of the run says so. Without an
+    ``archive`` that of the settings is opened. Raises PipelineError: the first thing that cannot be used; see
+    `pipeline.errors` for the kinds; NothingToMend: what is remembered is sure enough.
+    """
+    settings = for_rig(settings)
+    check_scene_there(settings)
+    settings = replace(settings, device=choose_device(settings.device))
+    offered = weights_offered(settings)
+    for better in offered[:-1]:
+        with suppress(NoScanPaidFor):
+            return _run_by(better, settings, planning=planning, archive=archive)
+    return _run_by(offered[-1], settings, planning=planning, archive=archive)
+
+
+def _run_by(path: Path, settings: Settings, *, planning: bool, archive: Archive | None) -> SurveyRun:
+    """Open what a survey needs that is read with the weights of a file, as `open_run`."""
+    model = SurveyModel.open(settings, path, planning=planning)
+    described = model.described
+    refused = farm_refusal(settings)
+    if refused is not None and not planning:
+        raise SettingsError(refused)
+    scene, notes, label_notes = _scene_for(model, settings, planning=planning)
+    grid = SceneGrid(*scene.shape, described.config.patch, described.config.factor)
+    zones = open_zones(settings, place_of_field(settings, scene), grid)
+    outside = beyond_training(settings, scene, described, model.trained_on, path)
+    familiar = model.asked_familiar(settings)
+    name, found = settings.name or Path(scene.name).stem, None
+    if planning:  # what a look would be, were there one
+        settings = replace(settings, doubt=None)
+    if settings.look == LOOK_PART:  # what is remembered says where to look: nothing else is asked for so early
+        archive = open_archive(settings.out) if archive is None and is_archive(settings.out) else archive
+        found = (None, ()) if archive is None else find_prior(archive, settings, name, grid, described.class_names)
+    prior = None if found is None else found[0]
+    settings, look, look_notes = choose_look(settings, prior, described, path, model.reader, grid, zones.shown)
+    settings, scans = choose_plain_scan(settings, described, path, grid, len(scene.wavelength_nm), zones.shown)
+    plan = plan_capture(settings, grid, zones.shown)
+    channels = 3 if model.vgg is None else model.vgg.channels
+    costs = ReadingCosts(described.config, grid, len(scene.wavelength_nm), channels)
+    budget = SeatBudget.asked(settings, costs, None if zones.shares is None else zones.shares > 0)
+    simulated, planned = make_source(scene, settings), (*plan.coarse, *plan.full)
+    source = field_source(scene, settings, simulated, planned)
+    check_memory(settings, simulated, grid, plan)
+    archive = open_archive(settings.out) if archive is None else archive
+    prior, prior_notes = found or find_prior(archive, settings, name, grid, described.class_names)
+    if settings.prior != AUTO:  # what is meant when it is asked for again
+        settings = replace(settings, prior=NONE if prior is None else prior.run)
+    said = (*notes, *zones.notes, *prior_notes, *look_notes, *model.notes(planning=planning), *outside, *label_notes)
+    return SurveyRun(
+        settings=settings,
+        archive=archive,
+        source=source,
+        simulated=simulated,
+        scene=scene,
+        planned=planned,
+        described=described,
+        load=model.load,
+        weights_key=model.key,
+        grid=grid,
+        plan=plan,
+        scans=scans,
+        zones=zones,
+        budget=budget,
+        look=look,
+        prior=prior,
+        reader=model.reader,
+        familiar=familiar,
+        map_scores=None if model.familiar is None else model.familiar.map_scores,
+        notes=said,
+        refused=refused,
+    )
+
+
+def _scene_for(
+    model: SurveyModel, settings: Settings, *, planning: bool
+) -> tuple[RasterScene, tuple[str, ...], tuple[str, ...]]:
+    """Open a scene that the weights can read, drawn unless for ``planning``; what to say of it and of its labels."""
+    scene, notes = open_scene(settings, model.described.class_names)
+    if not planning:  # what the rig would find there: no stage's work
+        scene.raster.drawn()
+        scene.light()
+    model.check_bands(scene.wavelength_nm)
+    label_notes = check_labels(scene, model.described)
+    if settings.mask is not None:
+        check_mask(settings.mask, scene.shape)
+    return scene, notes, label_notes
+
+
+def make_source(scene: RasterScene, settings: Settings) -> SimulatedSource:
+    """The simulated rig before a scene, without effects; beside a rig it stands for the plan: sizes, paths, memory."""
+    pointing = None
+    if settings.source == "sim" and settings.pointing_px:
+        pointing = PointingErrors(offset_px=settings.pointing_px, jitter_px=0.0, seed=settings.seed)
+    return SimulatedSource(scene, settings.simulated_rig, settings.seed, {}, name=settings.source, pointing=pointing)
+
+
+def now() -> str:
+    """The time in ISO 8601, UTC."""
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())

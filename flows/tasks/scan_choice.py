@@ -1,0 +1,113 @@
+"""The plain scan of a survey: which one the weights' record promises most of, and what its neighbours would give."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.settings.survey_settings import Settings
+from flows.settings.values import LOOK_WHOLE, parse_goals
+from flows.tasks.capture_plan import lay_out_sweeps
+from models.weights.files import Description
+from pipeline.errors import BudgetError, SettingsError, WeightsError
+from pipeline.geometry.grid import SceneGrid
+from pipeline.planning.plain_scans import (
+    MIOU,
+    PlainScan,
+    ScanLimits,
+    ScanRecord,
+    choose_scan,
+    frontier,
+    plain_scans,
+    priced_scan,
+    reference_scan,
+)
+
+
+@dataclass(frozen=True)
+class ScanChoice:
+    """The scan that a survey takes, if it takes a plain one, and those that the weights' record tells of."""
+
+    offered: tuple[PlainScan, ...] = ()  # none without a record
+    chosen: PlainScan | None = None  # None of a survey in two passes, and of what the record does not tell of
+
+    def best_within(self, seconds: float) -> PlainScan | None:
+        """The scan that is likely to score most in so many seconds; None where there is none."""
+        try:
+            return choose_scan(self.offered, ScanLimits(seconds)) if self.offered else None
+        except BudgetError:
+            return None
+
+    @property
+    def reference(self) -> PlainScan | None:
+        """The cheapest scan that is nearly as good as the best; None without a record."""
+        return reference_scan(self.offered) if self.offered else None
+
+    @property
+    def frontier(self) -> list[PlainScan]:
+        """Scans than which none is as cheap and better, by ascending seconds."""
+        return frontier(self.offered)
+
+
+def choose_plain_scan(
+    settings: Settings,
+    weights: Description,
+    path: Path,
+    grid: SceneGrid,
+    bands: int,
+    shown: NDArray[np.bool_] | None = None,
+) -> tuple[Settings, ScanChoice]:
+    """Settings with step and exposure of the plain scan that is asked for, and the choice that there was.
+
+    Lines show the ``shown`` (seat,) seats, all of them where it is None. What was chosen once stands in the settings,
+    and is kept when an archive is read again with other weights. Raises WeightsError: the choice is left to weights
+    without a record of scans; BudgetError: no scan costs as little, or reaches the goals; SettingsError: a goal of a
+    class that the weights lack, or a camera that exposes shorter than the record knows; PoseError: the field is beyond
+    the mirror's range.
+    """
+    content = weights.record.get("scans")
+    if content is None:
+        if settings.scan_step is None and settings.plain:
+            raise WeightsError(
+                f"the weights {path.name} have no record of plain scans, by which one would be chosen: give the scan "
+                "with --scan-step and --scan-exposure-ms, or train weights with --darkest-ms 3, some scenes kept for"
+                " validation"
+            )
+        return settings, ScanChoice()
+    record = ScanRecord.read(content)
+    goals = {} if settings.goal is None else parse_goals(settings.goal)
+    for name in goals:
+        if name not in record.scores:
+            known = ", ".join(one for one in record.scores if one != MIOU)
+            raise SettingsError(f"--goal {name}={100 * goals[name]:g}: the weights tell apart {known}")
+    camera, cost, whole = settings.camera, settings.cost, replace(settings, look=LOOK_WHOLE)
+    sweeps = {step: lay_out_sweeps(replace(whole, scan_step=step), grid, shown)[1] for step in record.steps}
+    scans = plain_scans(record, sweeps, camera, cost, bands, seconds=settings.seconds)
+    chosen, exposure_ms = None, settings.scan_exposure_ms or camera.exposure_ms
+    if settings != whole:  # of a part of a field the record says nothing
+        chosen = None
+    elif settings.scan_step in sweeps and record.knows(exposure_ms):
+        chosen = priced_scan(record, sweeps[settings.scan_step], camera, cost, bands, exposure_ms)
+    elif settings.plain and settings.scan_step is None:
+        if not scans:
+            raise SettingsError(
+                f"camera.exposure_ms = {camera.exposure_ms:g}: the weights' record tells of exposures from "
+                f"{record.exposures_ms[0]:g} ms, so that it can choose no scan; take one by hand with --scan-step"
+            )
+        chosen = choose_scan(scans, ScanLimits(settings.seconds, settings.bytes_raw, goals))
+        settings = replace(settings, scan_step=chosen.step, scan_exposure_ms=chosen.exposure_ms)
+    return settings, ScanChoice(tuple(scans), chosen)
+
+
+def as_told(scan: PlainScan | None) -> dict[str, Any] | None:
+    """A scan as receipts tell it, with its expected mIoU alone."""
+    if scan is None:
+        return None
+    told: Mapping[str, Any] = asdict(scan)
+    figures = {"expected_miou": scan.expected[MIOU], "expected_spread": scan.spread}
+    return {name: value for name, value in told.items() if name not in ("expected", "spread")} | figures

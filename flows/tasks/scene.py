@@ -1,0 +1,269 @@
+"""What a survey looks at, with the labels and the mask on its pixels, and who looks: the simulator or a rig."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.settings.survey_settings import BUILT_IN_SCENES, RIG_FIELD, Settings
+from flows.training.data import scene_of_file, unpack_mask
+from models.weights.files import Description
+from pipeline.errors import SceneError, SettingsError
+from pipeline.geometry.grid import UNLABELLED
+from pipeline.geometry.scan import Sweep
+from pipeline.lazy import Once, deferred
+from pipeline.simulator.effects.effect import Effect
+from pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE, farm_scene, law_of_key
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
+from pipeline.simulator.simulated import SimulatedSource
+from pipeline.source import Source
+from storage.readers.cube_sources import machine_bytes
+from storage.readers.raster_files import load_raster, split_variable
+from storage.readers.scene_files import load_scene_file
+
+if TYPE_CHECKING:
+    import flows.tasks.rig_field as rig_field
+else:
+    rig_field = deferred("flows.tasks.rig_field")
+
+# Peak of a survey of the farm without controls: 1.58 GB for 1280 x 1024 px, 4.12 GB for 2560 x 2560 px
+FARM_BYTES, FARM_BYTES_PER_PX = 1_000_000_000, 490
+POSE_WINS = "the scene's own place on the earth is set aside: [pose] says where it lies; leave [pose] out to keep it"
+SAME_HOUR = 0.5  # by which true solar time is at most off mean solar time, and whoever rounds it [h]
+
+
+def check_scene_there(settings: Settings) -> None:
+    """Refuse a scene file that is not there, before anything else is asked for (SceneError)."""
+    path, _ = split_variable(settings.scene)
+    if settings.scene in (RIG_FIELD, *BUILT_IN_SCENES):
+        return
+    try:
+        there, what = path.exists(), "a link that leads nowhere," if path.is_symlink() else "no file"
+    except OSError as error:  # such as a name longer than any
+        raise SceneError(f"--scene {settings.scene} cannot be the name of a file: {error.strerror}") from error
+    if not there:
+        raise SceneError(f"there is {what} {path}; check the name of --scene (seen from {Path.cwd()})")
+
+
+def open_scene(settings: Settings, known: Sequence[str] | None = None) -> tuple[RasterScene, tuple[str, ...]]:
+    """Open the scene, say what was assumed; SceneError, WavelengthError: its file, SettingsError: not for a farm.
+
+    Labels that nobody named, but that lie beside the scene, count where their classes are among the ``known`` ones.
+    """
+    if settings.scene == RIG_FIELD:
+        return _field_before_rig(settings), ()
+    if settings.scene in BUILT_IN_SCENES:
+        for name, value in {"labels": settings.labels, "wavelengths": settings.wavelengths}.items():
+            if value is not None:
+                raise SettingsError(f"--{name} is for scene files; the scene '{settings.scene}' brings its own")
+        shape = settings.shape or FARM_SHAPE
+        farm = farm_scene(settings.seed, shape, camera=settings.camera, day=settings.day, hour=settings.hour)
+        return farm if settings.bands is None else _some_bands(farm, settings.bands), _notes_of_moment(settings)
+    file = load_scene_file(
+        settings.scene,
+        labels=settings.labels,
+        bands=settings.bands,
+        wavelengths=settings.wavelengths,
+        labels_needed=False,
+    )
+    strange = [name for name in file.class_names if known is not None and name not in known]
+    if file.labels_found and strange:
+        told = f"of the class {strange[0]!r}, which the weights do not know: name its classes in a scene.toml to judge"
+        file = file.without_labels(f"the labels beside the scene are left out: they are {told} by them")
+    scene, notes = scene_of_file(file, settings.camera), file.provenance
+    if scene.geobox is not None and settings.pose is not None:  # one place a run
+        scene, notes = replace(scene, geobox=None), (*notes, POSE_WINS)
+    if not scene.filled_px:
+        return scene, notes
+    void = 0 if scene.missing is None else int(np.count_nonzero(scene.missing))
+    unclassed = f"; {void} without most of their bands have no class in the map" if void else ""
+    gaps = f"{scene.filled_px} pixels without a value were given their band's median{unclassed}"
+    return scene, (*notes, gaps)
+
+
+def _field_before_rig(settings: Settings) -> RasterScene:
+    """Give a field of which only size and bands are known. Raises SettingsError: they are not given."""
+    for name, value in {"size": settings.size, "wavelengths": settings.wavelengths}.items():
+        if value is None:
+            raise SettingsError(
+                f"scene {RIG_FIELD!r} is what stands before the rig: give its {name}, which no file tells"
+            )
+    assert settings.size is not None
+    assert settings.wavelengths is not None
+    width, height = settings.size
+    bands = len(settings.wavelengths)
+    nothing = np.zeros((height, width, 1), np.float32)
+    return RasterScene(
+        name=settings.name or RIG_FIELD,
+        key=f"{RIG_FIELD}/{settings.name or ''}/{width}x{height}",
+        raster=SceneRaster.of(nothing),
+        light=Once.of(
+            SceneLight(np.zeros((1, bands), np.float32), np.full(bands, settings.camera.full_well_e, np.float32))
+        ),
+        panel=np.full(bands, settings.rig.panel, np.float32),
+        wavelength_nm=np.array(settings.wavelengths, np.float64),
+    )
+
+
+def _notes_of_moment(settings: Settings) -> tuple[str, ...]:
+    """Say where plants and shadows are not those of the moment at which the sky's light begins."""
+    started, moment = settings.sky.started, settings.moment
+    if started is None or moment is None:
+        return ()
+    sun = started.astimezone(UTC) + timedelta(hours=settings.sky.longitude_deg / 15)
+    day, hour = moment
+    at = sun.hour + sun.minute / 60
+    if day == sun.timetuple().tm_yday and abs(hour - at) < SAME_HOUR:
+        return ()
+    return (
+        f"plants and shadows are of day {day}, {hour:g} h, while the light drifts as from sky.started, day "
+        f"{sun.timetuple().tm_yday}, {at:.1f} h solar time",
+    )
+
+
+def farm_refusal(settings: Settings) -> str | None:
+    """Why this machine cannot hold the farm of the settings, before it tries; None where it can."""
+    if settings.scene not in BUILT_IN_SCENES or settings.shape is None:
+        return None
+    height, width = settings.shape
+    needed = FARM_BYTES + height * width * FARM_BYTES_PER_PX
+    there = machine_bytes()
+    if needed <= there:
+        return None
+    return (
+        f"--size {width}x{height}: a survey of such a farm takes about {needed / 1e9:.0f} GB of memory,"
+        f" this machine has {there / 1e9:.0f}; take a smaller one"
+    )
+
+
+def _some_bands(scene: RasterScene, bands: tuple[int, ...]) -> RasterScene:
+    """The same field seen by a camera with some of the bands."""
+    count, chosen = len(scene.wavelength_nm), list(bands)
+    if not all(0 <= band < count for band in bands):
+        raise SettingsError(f"--bands {','.join(map(str, bands))}: the built-in farm has bands 0 to {count - 1}")
+    return replace(
+        scene,
+        key=f"{scene.key}/only={','.join(map(str, bands))}",
+        light=Once(lambda: SceneLight(scene.electrons[:, chosen], scene.panel_electrons[chosen])),
+        panel=scene.panel[chosen],
+        wavelength_nm=scene.wavelength_nm[chosen],
+        fwhm_nm=None if scene.fwhm_nm is None else scene.fwhm_nm[chosen],
+    )
+
+
+def check_mask(mask: str, shape: tuple[int, int]) -> None:
+    """Refuse a mask file that is no image of this (y, x) size (SceneError)."""
+    values = load_raster(mask, dims=2).values
+    if values.shape[:2] != shape:
+        raise SceneError(f"--mask {mask} is {values.shape[:2]} px (y, x), the scene is {shape}; give one of its size")
+
+
+def check_labels(scene: RasterScene, weights: Description) -> tuple[str, ...]:
+    """Refuse labels of classes that the weights do not know (SceneError); say what judging by the others is worth."""
+    if not scene.labelled:
+        return ()
+    missing = [name for name in scene.class_names if name not in weights.class_names]
+    if missing:
+        known = ", ".join(weights.class_names)
+        told = "use weights for these"
+        if (found := re.fullmatch(r"class_(\d+)|colour_([0-9a-f]{6})", missing[0])) is not None:  # nobody named it
+            value = found[1] or list(bytes.fromhex(found[2]))
+            told += (
+                ", or say which class each value of the label file is, in a table [classes] of the scene.toml beside "
+                f"the scene's file: {weights.class_names[0]} = {value}"
+            )
+        raise SceneError(f"the labels have the class {missing[0]!r}, the weights know {known}; {told}")
+    law, learnt = law_of_key(scene.key), law_of_key(str(weights.record.get("data")))
+    if None not in (law, learnt) and law != learnt:
+        return (f"the weights were trained on {learnt}, the scene is of {law}: expect a poorer map",)
+    split = weights.record.get("split", {})
+    if scene.key in split.get("pixels", {}):
+        return ("accuracy is counted on the labelled pixels that the weights were not trained on",)
+    if scene.key in split.get("train", {}).values():
+        return ("the weights were trained on this scene: its accuracy says nothing of other fields",)
+    return ()
+
+
+def judged_labels(scene: RasterScene, weights: Description) -> NDArray[np.uint8] | None:
+    """Labels in the order of the weights' classes, without the pixels that the weights were trained on."""
+    if scene.labels is None:
+        return None
+    order = np.full(256, UNLABELLED, np.uint8)
+    order[: len(scene.class_names)] = [weights.class_names.index(name) for name in scene.class_names]
+    labels = order[scene.labels]
+    trained = weights.record.get("split", {}).get("pixels", {}).get(scene.key)
+    if trained is not None:
+        labels[unpack_mask(trained, scene.shape)] = UNLABELLED
+    return labels
+
+
+class FieldSource(Protocol):
+    """Who looks at the field for a survey: the one seam between what is simulated and what is there."""
+
+    @property
+    def name(self) -> str:
+        """What the receipt calls it."""
+
+    @property
+    def simulates(self) -> bool:
+        """Whether effects are chosen for it, which then stand in what is stored of its lines."""
+
+    def key(self, field: str) -> dict[str, Any]:
+        """What its light depends on, beside scene, camera, seed, sweeps and effects."""
+
+    def saying(self, say: Callable[[str], None]) -> FieldSource:
+        """The same, telling somebody what it is at while no line comes."""
+
+    def lit(self, chosen: Mapping[Effect, str], clock: Mapping[str, float]) -> FieldSource:
+        """The same with the effects that were decided, and when sweeps start by name [s]."""
+
+    def opened(self, spool: Path) -> AbstractContextManager[Source]:
+        """What lines come from, held on to; what it keeps on the way goes beside the lines in ``spool``."""
+
+
+@dataclass(frozen=True)
+class SimulatedField:
+    """The simulated rig before a scene."""
+
+    source: SimulatedSource
+    simulates = True
+
+    @property
+    def name(self) -> str:
+        return self.source.name
+
+    def key(self, field: str) -> dict[str, Any]:
+        return {}
+
+    def saying(self, say: Callable[[str], None]) -> SimulatedField:
+        return self  # lines come all the time
+
+    def lit(self, chosen: Mapping[Effect, str], clock: Mapping[str, float]) -> SimulatedField:
+        return SimulatedField(replace(self.source, chosen=chosen, clock=clock))
+
+    def opened(self, spool: Path) -> AbstractContextManager[Source]:
+        return nullcontext(self.source)
+
+
+def field_source(
+    scene: RasterScene, settings: Settings, simulated: SimulatedSource, planned: Sequence[Sweep]
+) -> FieldSource:
+    """Give who looks, as the settings say; raises what `flows.tasks.rig_field.rig_field` does."""
+    if settings.source != "rig":
+        return SimulatedField(simulated)
+    return rig_field.rig_field(scene, settings, planned)
+
+
+def for_rig(settings: Settings) -> Settings:
+    """Give the settings of a survey through a rig: this look at the field has a name, and no control is simulated."""
+    if settings.source != "rig":
+        return settings
+    return replace(settings, visit=settings.visit or f"{datetime.now(UTC):%Y-%m-%d}", controls=False)

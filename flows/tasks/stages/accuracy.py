@@ -1,0 +1,271 @@
+"""Judging a map by labels: its own accuracy, and what no detail, all detail and other placements would have given.
+
+A stage like the others, but outside the survey's savings: it looks at the whole scene in full and needs labels. Labels
+come with simulated fields alone, which memory holds as well: columns and maps are of the whole field, and the model
+reads it as one region however large it is.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.tasks.run import SurveyRun
+from flows.tasks.stage import Product, Wanted, stage
+from flows.tasks.stages.effects import source_with
+from flows.tasks.stages.maps import glance_at, patch_columns
+from flows.tasks.stages.placement import load_registration
+from models.evaluation.metrics import (
+    agreement,
+    average_accuracy,
+    confusion,
+    false_pixels,
+    gap_closed,
+    iou_per_class,
+    kappa,
+)
+from models.evaluation.placement import CONTROL_SHARE, Controls, run_controls
+from models.policies.policies import score_seats
+from models.reading.inference import CoarseLook, Glance, glance_of_columns, segment
+from models.weights.files import Weights
+from pipeline.geometry.grid import UNLABELLED, SceneGrid
+from pipeline.geometry.scan import Sweep
+from pipeline.planning.fine_pass import price_of_seats
+from pipeline.planning.prices import count_lines
+from pipeline.planning.selection import frame_seats
+from pipeline.rectify.kernels import Kernel
+from pipeline.rectify.region import read_seats
+from pipeline.simulator.effects.pointing import CommonOffset, PointingErrors
+from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
+from storage.archive.keys import StageRef, array_digest
+from storage.archive.manifests import read_table
+from storage.archive.whole_files import to_json
+from storage.arrays.class_maps import load_class_map
+from storage.arrays.mosaics import open_patches
+
+RECORD = "accuracy.json"
+ACCURACY = Product("evaluate", version=9, files=(RECORD,), by_weights=True)
+
+
+@stage("evaluate", "accuracy (not part of the survey)", ACCURACY, unit="operations of a glance", size="surveys")
+def evaluate(
+    run: SurveyRun, mosaic: StageRef, patches: StageRef, class_map: StageRef, effects: StageRef, *pointing: StageRef
+) -> Wanted:
+    """Judge the map by the labels, and other placements, with the survey's effects; no part of the survey's cost."""
+    inputs = [mosaic, patches, class_map, effects, *pointing]
+    for ref in inputs:
+        _ = ref.key  # a plan stops here where one is not known yet: for its own key the labels have to be drawn
+    off = _map_offset(run, pointing)
+    labels = _moved(run, off)
+
+    def build(path: Path) -> None:
+        """Write the figures of the map, of the coarse look alone and, where asked for, of other placements."""
+        drawn = load_class_map(class_map.path / "class_map.zarr")
+        classes = drawn.classes
+        judged = np.where(classes == UNLABELLED, np.uint8(UNLABELLED), labels)  # what has no class is not
+        seen = glance_at(run, mosaic)
+        counts = confusion(judged, classes, len(drawn.names))  # with the class unknown, which no label has
+        result: dict[str, Any] = _figures(run, counts) | {"confusion": counts.tolist()}
+        empty = np.empty((0, run.grid.patch, run.grid.patch, run.weights.basis.columns), np.float32)
+        none = segment(run.weights, seen, empty, np.empty(0, np.int64))
+        result["none"] = _figures(run, confusion(judged, none.classes, run.weights.config.classes))
+        result |= {"all": {"miou": None, "per_class_iou": {}}, "gap_closed": None, "controls": {}}
+        if run.controls:
+            source = source_with(_sure_source(run, off), effects)
+            result |= _controls(replace(run, simulated=source), seen, patches, judged, result)
+        (path / RECORD).write_text(to_json(result), encoding="utf-8")  # no NaN, which JSON does not know
+
+    params = {
+        **run.model_key,
+        "labels": array_digest(labels),
+        "controls": run.controls,
+        "kernel": run.settings.kernel,
+        **run.source_key(),
+    }
+    return Wanted(build, params, inputs)
+
+
+def _map_offset(run: SurveyRun, pointing: Sequence[StageRef]) -> NDArray[np.float64]:
+    """How far the whole map lies beside the scene, (along, scan) px: what the sweep that registration held is off by.
+
+    Overlaps tie sweeps to each other and not to the ground. Only the simulator knows the rest.
+    """
+    errors = run.simulated.pointing
+    if not isinstance(errors, PointingErrors) or not pointing:
+        return np.zeros(2)
+    return errors.offset(load_registration(pointing[0])["reference"])
+
+
+def _moved(run: SurveyRun, off: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """The labels as the map shows the scene, to the nearest pixel; what it shows beyond them is unlabelled."""
+    labels = run.labels
+    assert labels is not None
+    down, across = np.rint(off[::-1] if run.plan.along == "x" else off).astype(int)
+    rows, columns = (np.arange(size) + by for size, by in zip(labels.shape, (down, across), strict=True))
+    inside = ((rows >= 0) & (rows < labels.shape[0]))[:, None] & ((columns >= 0) & (columns < labels.shape[1]))
+    moved = labels[np.clip(rows, 0, labels.shape[0] - 1)[:, None], np.clip(columns, 0, labels.shape[1] - 1)]
+    return np.where(inside, moved, np.uint8(UNLABELLED))
+
+
+def _sure_source(run: SurveyRun, off: NDArray[np.float64]) -> SimulatedSource:
+    """A mirror that looks as far beside the scene as the map lies, everywhere: controls share the map's pixels."""
+    if run.simulated.pointing is None:
+        return run.simulated
+    return replace(run.simulated, pointing=CommonOffset((float(off[0]), float(off[1]))))
+
+
+def _controls(
+    run: SurveyRun, seen: Glance, patches: StageRef, labels: NDArray[np.uint8], result: dict[str, Any]
+) -> dict[str, Any]:
+    columns = columns_of_all_seats(
+        run.simulated,
+        run.plan.coarse if run.plan.plain else run.plan.full,
+        run.grid,
+        run.weights,
+        memory=run.settings.memory,
+        kernel=run.settings.kernel,
+        report=lambda done: run.report(0.6 * done),
+    )
+    rows = 0
+
+    def report(row: str) -> None:
+        nonlocal rows
+        rows += 1
+        run.report(0.6 + 0.035 * rows)
+
+    among = None if run.zones.shares is None else run.zones.shares > 0
+    controls = run_controls(
+        run.weights,
+        seen,
+        columns,
+        labels,
+        share=_control_share(run, patches),
+        seed=run.settings.seed,
+        among=among,
+        report=report,
+    )
+    figures = _figures(run, controls.every)
+    return {
+        "all": figures,
+        "gap_closed": gap_closed(result["miou"], result["none"]["miou"], figures["miou"]),
+        "controls": controls.as_dict(),
+        "controls_mode": _controls_mode(run, seen, controls),
+        "segment_wall_s": _segment_seconds(run, seen, patches, columns),
+    }
+
+
+def _control_share(run: SurveyRun, patches: StageRef) -> float:
+    """Share of the valid seats that other placements get; of a plain scan as many as were kept of it."""
+    if run.budget is None:
+        return CONTROL_SHARE
+    return len(open_patches(patches.path / "patches.zarr").seats) / len(run.budget.seats)
+
+
+def _controls_mode(run: SurveyRun, seen: Glance, controls: Controls) -> dict[str, Any]:
+    """What the controls' seats are, and what those of most gain would cost the rig: seats are not lines."""
+    grid, share, shares = run.grid, run.grid.valid_share().ravel(), run.zones.shares
+    seats = frame_seats(score_seats("gain", seen), controls.share, (share if shares is None else shares) > 0).seats
+    fine = share[seats].sum() * grid.patch**2  # samples beside the scene do not count
+    mode = {
+        "mode": "frame",
+        "share_of_seats": controls.share,
+        "seats": controls.seats,
+        "share_of_samples": (fine + np.prod(grid.coarse_shape)) / (grid.height * grid.width),
+    }
+    if run.plan.plain:  # whose lines are those of every placement
+        return mode
+    price = price_of_seats(grid, run.camera, run.settings.cost, run.plan.along, seats)
+    coarse_lines, full_lines = count_lines(run.plan.coarse), count_lines(run.plan.full)
+    return mode | {
+        "share_of_lines": (coarse_lines + price.lines) / full_lines,
+        "share_of_seconds": (run.plan.coarse_s + price.seconds) / run.plan.full_s,
+    }
+
+
+def _segment_seconds(run: SurveyRun, seen: Glance, patches: StageRef, columns: NDArray[np.float32]) -> dict[str, float]:
+    """Wall time of the model from spectral columns to the map, the better of two each [s].
+
+    As captured: glance, scores and map. With every seat there is nothing to choose: the map alone.
+    """
+    (seats, own), settings = patch_columns(run, patches, seen), run.settings
+    valid = run.grid.valid_seats()
+    every, bare = columns[valid], CoarseLook(seen.grid, seen.columns, living=seen.living)  # to be read anew
+    network = None if run.vgg is None else run.vgg.saliency(run.weights)
+
+    def look_choose_draw() -> None:
+        looked = glance_of_columns(run.weights, seen.columns, run.grid)
+        score_seats(settings.policy, looked, seed=settings.seed, mask=run.mask, network=network)
+        segment(run.weights, looked, own, seats)
+
+    return {
+        "done": min(_seconds(look_choose_draw) for _ in range(2)),
+        "full": min(_seconds(lambda: segment(run.weights, bare, every, valid)) for _ in range(2)),
+    }
+
+
+def _seconds(work: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+def _figures(run: SurveyRun, counts: NDArray[np.int64]) -> dict[str, Any]:
+    """What is said of a map; every map of a run is judged by the same labels, and so over the same classes."""
+    names = run.weights.class_names
+    known = len(names)
+    false = zip(names, false_pixels(counts)[:known].tolist(), strict=True)
+    unknown = {} if len(counts) == known else {"unknown_px": int(counts[:, known].sum())}
+    return {
+        **agreement(counts, known),
+        "average_accuracy": average_accuracy(counts),
+        "kappa": kappa(counts),
+        "pixels": int(counts.sum()),
+        "per_class_iou": dict(zip(names, iou_per_class(counts)[:known].tolist(), strict=True)),
+        "false_classes": {name: pixels for name, pixels in false if pixels},
+        **unknown,
+    }
+
+
+def load_accuracy(evaluated: StageRef) -> dict[str, Any]:
+    """Read the figures of an evaluation."""
+    return read_table(evaluated.path / RECORD)
+
+
+MEMORY_SHARE = 32  # a band of seats may take this part of the memory
+
+
+def columns_of_all_seats(
+    source: SimulatedSource,
+    full: Sequence[Sweep],
+    grid: SceneGrid,
+    weights: Weights,
+    *,
+    memory: int,
+    kernel: Kernel,
+    report: Callable[[float], None] = lambda done: None,
+) -> NDArray[np.float32]:
+    """Scan the scene in full, a band of seats at a time, and keep the normalised columns only.
+
+    Gives (seat, p, p, column) float32 of the padded grid; seats beyond the scene are 0. ``memory`` is in bytes.
+    """
+    sweeps = [SimulatedSweep(source, sweep) for sweep in full]
+    p, valid = grid.patch, grid.valid_seats()
+    columns = np.zeros((int(np.prod(grid.seat_shape)), p, p, weights.basis.columns), np.float32)
+    row, column = np.divmod(valid, grid.seat_shape[1])
+    place = row if full[0].along == "x" else column  # bands lie across the scan, as deep as fits
+    one = int(np.count_nonzero(place == 0)) * p**2 * len(source.wavelength_nm) * 4
+    deep = max(1, memory // MEMORY_SHARE // one)
+    done = 0
+    for band in range(int(place.max()) // deep + 1):
+        seats = valid[place // deep == band]
+        values, _ = read_seats(sweeps, source.camera, grid, seats, kernel)
+        columns[seats] = weights.columns(values, source.wavelength_nm)
+        done += len(seats)
+        report(done / len(valid))
+    return columns

@@ -1,0 +1,206 @@
+"""The stages of attention: a score for every seat, the sweeps that show most of it, and the other way to lay lines."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.settings.survey_settings import SPARING
+from flows.settings.values import LOOK_WHOLE
+from flows.tasks.field_work import FieldWork, region_params
+from flows.tasks.run import SurveyRun
+from flows.tasks.seat_budget import SeatBudget
+from flows.tasks.stage import Product, Wanted, stage
+from models.policies.policies import IMAGE_POLICIES, SEEDED_POLICIES, SEEING_POLICIES, score_seats
+from models.reading.inference import Glance
+from pipeline.geometry.grid import seat_pixels
+from pipeline.geometry.scan import Sweep, exposing
+from pipeline.planning.area_cover import seats_shown
+from pipeline.planning.fine_pass import FinePlan, plan_fine
+from pipeline.planning.orientation import compare_orientations, find_rows
+from pipeline.planning.plain_scans import scan_words
+from storage.archive.keys import StageRef, array_digest
+from storage.archive.manifests import read_table, write_table
+from storage.arrays.mosaics import Attention, load_attention, mosaic_brightness, write_attention
+
+ATTENTION = Product("attend", version=7, files=("attention.zarr", "plan.json"), by_weights=True)
+
+
+@stage("attend", "attention and plan", ATTENTION, unit="pixels")
+def attend(run: SurveyRun, mosaic: StageRef) -> Wanted:
+    """Score every seat by the coarse mosaic, and plan the sweeps that show the most score in the time left."""
+    settings = run.settings
+
+    def build(path: Path) -> None:
+        """Write every seat's score and rank, and the plan of sweeps; refuse a map that does not fit."""
+        work = FieldWork.of(run)
+        scores, plan = _planned(run, work, mosaic)
+        work.crew_for(plan.seats, len(run.scene.wavelength_nm))  # refuses what does not fit before the rig goes back
+        rank = np.full(scores.shape, -1, np.int32)
+        rank[plan.seats[np.argsort(-scores[plan.seats], kind="stable")]] = np.arange(len(plan.seats))
+        shape = run.grid.seat_shape
+        write_attention(path / "attention.zarr", Attention(scores.reshape(shape), rank.reshape(shape), settings.policy))
+        content = asdict(plan) | {"seats": plan.seats.tolist()}
+        absent = [name for name in ("threshold", "spared_s") if content[name] is None]
+        write_table(path / "plan.json", {name: value for name, value in content.items() if name not in absent})
+
+    params = {
+        **run.model_key,
+        "grid": asdict(run.grid),
+        "policy": settings.policy,
+        "seed": settings.seed if settings.policy in SEEDED_POLICIES else None,
+        "mask": None if run.mask is None else array_digest(run.mask),
+        "fine_s": run.plan.fine_s,
+        "overlap_px": run.plan.overlap_px,
+        "margin_px": run.plan.margin_px,
+        "along": run.plan.along,
+        "camera": asdict(run.camera),
+        "cost": asdict(settings.cost),
+        **(region_params(run.grid) if settings.policy in SEEING_POLICIES else {}),
+        **({} if run.vgg is None else {"vgg": run.vgg.key}),
+        **({} if settings.threshold is None else {"threshold": settings.threshold}),
+        **({"plain": True} if run.plan.plain else {}),
+        **({} if run.budget is None else {"seats": {name: getattr(settings, name) for name in SPARING}}),
+        **run.zones.key,
+    }
+    return Wanted(build, params, [mosaic])
+
+
+def _planned(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> tuple[NDArray[np.float64], FinePlan]:
+    """Scores of the seats where some are chosen, and what is seen of the field in detail."""
+    if not run.plan.plain:
+        return _scored(run, work, mosaic)
+    return _whole_field(run) if run.budget is None else _part_of_scan(run, run.budget, work, mosaic)
+
+
+def _scored(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> tuple[NDArray[np.float64], FinePlan]:
+    """Scores of the seats, and the runs of lines that show most of them in the time left."""
+    scores = _scores_within_zones(run, work, mosaic)
+    plan = plan_fine(
+        run.grid,
+        run.camera,
+        run.settings.cost,
+        run.plan.along,
+        scores,
+        budget_s=run.plan.fine_s,
+        margin_px=run.plan.margin_px,
+        full=run.plan.full,
+        threshold=run.settings.threshold,
+    )
+    return scores, _kept_seats(run, plan)
+
+
+def _kept_seats(run: SurveyRun, plan: FinePlan) -> FinePlan:
+    """The plan with the seats alone of which zones leave something."""
+    shares = run.zones.shares
+    return plan if shares is None else replace(plan, seats=plan.seats[shares[plan.seats] > 0])
+
+
+def _part_of_scan(
+    run: SurveyRun, budget: SeatBudget, work: FieldWork, mosaic: StageRef
+) -> tuple[NDArray[np.float64], FinePlan]:
+    """Scores of the seats, and those of a plain scan that the budget pays for: all were seen, some are kept."""
+    scores, every = _scores_within_zones(run, work, mosaic), _whole_field(run)[1]
+    bought = budget.choose(scores)
+    s = run.grid.factor
+    reason = (
+        f"{every.reason}; {len(bought)} of {len(budget.seats)} seats are kept and read in detail, the others as means "
+        f"of {s} x {s} px"
+    )
+    told = np.where(np.isfinite(scores), scores, 0.0)
+    worth, wanted = float(told[bought].sum()), float(np.maximum(told, 0.0).sum())
+    return scores, replace(every, seats=np.sort(bought), reason=reason, worth=worth, wanted_worth=wanted)
+
+
+def _scores_within_zones(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> NDArray[np.float64]:
+    """(seat,) worth of a fine look at each seat, by the share of it that zones leave.
+
+    What is seen of the others beside it is not asked for.
+    """
+    scores, shares = _scores(run, work, mosaic), run.zones.shares
+    return scores if shares is None else np.where(shares > 0, scores, 0.0) * shares
+
+
+def _whole_field(run: SurveyRun) -> tuple[NDArray[np.float64], FinePlan]:
+    """No scores, and the plan of a plain scan: every seat is seen, and there is nothing to go back for."""
+    sweep = run.plan.coarse[0]
+    words = scan_words(sweep.step, exposing(run.camera, sweep).exposure_ms)
+    seats, what = run.grid.valid_seats(), "the field was"
+    if run.settings.look != LOOK_WHOLE:
+        seats, what = np.flatnonzero(seats_shown(run.plan.coarse, run.grid, run.camera)), "a part of the field was"
+    plan = FinePlan([], seats, 0.0, 0.0, "scan", f"{what} scanned once: {words}")
+    return np.zeros(int(np.prod(run.grid.seat_shape))), _kept_seats(run, plan)
+
+
+def _scores(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> NDArray[np.float64]:
+    """(seat,) worth of a fine look at each seat of the padded grid."""
+    scores = _scores_of_seats(run, work, mosaic)
+    if run.scene.missing is not None:  # a seat without any pixel of the scene is worth no look
+        scores = np.where(_on_no_scene(run), 0.0, scores)
+    return scores
+
+
+def _on_no_scene(run: SurveyRun) -> NDArray[np.bool_]:
+    """(seat,) of whose pixels the scene has none."""
+    grid, missing = run.grid, run.scene.missing
+    assert missing is not None
+    return np.asarray(seat_pixels(grid, missing).mean(axis=(1, 2)) >= grid.valid_share().ravel())
+
+
+def _scores_of_seats(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> NDArray[np.float64]:
+    policy = run.settings.policy
+    if policy in SEEING_POLICIES + IMAGE_POLICIES:
+        return work.score(policy, mosaic.path / "mosaic.zarr", lambda done: run.report(0.5 * done)).ravel()
+    nothing = np.empty((0, 0, 0), np.float32)
+    return score_seats(policy, Glance(run.grid, nothing, nothing), seed=run.settings.seed, mask=run.mask)
+
+
+def load_plan(attention: StageRef) -> FinePlan:
+    """Read the plan of an attention store."""
+    plan = read_table(attention.path / "plan.json")
+    kept = {"sweeps": [Sweep(**sweep) for sweep in plan["sweeps"]], "seats": np.array(plan["seats"], np.intp)}
+    return FinePlan(**(plan | kept))
+
+
+FILE = "orientation.json"
+TURNED = Product("turned", version=1, files=(FILE,))
+
+
+@stage("compare_turned", "the plan with lines along the other axis", TURNED, unit="pixels")
+def compare_turned(run: SurveyRun, mosaic: StageRef, attention: StageRef) -> Wanted:
+    """Plan the scores with lines along the other axis, and find which way crop rows run."""
+    settings = run.settings
+
+    def build(path: Path) -> None:
+        """Write what the plan would be with turned lines, and the sentence that tells of it."""
+        scores = load_attention(attention.path / "attention.zarr").score.ravel()
+        if run.plan.plain:  # whose seats are chosen free of lines
+            scores = np.zeros_like(scores)
+        rows = find_rows(mosaic_brightness(mosaic.path / "mosaic.zarr"))
+        turned = compare_orientations(
+            run.grid,
+            run.camera,
+            settings.cost,
+            run.plan.along,
+            scores,
+            budget_s=run.plan.fine_s,
+            plan=load_plan(attention),
+            rows=rows,
+            overlap_px=run.plan.overlap_px,
+            margin_px=run.plan.margin_px,
+            threshold=settings.threshold,
+            coarse_exposure_ms=settings.coarse_exposure_ms,
+            shown=None if settings.pointing_px else run.zones.shown,
+        )
+        write_table(path / FILE, asdict(turned) | {"sentence": turned.sentence})
+
+    return Wanted(build, {}, [mosaic, attention])  # all it depends on are parameters of attention
+
+
+def load_orientation(turned: StageRef) -> dict[str, Any]:
+    """Read what the other orientation of the line would have shown, and which way crop rows run."""
+    return read_table(turned.path / FILE)

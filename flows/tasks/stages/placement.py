@@ -1,0 +1,301 @@
+"""Where lines lie and what they show: registration (none where the mirror is believed), lookup, mosaic, patches."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.tasks.run import SurveyRun
+from flows.tasks.stage import Product, Wanted, stage
+from flows.tasks.stages.attention import load_plan
+from flows.tasks.stages.capture import captured
+from pipeline.errors import ShapeError
+from pipeline.geometry.grid import seat_pixels
+from pipeline.rectify.mosaic import LineCache
+from pipeline.rectify.placed import PixelGrid, Placed, TieTable
+from pipeline.rectify.region import read_every_seat, read_seats
+from pipeline.rectify.registration.alignment import SweepShift
+from pipeline.rectify.registration.illumination import overlap_light, solve_lights
+from pipeline.rectify.registration.overlaps import BroadSweep, broad_bands
+from pipeline.rectify.registration.seams import Anchor, Registration, SeamWindow, anchor_sweep, register_sweeps
+from pipeline.rectify.tracks import Track
+from storage.archive.keys import StageRef
+from storage.archive.manifests import read_table, write_table
+from storage.arrays.layout import NO_VALUE, blank_coarse, blank_pixels, read_array
+from storage.arrays.lookups import path_digest, write_lookup
+from storage.arrays.mosaics import MosaicWriter, PatchWriter, load_mosaic, open_patches
+from storage.arrays.quicklooks import choose_bands, stretched
+from storage.arrays.tile_work import MosaicRecipe, Sighted, Thumbnail, sight_sweeps, write_mosaic
+
+RECORD = "registration.json"
+POINTING = Product("register", version=2, files=(RECORD,))
+
+
+def sighted(run: SurveyRun, raw: StageRef, registration: StageRef | None) -> list[Sighted]:
+    """Open the sweeps of a capture with what registration found of them."""
+    return sight_sweeps(captured(raw), record_of(registration), run.camera)
+
+
+def record_of(registration: StageRef | None) -> Path | None:
+    """Where a registration wrote what it found."""
+    return None if registration is None else registration.path / RECORD
+
+
+@stage(
+    "register_coarse", "seams of the coarse sweeps", POINTING, inputs=1, unit="coarse values", named="coarse_pointing"
+)
+def register_coarse(run: SurveyRun, raw: StageRef) -> Wanted:
+    """Find pointing and light of the coarse sweeps from what neighbours show twice."""
+    prior = run.settings.pointing_px
+
+    def build(path: Path) -> None:
+        sweeps = sighted(run, raw, None)
+        broad = [BroadSweep.read(one.cube, run.camera, usable=one.usable) for one in sweeps]
+        run.report(0.4)
+        found = register_sweeps(broad, run.camera, prior_px=prior)
+        run.report(0.8)
+        placed = [replace(one, shift=found.of(one.cube.sweep.name)).placed(run.camera) for one in sweeps]
+        write_table(path / RECORD, _seams_record(found, _gains(run, found, placed)))
+
+    return Wanted(build, {"prior_px": prior, "pass": "coarse"}, [raw])
+
+
+def _gains(run: SurveyRun, found: Registration, placed: Sequence[Placed]) -> dict[str, list[float]]:
+    """What each sweep's values are to be multiplied by, band by band, so that neighbours agree."""
+    windows = [seen.window for seen in found.windows if seen.measured is not None]
+    if not windows:
+        return {}
+    lights = solve_lights(overlap_light(placed, run.camera, windows), len(placed), run.scene.wavelength_nm)
+    tied = [number for number in range(len(placed)) if number not in lights.untied]
+    return {placed[number].lines.sweep.name: lights.gain(number).tolist() for number in tied}
+
+
+def _seams_record(found: Registration, gains: dict[str, list[float]]) -> dict[str, Any]:
+    names = [shift.name for shift in found.shifts]
+    return {
+        "method": "seams",
+        "reference": found.reference,
+        "sweeps": {shift.name: _shift_record(shift) | {"gain": gains.get(shift.name)} for shift in found.shifts},
+        "untied": list(found.untied),
+        "narrow": [asdict(narrow) for narrow in found.narrow],
+        "windows": [_window_record(seen, names) for seen in found.windows],
+    }
+
+
+def _shift_record(shift: SweepShift) -> dict[str, Any]:
+    return {"offset_px": shift.offset.tolist(), "drift_px_per_line": shift.drift.tolist()}
+
+
+def _window_record(seen: SeamWindow, names: Sequence[str]) -> dict[str, Any]:
+    left = seen.residual_px.tolist() if np.isfinite(seen.residual_px).all() else None
+    status = "too narrow" if seen.found is None else seen.found.status
+    window = seen.window
+    return {
+        "reference": names[window.reference],
+        "moving": names[window.moving],
+        "along_px": window.along_px,
+        "scan_px": window.scan_px,
+        "status": status,
+        "residual_px": left,
+    }
+
+
+@stage("register_fine", "fine sweeps on the mosaic", POINTING, inputs=2, unit="fine values", named="fine_pointing")
+def register_fine(run: SurveyRun, raw: StageRef, mosaic: StageRef) -> Wanted:
+    """Find where each fine sweep lies on the coarse mosaic, which itself may be off by as much."""
+    prior = run.settings.pointing_px
+
+    def build(path: Path) -> None:
+        """Lay each sweep onto the mean of the mosaic's bands, and write where it lies."""
+        sweeps = sighted(run, raw, None)
+        anchors: list[Anchor] = []
+        values = load_mosaic(mosaic.path / "mosaic.zarr").values if sweeps else np.empty((0, 0, 0), np.float32)
+        for number, one in enumerate(sweeps):
+            under = np.asarray(values[..., broad_bands(one.cube.references)].mean(axis=-1), np.float32)
+            broad = BroadSweep.read(one.cube, run.camera, usable=one.usable)
+            anchors.append(anchor_sweep(broad, run.camera, run.grid, under, prior_px=2 * prior))
+            run.report((number + 1) / len(sweeps))
+        record = {
+            "method": "mosaic",
+            "reference": "the coarse mosaic",
+            "sweeps": {one.shift.name: _shift_record(one.shift) | {"gain": None} for one in anchors},
+            "untied": [one.shift.name for one in anchors if one.found.status != "found"],
+            "narrow": [],
+            "windows": [{"moving": one.shift.name, "status": one.found.status} for one in anchors],
+        }
+        write_table(path / RECORD, record)
+
+    return Wanted(build, {"prior_px": prior, "pass": "fine", "grid": asdict(run.grid)}, [raw, mosaic])
+
+
+def load_registration(registration: StageRef) -> dict[str, Any]:
+    """Read what was found: by sweep the offset, drift and gain; the held sweep, those untied, and every window."""
+    return read_table(registration.path / RECORD)
+
+
+LOOKUP = Product("locate", version=2, files=("lookup.zarr",))
+MOSAIC = Product("rectify", version=4, files=("mosaic.zarr",))
+PATCHES = Product("patches", version=4, files=("patches.zarr",), made_again=True)
+QUICKLOOK_PX = 512
+SEATS_AT_ONCE = 64
+CACHE_SHARE = 8  # raw lines kept for the next patches may take this part of the memory
+
+
+@stage("locate", "lookup", LOOKUP, unit="coarse pixels")
+def locate(run: SurveyRun, raw: StageRef, *registration: StageRef) -> Wanted:
+    """Look up where each coarse pixel was seen: a table that every survey along the same path shares."""
+    grid = PixelGrid.of_scene(run.grid, 1 if run.plan.plain else run.grid.factor)
+    sweeps = sighted(run, raw, _only(registration))
+    camera = {name: getattr(run.camera, name) for name in ("samples", "pitch_um", "focal_length_mm")}
+    params = {
+        "camera": camera,
+        "grid": asdict(grid),
+        "paths": {
+            one.cube.sweep.name: {
+                "path": path_digest(one.cube.position, one.usable, one.shift_px),
+                **{name: getattr(one.cube.sweep, name) for name in ("along", "step", "binning")},
+            }
+            for one in sweeps
+        },
+    }
+
+    def build(path: Path) -> None:
+        """Write the tie tables of each sweep; of one that ties cannot follow, none."""
+        tables: dict[str, list[tuple[Track, TieTable]]] = {}
+        for number, one in enumerate(sweeps):
+            made = one.placed(run.camera, grid).tracks
+            whole = [(track, table) for track, table in made if table is not None]
+            # Where lines lie too unevenly for ties there is nothing to keep: such a sweep is looked up directly.
+            tables[one.cube.sweep.name] = whole if len(whole) == len(made) else []
+            run.report((number + 1) / len(sweeps))
+        write_lookup(path / "lookup.zarr", tables, params)
+
+    return Wanted(build, params)  # keyed by the paths, not by what was seen along them
+
+
+@stage("rectify", "mosaic", MOSAIC, unit="mosaic values")
+def rectify(run: SurveyRun, raw: StageRef, lookup: StageRef, *registration: StageRef) -> Wanted:
+    """Bring the coarse sweeps onto the scene grid and blend them into one mosaic, tile by tile."""
+
+    def build(path: Path) -> None:
+        """Write mosaic and quicklook tile by tile, and what became of each sweep's lines."""
+        grid = PixelGrid.of_scene(run.grid, run.grid.factor)
+        recipe = MosaicRecipe(
+            raw.path,
+            run.camera,
+            grid,
+            run.settings.kernel,
+            lookup=lookup.path / "lookup.zarr",
+            registration=record_of(_only(registration)),
+            finer=PixelGrid.of_scene(run.grid, 1) if run.plan.plain else None,
+        )
+        writer = MosaicWriter(
+            path / "mosaic.zarr",
+            grid.shape,
+            run.scene.wavelength_nm,
+            fwhm_nm=run.scene.fwhm_nm,
+            grid=run.angular_grid(run.grid.factor),
+            simulation=captured(raw)[0].simulation,
+        )
+        colours, _ = choose_bands(run.scene.wavelength_nm)
+        settings, picture = run.settings, Thumbnail(grid.shape, colours, QUICKLOOK_PX)
+        write_mosaic(recipe, writer, memory=settings.memory, crew=settings.crew, seen=picture, report=run.report)
+        if run.scene.missing is not None:
+            gaps = blank_coarse(run.scene.missing, run.grid.factor)
+            blank_pixels(path / "mosaic.zarr", gaps, NO_VALUE)
+            picture.blank(gaps)
+        writer.write_quicklook(stretched(picture.image).image)
+        write_table(path / "lines.json", {one.cube.sweep.name: one.facts() for one in recipe.sweeps()})
+
+    params = {"grid": asdict(run.grid), "kernel": run.settings.kernel, **run.place_key}
+    return Wanted(build, params, [raw, lookup, *registration])
+
+
+@stage("cut_patches", "fine patches", PATCHES, unit="patch values")
+def cut_patches(run: SurveyRun, attention: StageRef, raw: StageRef, *registration: StageRef) -> Wanted:
+    """Bring every chosen seat onto the scene grid, one patch a seat; NaN where nothing was seen, or is no scene.
+
+    ``raw`` are the fine sweeps, or those of a plain scan.
+    """
+
+    def build(path: Path) -> None:
+        """Write the patches in the order in which sweeps pass them, a batch of seats at a time."""
+        seats = load_plan(attention).seats
+        row, column = np.divmod(seats, run.grid.seat_shape[1])
+        # as the sweeps pass them, so that a few of them need few lines at a time
+        ordered = seats[np.lexsort((column, row) if run.plan.along == "x" else (row, column))]
+        writer = PatchWriter(
+            path / "patches.zarr",
+            ordered,
+            run.grid.seat_origin(ordered),
+            run.grid.patch,
+            run.scene.wavelength_nm,
+            fwhm_nm=run.scene.fwhm_nm,
+            grid=run.angular_grid(),
+        )
+        if run.plan.plain and len(ordered):
+            _cut_everything(run, sighted(run, raw, _only(registration)), writer, ordered)
+            return
+        cache = LineCache(run.settings.memory // CACHE_SHARE)
+        sweeps = [one.placed(run.camera) for one in sighted(run, raw, _only(registration))]
+        for first in range(0, len(ordered), SEATS_AT_ONCE):
+            seats = ordered[first : first + SEATS_AT_ONCE]
+            seen = read_seats(sweeps, run.camera, run.grid, seats, run.settings.kernel, cache=cache)
+            writer.write(*_on_scene(run, seats, *seen))
+            run.report((first + len(seats)) / len(ordered))
+
+    params = {"grid": asdict(run.grid), "kernel": run.settings.kernel, **run.place_key}
+    return Wanted(build, params, [attention, raw, *registration])
+
+
+def _on_scene(
+    run: SurveyRun, seats: NDArray[np.integer], values: NDArray[np.float32], valid: NDArray[np.bool_]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """The same patches (patch, y, x, band) with NaN, and no validity, where the scene has no value."""
+    if run.scene.missing is None:
+        return values, valid
+    gaps = seat_pixels(run.grid, run.scene.missing)[seats]
+    return np.where(gaps[..., None], np.float32(np.nan), values), valid & ~gaps
+
+
+def _cut_everything(run: SurveyRun, sweeps: Sequence[Sighted], writer: PatchWriter, seats: NDArray[np.integer]) -> None:
+    """Cut the wanted seats of a plain scan, by tables of its pixels: many times as fast as looking each of them up."""
+    placed = [one.placed(run.camera, PixelGrid.of_scene(run.grid, 1)) for one in sweeps]
+    done, first, every = 0, 0, run.grid.valid_seats()
+    row, column = np.divmod(every, run.grid.seat_shape[1])
+    wanted = np.isin(every[np.lexsort((column, row) if run.plan.along == "x" else (row, column))], seats)
+    most_bytes = run.settings.memory // CACHE_SHARE
+    for values, seen in read_every_seat(placed, run.camera, run.grid, run.settings.kernel, most_bytes=most_bytes):
+        kept = wanted[first : first + len(values)]
+        first += len(values)
+        if not kept.all():
+            values, seen = values[kept], seen[kept]
+        writer.write(*_on_scene(run, seats[done : done + len(values)], values, seen))
+        done += len(values)
+        run.report(done / len(seats))
+
+
+def seen_shares(run: SurveyRun, patches: StageRef) -> NDArray[np.float64]:
+    """How much of each patch was seen, (patch,) 0..1 of its pixels on the scene; 1 where it has none there."""
+    store = open_patches(patches.path / "patches.zarr")
+    seen: NDArray[np.float64] = read_array(store.group, "valid").mean(axis=(1, 2))
+    there = run.grid.valid_share().ravel()[store.seats]
+    if run.scene.missing is not None:
+        there = there - seat_pixels(run.grid, run.scene.missing)[store.seats].mean(axis=(1, 2))
+    return np.divide(seen, there, out=np.ones_like(seen), where=there > 0)
+
+
+def _only(registration: Sequence[StageRef]) -> StageRef | None:
+    if len(registration) > 1:
+        raise ShapeError(f"expected one registration or none, got {len(registration)}")
+    return registration[0] if registration else None
+
+
+def line_facts(mosaic: StageRef) -> dict[str, dict[str, Any]]:
+    """Read, by sweep, how many lines were lost, repeated, out of order, late or invalid."""
+    return read_table(mosaic.path / "lines.json")

@@ -1,0 +1,158 @@
+"""What a map scores: labels and controls where the map looks, and figures read from receipts of any age."""
+
+from __future__ import annotations
+
+import copy
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from flows.tasks.scores import definitions_differ, false_class_words, score_of, worst_class
+from flows.tasks.stages import accuracy as evaluation
+from flows.tasks.stages import placement
+from models.evaluation.metrics import agreement, confusion, iou_per_class, mean_iou, miou_of_shown_classes
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import UNLABELLED
+from pipeline.rectify.registration.illumination import LightRatio
+from pipeline.simulator.effects.pointing import CommonOffset, PointingErrors
+from pipeline.simulator.rig_model import Rig
+from pipeline.simulator.scenes.scene import raster_from_values
+from pipeline.simulator.simulated import SimulatedSource
+from storage.archive.archive import Archive
+from storage.archive.keys import StageRef
+from tests.flows.publish.test_receipt import make_receipt
+
+OFF = np.array([2.2, -1.4])  # along the line and the scan [px]
+
+
+@pytest.mark.parametrize(("along", "down", "right"), [("x", -1, 2), ("y", 2, -1)])
+def test_labels_move_to_where_the_map_shows_them(along: str, down: int, right: int) -> None:
+    """The map's pixel p shows what lies at p + offset, to the nearest pixel; beyond the labels nothing is known."""
+    labels = np.arange(30, dtype=np.uint8).reshape(5, 6)
+    run: Any = SimpleNamespace(labels=labels, plan=SimpleNamespace(along=along))
+    moved = evaluation._moved(run, OFF)
+    for row, column in np.ndindex(5, 6):
+        at = row + down, column + right
+        known = 0 <= at[0] < 5 and 0 <= at[1] < 6
+        assert moved[row, column] == (labels[at] if known else UNLABELLED)
+
+
+def test_a_false_class_is_listed_with_its_pixels() -> None:
+    """What a map shows and the labels lack has pixels and no IoU, and does not count in the mean."""
+    run: Any = SimpleNamespace(weights=SimpleNamespace(class_names=("soil", "crop", "tree")))
+    labels, drawn = np.array([0, 0, 0, 1, UNLABELLED], np.uint8), np.array([0, 0, 2, 1, 2], np.uint8)
+    found = evaluation._figures(run, confusion(labels, drawn, 3))
+    assert found["false_classes"] == {"tree": 1}
+    assert found["per_class_iou"] == pytest.approx({"soil": 2 / 3, "crop": 1.0, "tree": np.nan}, nan_ok=True)
+    assert found["miou"] == pytest.approx(5 / 6)
+    assert found["miou_of_shown_classes"] == pytest.approx(5 / 9)
+
+
+def _registration(archive: Path, record: dict[str, Any]) -> StageRef:
+    """A published registration."""
+
+    def build(path: Path) -> None:
+        (path / "registration.json").write_text(json.dumps(record))
+
+    return Archive.open(archive).produce("register", build, version=1, params={})[0]
+
+
+def test_controls_look_where_the_map_does(tmp_path: Path) -> None:
+    """The offset is that of the sweep which registration held, and controls scan with the same one everywhere."""
+    scene = raster_from_values(np.ones((8, 8, 1)), LineCamera(), name="t", wavelength_nm=np.array([500.0]))
+    errors = PointingErrors(9.0, 0.0, 4)
+    run: Any = SimpleNamespace(simulated=SimulatedSource(scene, Rig(), pointing=errors))
+    off = evaluation._map_offset(run, [_registration(tmp_path, {"reference": "coarse-3"})])
+    np.testing.assert_array_equal(off, errors.offset("coarse-3"))
+    assert evaluation._sure_source(run, off).pointing == CommonOffset((float(off[0]), float(off[1])))
+    assert (evaluation._map_offset(run, []) == 0).all()
+
+
+def test_corrections_are_found_and_read(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Two sweeps lit differently meet in the middle; offset, drift and gain reach their sweep alone."""
+    ratio = LightRatio(0, 1, np.log([4.0, 4.0]), np.zeros(2))
+    monkeypatch.setattr(placement, "overlap_light", lambda *_: [ratio])
+    placed: Any = [SimpleNamespace(lines=SimpleNamespace(sweep=SimpleNamespace(name=name))) for name in "ab"]
+    run: Any = SimpleNamespace(camera=None, scene=SimpleNamespace(wavelength_nm=np.array([500.0, 600.0])))
+    found: Any = SimpleNamespace(windows=[SimpleNamespace(window=None, measured=True)])
+    gains = placement._gains(run, found, placed)
+    np.testing.assert_allclose(gains["a"], 2.0, rtol=1e-6)
+    np.testing.assert_allclose(gains["b"], 0.5, rtol=1e-6)
+    record = {"a": {"offset_px": [1.0, -2.0], "drift_px_per_line": [0.5, 0.0], "gain": [0.5, 2.0]}}
+    ref = _registration(tmp_path, {"sweeps": record})
+    sweeps = [SimpleNamespace(name=name, exposure_ms=None) for name in "ab"]
+    cubes = [SimpleNamespace(sweep=sweep, time_s=np.arange(3.0)) for sweep in sweeps]
+    monkeypatch.setattr(placement, "captured", lambda _: cubes)
+    run: Any = SimpleNamespace(camera=LineCamera())
+    one, other = placement.sighted(run, ref, ref)
+    np.testing.assert_array_equal(one.shift_px, [[0.5, -2.0], [1.0, -2.0], [1.5, -2.0]])
+    np.testing.assert_array_equal(one.gain, [0.5, 2.0])
+    assert (other.shift_px == 0).all()
+    assert other.gain is None
+
+
+NAMES = ("soil", "crop", "weed", "track")
+MAP = st.lists(st.integers(0, 3), min_size=24, max_size=24)
+
+
+def _before(truth: list[int], *maps: list[int]) -> tuple[dict[str, Any], float]:
+    """The accuracy of a receipt of before, of this map, none and all; and what this map scores now."""
+    found = []
+    for drawn in maps:
+        counts = confusion(np.array(truth), np.array(drawn), 4)
+        shown = counts.sum(axis=0) + counts.sum(axis=1) > 0
+        iou = np.where(shown, np.nan_to_num(iou_per_class(counts)), np.nan)
+        per_class = {name: None if np.isnan(one) else float(one) for name, one in zip(NAMES, iou, strict=True)}
+        found.append({"miou": miou_of_shown_classes(counts), "per_class_iou": per_class, "overall_accuracy": 0.5})
+    now = mean_iou(confusion(np.array(truth), np.array(maps[0]), 4))
+    return {**found[0], "none": found[1], "all": found[2]}, now
+
+
+@given(st.lists(st.integers(0, 2), min_size=24, max_size=24), MAP, MAP, MAP)
+def test_an_older_receipt_scores_as_it_would_now_or_not_at_all(
+    truth: list[int], this: list[int], none: list[int], every: list[int]
+):
+    """Its mean is taken over the classes of the truth, as far as its three maps tell which these are."""
+    accuracy, now = _before(truth, this, none, every)
+    found = score_of({"accuracy": accuracy})["miou"]
+    maps = [accuracy["per_class_iou"], accuracy["none"]["per_class_iou"], accuracy["all"]["per_class_iou"]]
+    unclear = any(all(one[name] == 0 for one in maps) for name in NAMES)
+    assert (found is None) if unclear else found == pytest.approx(now)
+
+
+def test_a_receipt_of_now_gives_its_own_figures():
+    """Both means; the worst class of the truth; and each map that shows a false class, with its pixels."""
+    assert score_of(make_receipt()) == {"miou": 0.75, "overall_accuracy": 0.934}
+    accuracy: Any = copy.deepcopy(make_receipt()["accuracy"])
+    assert worst_class(accuracy) == ("bare_weed", 0.2, 0.6, 0.8)
+    accuracy["per_class_iou"] = {"wheat": None}
+    assert worst_class(accuracy) is None
+    accuracy: Any = copy.deepcopy(make_receipt()["accuracy"])
+    accuracy["none"]["false_classes"] = {"wheat": 30, "bare_track": 1}
+    words = "Shown although the truth has none: this survey wheat 2 px; none wheat 30 px, bare track 1 px."
+    assert false_class_words(accuracy) == words
+    accuracy["false_classes"] = accuracy["none"]["false_classes"] = {}
+    assert false_class_words(accuracy) == ""
+
+
+@pytest.mark.parametrize("accuracy", [None, 3, {}, {"miou": "x"}, {"per_class_iou": [1], "none": 2, "all": None}])
+def test_what_was_not_judged_has_no_score(accuracy: object):
+    """No labels, or a receipt that somebody has damaged."""
+    assert score_of({"accuracy": accuracy}) == {"miou": None, "overall_accuracy": None}
+    assert score_of({}) == {"miou": None, "overall_accuracy": None}
+
+
+@given(MAP, MAP)
+def test_definitions_differ_where_a_map_shows_a_false_class(truth: list[int], drawn: list[int]):
+    """And nowhere else, to the last bit; a receipt of before, which has one definition, has no other."""
+    counts = confusion(np.array(truth), np.array(drawn), 4)
+    figures = agreement(counts)
+    expected = figures["miou"] > 0 and not set(drawn) <= set(truth)
+    assert definitions_differ([figures]) == expected
+    assert not definitions_differ([{"miou": figures["miou"]}])

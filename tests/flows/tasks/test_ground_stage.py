@@ -1,0 +1,248 @@
+"""The ground stage: a posed survey's map in the archive, with hectares; nothing without a pose."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from flows.settings.survey_settings import MapChoice, Settings
+from flows.tasks.run import SurveyRun
+from flows.tasks.stages.on_ground import STORE, coarse_colours, ground, survey_grid
+from pipeline.errors import PoseError
+from pipeline.geometry.grid import UNLABELLED, SceneGrid
+from pipeline.ground.map_grid import GroundGrid
+from pipeline.ground.view import RigPose, pixel_places
+from storage.archive.archive import Archive
+from storage.archive.keys import StageRef
+from storage.arrays.class_maps import (
+    ClassMap,
+    ClassNames,
+    create_belief,
+    load_class_map,
+    write_belief_tile,
+    write_changes,
+    write_changes_tile,
+    write_class_map,
+)
+from storage.arrays.ground_maps import GroundMap, load_ground_map
+from storage.arrays.layout import AngularGrid
+from storage.arrays.mosaics import MosaicWriter
+
+pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
+POSE = RigPose(lon_deg=9.5, lat_deg=52.1, heading_deg=25.0, tilt_deg=50.0, height_m=14.0)
+SHAPE = (120, 160)
+LEGEND = ClassNames(("weed", "crop"), np.array([[255, 0, 0], [0, 255, 0]], np.uint8))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """As much of a scene as the stage looks at."""
+
+    shape: tuple[int, int] = SHAPE
+
+
+@dataclass(frozen=True)
+class Run:
+    """As much of a survey as the stage looks at."""
+
+    archive: Archive
+    settings: Settings = field(default_factory=lambda: Settings(pose=POSE))
+    scene: Scene = field(default_factory=Scene)
+    grid: SceneGrid = field(default_factory=lambda: SceneGrid(*SHAPE, 8, 4))
+    report: Callable[[float], None] = lambda done: None
+
+    @property
+    def camera(self) -> Any:
+        """The settings' camera."""
+        return self.settings.camera
+
+
+def believe(folder: Path, age_days: np.ndarray, old_class: np.ndarray | None = None) -> None:
+    """A belief of these ages (y, x), NaN where nothing is known; one that goes on from another with what changed."""
+    values = np.where(np.isnan(age_days)[..., None], np.nan, np.log([0.5, 0.5])).astype(np.float32)
+    path = folder / "belief.zarr"
+    create_belief(path, SHAPE, LEGEND, goes_on=old_class is not None)
+    for top in range(0, SHAPE[0], 64):
+        rows = slice(top, top + 64)
+        write_belief_tile(path, (top, 0), values[rows], age_days[rows], np.ones(SHAPE, np.float32)[rows])
+        if old_class is not None:
+            write_changes_tile(path, (top, 0), old_class[rows])
+    if old_class is not None:
+        write_changes(path, seat_shares(old_class), 8)
+
+
+def seat_shares(old_class: np.ndarray) -> np.ndarray:
+    """(15, 20) shares of pixels that changed, of seats of 8 px."""
+    return (old_class != UNLABELLED).reshape(15, 8, 20, 8).mean(axis=(1, 3), dtype=np.float32)
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    """A posed survey of a small field."""
+    return Run(Archive.open(tmp_path / "archive"))
+
+
+@pytest.fixture
+def stores(tmp_path: Path) -> tuple[StageRef, StageRef]:
+    """A class map of two halves, the right one unknown in its upper part, and a coarse mosaic that brightens down."""
+    classes = np.zeros(SHAPE, np.uint8)
+    classes[:, 80:] = 1
+    classes[:30, 80:] = UNLABELLED
+    confidence = np.where(classes == UNLABELLED, np.nan, 0.25 + 0.5 * (classes == 1)).astype(np.float32)
+    found = ClassMap(classes, confidence, LEGEND.names, LEGEND.colours)
+    write_class_map(tmp_path / "map" / "class_map.zarr", found)
+    believe(tmp_path / "map", np.zeros(SHAPE, np.float32))
+    rows, columns = SHAPE[0] // 4, SHAPE[1] // 4
+    writer = MosaicWriter(
+        tmp_path / "mosaic" / "mosaic.zarr",
+        (rows, columns),
+        np.array([460.0, 550.0, 640.0, 800.0]),
+        grid=AngularGrid(1e-4, SHAPE, 4),
+    )
+    values = np.linspace(0.1, 0.9, rows)[:, None, None] * np.ones((rows, columns, 4))
+    values[:5, :5] = np.nan
+    writer.write_tile(0, 0, values, np.ones((rows, columns)))
+    return StageRef("segment", "m", tmp_path / "map"), StageRef("rectify", "r", tmp_path / "mosaic")
+
+
+def draw(run: Run, stores: tuple[StageRef, StageRef]) -> StageRef:
+    """Run the stage as an engine would."""
+    return ground.produce(run.archive, ground.needed(run, *stores))[0]
+
+
+def grid_of(run: Run) -> GroundGrid:
+    """The map's grid."""
+    grid = survey_grid(cast("SurveyRun", run))
+    assert grid is not None
+    return grid
+
+
+def test_what_is_unknown_has_no_confidence_on_the_map_either(
+    run: Run, stores: tuple[StageRef, StageRef], tmp_path: Path
+) -> None:
+    """Single pixels of the class unknown among pixels that are sure: none is lent the confidence of those beside it."""
+    classes = np.zeros(SHAPE, np.uint8)
+    classes[40:70:3, 50:90:3] = 1
+    confidence = np.where(classes == 1, np.nan, 0.9).astype(np.float32)
+    legend = (("crop", "unknown"), np.array([[0, 255, 0], [255, 0, 255]], np.uint8))
+    write_class_map(tmp_path / "strange" / "class_map.zarr", ClassMap(classes, confidence, *legend))
+    believe(tmp_path / "strange", np.where(classes == 1, np.nan, 0).astype(np.float32))
+    found = load_ground_map(draw(run, (StageRef("segment", "s", tmp_path / "strange"), stores[1])).path / STORE)
+    assert (found.classes == 1).sum() > 50
+    np.testing.assert_array_equal(np.isnan(found.confidence), found.classes != 0)
+    np.testing.assert_array_equal(np.isnan(found.age_days), found.classes != 0)
+
+
+def test_without_ground_nothing_is_written(run: Run, stores: tuple[StageRef, StageRef]) -> None:
+    """No pose is no map; a pose that looks at the sky is refused by its name."""
+    assert ground(replace(run, settings=Settings()), *stores) is None
+    assert run.archive.refs() == []
+    sky = Settings(pose=replace(POSE, tilt_deg=-30.0))
+    with pytest.raises(PoseError, match=r"no ray of the field meets the ground .*tilt_deg -30"):
+        draw(replace(run, settings=sky), stores)
+    assert run.archive.refs() == []
+
+
+def test_map_and_picture_lie_where_the_rays_end(run: Run, stores: tuple[StageRef, StageRef]) -> None:
+    """Each scene pixel's class is found where its ray meets the ground; the mosaic's ramp rises towards the rig."""
+    ref = draw(run, stores)
+    found = load_ground_map(ref.path / STORE)
+    grid = grid_of(run)
+    y, x = pixel_places(SHAPE)
+    points = np.stack(np.meshgrid(y[10:-10:9], x[10:-10:9], indexing="ij"), axis=-1).reshape(-1, 2)
+    places = grid.frame.ground_to_map(grid.frame.view.scene_to_ground(points))
+    column, row = (np.floor(part).astype(int) for part in ~found.geobox.affine * places.T)
+    wanted = np.where(points[:, 1] < 0, 0, np.where(points[:, 0] < y[30], UNLABELLED, 1))
+    assert found.classes[row, column].tolist() == wanted.tolist()
+    sure = found.confidence[row, column]
+    np.testing.assert_array_equal(np.isnan(sure), wanted == UNLABELLED)
+    assert sure[wanted == 1] == pytest.approx(0.75)
+    ref = draw(run, stores)
+    found = load_ground_map(ref.path / STORE)
+    tones = coarse_colours(stores[1])
+    assert np.nanmin(tones) >= 1
+    assert np.isnan(tones[:5, :5]).all()
+    seen = found.picture.max(axis=2) > 0
+    assert 0.3 < seen.mean() < 0.95
+    assert not seen[0, 0]
+    row, column = np.nonzero(seen)
+    along = row * np.cos(np.deg2rad(25)) - column * np.sin(np.deg2rad(25))  # towards the rig on a north-up map
+    assert np.corrcoef(along, found.picture[row, column, 0])[0, 1] > 0.95
+
+
+def field_pixels(run: Run, found: GroundMap) -> tuple[np.ndarray, np.ndarray]:
+    """Whether each pixel of a map is in the field, and the row and column of the field's pixel that it shows."""
+    places = grid_of(run).scene_pixels(*(slice(0, size) for size in found.classes.shape))
+    seen = np.isfinite(places[..., 0])
+    return seen, np.floor(places[seen] + 0.5).astype(int).T
+
+
+def test_age_and_changes_are_those_of_the_pixel_that_is_shown(
+    run: Run, stores: tuple[StageRef, StageRef], tmp_path: Path
+) -> None:
+    """Of a second visit: days, share of the patch and old class are no blend of neighbours; what is unknown is NaN."""
+    rng = np.random.default_rng(3)
+    age = 0.125 * rng.integers(0, 400, SHAPE).astype(np.float32)
+    age[rng.random(SHAPE) < 0.1] = np.nan
+    old = np.where(rng.random(SHAPE) < rng.random((1, SHAPE[1])), UNLABELLED, rng.integers(0, 2, SHAPE))
+    write_class_map(tmp_path / "later" / "class_map.zarr", load_class_map(stores[0].path / "class_map.zarr"))
+    believe(tmp_path / "later", age, old.astype(np.uint8))
+    ref = draw(run, (StageRef("segment", "l", tmp_path / "later"), stores[1]))
+    found = load_ground_map(ref.path / STORE)
+    seen, (row, column) = field_pixels(run, found)
+    assert found.changed is not None
+    assert found.old_class is not None
+    np.testing.assert_array_equal(found.age_days[seen], age[row, column])
+    np.testing.assert_array_equal(found.old_class[seen], old[row, column])
+    np.testing.assert_array_equal(found.changed[seen], seat_shares(old)[row // 8, column // 8])
+    for image in (found.age_days, found.changed):
+        assert np.isnan(image[~seen]).all()
+    assert (found.old_class[~seen] == UNLABELLED).all()
+
+
+def test_a_first_look_has_ages_and_no_changes(run: Run, stores: tuple[StageRef, StageRef]) -> None:
+    """All that is seen was looked at today; to plain xarray there is nothing about a change."""
+    ref = draw(run, stores)
+    found = load_ground_map(ref.path / STORE)
+    seen, _ = field_pixels(run, found)
+    assert (found.age_days[seen] == 0).all()
+    assert np.isnan(found.age_days[~seen]).all()
+    with xr.open_zarr(ref.path / STORE, consolidated=False) as content:
+        assert not {"changed", "changed_from"} & set(content)
+        assert content["age"].attrs["units"] == "days"
+
+
+def test_the_store_has_hectares_and_where_it_was_seen_from(run: Run, stores: tuple[StageRef, StageRef]) -> None:
+    """Areas are sums of footprints at any resolution; plain xarray reads pose, counts of pixels and CRS."""
+    ref = draw(replace(run, settings=Settings(pose=POSE, map=MapChoice(resolution_m=0.02))), stores)
+    areas = load_ground_map(ref.path / STORE).areas
+    grid = grid_of(run)
+    exact = grid.frame.view.area_m2(np.stack(np.meshgrid(*pixel_places(SHAPE), indexing="ij"), axis=-1))
+    assert areas["weed"]["m2"] == pytest.approx(exact[:, :80].sum(), rel=1e-12)
+    assert areas["crop"]["m2"] == pytest.approx(exact[30:, 80:].sum(), rel=1e-12)
+    assert areas["crop"]["ha"] == pytest.approx(areas["crop"]["m2"] / 10_000)
+    ref = draw(replace(run, settings=Settings(pose=POSE, map=MapChoice(epsg=25832))), stores)
+    with xr.open_zarr(ref.path / STORE, consolidated=False) as content:
+        assert content.attrs["proj:code"] == "EPSG:25832"
+        assert content.attrs["rig_pose"]["tilt_deg"] == 50.0
+        assert content.attrs["scene_pixels"] == {"mapped_px": 120 * 160, "beyond_reach_px": 0, "no_ground_px": 0}
+
+
+def test_the_key_follows_pose_and_map(run: Run, stores: tuple[StageRef, StageRef]) -> None:
+    """The same pose finds its store; another tilt or resolution makes another."""
+    changed = [
+        run.settings,
+        replace(run.settings, pose=replace(POSE, tilt_deg=51.0)),
+        replace(run.settings, map=MapChoice(resolution_m=0.01)),
+        run.settings,
+    ]
+    refs = [draw(replace(run, settings=settings), stores) for settings in changed]
+    keys = [ref.key for ref in refs]
+    assert keys[0] == keys[3]
+    assert len(set(keys)) == 3

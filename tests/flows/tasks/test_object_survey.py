@@ -1,0 +1,184 @@
+"""A survey into a bucket: the same map as in a folder, nothing twice, on this machine or another."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from storage.remote.opening import open_archive
+
+pytest.importorskip("obstore", reason="obstore is not installed (extra s3)")
+
+import spectralzoom
+from flows.publish.run_folder import Published
+from flows.tasks.survey import STAGES
+from pipeline.errors import SceneError
+from storage.archive.archive import Archive
+from storage.arrays.class_maps import load_class_map
+from storage.remote.object_archive import ObjectArchive
+from storage.remote.object_stores import Objects
+from tests.conftest import Survey
+from tests.flows.conftest import FEW_BANDS, CommandLine
+from tests.remembered_work import with_effects
+
+pytestmark = pytest.mark.usefixtures("no_effects")
+
+SMALL = ("--size", "96x64", "--bands", FEW_BANDS, "--no-controls", "--engine", "plain")
+CACHED = {"cached", "skipped"}
+
+
+def states(receipt: dict[str, object]) -> set[str]:
+    """What became of the stages."""
+    rows = receipt["stages"]
+    assert isinstance(rows, list)
+    assert len(rows) == len(STAGES)
+    return {row["state"] for row in rows}
+
+
+def map_of(archive: Archive, published: Published) -> NDArray[np.uint8]:
+    """The class map that a survey left."""
+    return load_class_map(archive.locate(published.receipt["products"]["class_map"])).classes
+
+
+def test_a_rerun_makes_nothing_and_moves_next_to_nothing(
+    bucket: str, survey_png: Survey, surveyed_png: Survey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The map is that of a folder; here, and on a machine that has nothing yet, a rerun finds every stage."""
+    opened: list[Objects] = []
+    start = Objects.__init__
+    monkeypatch.setattr(Objects, "__init__", lambda self, *given: (start(self, *given), opened.append(self))[0])
+    with with_effects():  # as the survey beside it has them
+        first = survey_png(bucket)
+    stored = sum(open_archive(bucket).stored_bytes(ref) for ref in open_archive(bucket).refs())
+    beside = map_of(open_archive(tmp_path / "folder"), surveyed_png(tmp_path / "folder"))
+    np.testing.assert_array_equal(map_of(open_archive(bucket), first), beside)
+    opened.clear()
+    again = survey_png(bucket)
+    assert states(again.receipt) <= CACHED
+    (objects,) = opened
+    reports = sum(path.stat().st_size for path in again.folder.iterdir())
+    assert objects.traffic.sent < reports + 2000
+    assert objects.traffic.received < 100_000  # manifests: stores are not fetched
+    assert objects.traffic.received < stored / 2
+    assert objects.traffic.requests < 40
+    monkeypatch.setenv("SPECTRALZOOM_WORK", str(tmp_path / "elsewhere"))
+    elsewhere = survey_png(bucket)
+    assert states(elsewhere.receipt) <= CACHED
+    assert elsewhere.folder != again.folder
+    np.testing.assert_array_equal(map_of(open_archive(bucket), elsewhere), beside)
+    monkeypatch.setenv("SPECTRALZOOM_WORK", str(tmp_path / "a desk"))
+    run = spectralzoom.open(bucket).latest
+    np.testing.assert_array_equal(run.class_map, beside)
+    assert run.report.is_file()
+
+
+def test_verbs_read_an_archive_in_a_bucket(
+    bucket: str, command_line: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """survey, plan, ls, explain, verify, compare, reprocess and gc take s3://bucket/prefix where they take a folder."""
+    monkeypatch.chdir(tmp_path)
+    assert command_line("plan", "--out", bucket, *SMALL[:5]).code == 0
+    ended = command_line("survey", "--out", bucket, *SMALL, "--json")
+    assert (ended.code, ended.errors) == (0, [])
+    receipt = json.loads(ended.out)
+    monkeypatch.setenv("SPECTRALZOOM_WORK", str(tmp_path / "elsewhere"))
+    plan = json.loads(command_line("plan", "--out", bucket, *SMALL[:5], "--json").out)
+    assert plan["to_make"] == 0
+    listed = json.loads(command_line("ls", bucket, "--json").out)
+    assert listed["archive"] == bucket
+    (run,) = listed["runs"]
+    assert run["state"] == "there"
+    tree = json.loads(command_line("explain", bucket, "class_map", "--json").out)
+    assert tree["product"].startswith("stages/segment/")
+    assert json.loads(command_line("verify", bucket, "--json").out)["problems"] == []
+    assert command_line("survey", "--out", bucket, *SMALL).code == 0
+    compared = json.loads(command_line("compare", bucket, "previous", "latest", "--json").out)
+    assert compared["differing"]["pixels"] == 0
+    assert Path(compared["picture"]).parent == tmp_path
+    again = json.loads(command_line("reprocess", bucket, "--json").out)
+    assert [row["state"] for row in again["fields"]] == ["skipped"]
+    cleared = json.loads(command_line("gc", bucket, "--keep-days", "0", "--json").out)
+    assert (cleared["removals"], cleared["obstacle"]) == ([], None)
+    assert receipt["settings"]["out"] == bucket
+
+
+def rot_mosaic(address: str) -> None:
+    """Let a bit of the mosaic's numbers flip in the bucket."""
+    archive = open_archive(address)
+    assert isinstance(archive, ObjectArchive)
+    name = next(name for name in archive.objects.listing("stages/rectify") if "/values/c/" in name)
+    content = bytearray(archive.objects.read(name) or b"")
+    content[100] ^= 1
+    archive.objects.write(name, bytes(content))
+
+
+def test_a_flipped_bit_is_named_and_written_again(bucket: str, survey_png: Survey, command_line: CommandLine) -> None:
+    """verify names store and array, exit code 1; --repair writes the file again from this machine's working copy."""
+    survey_png(bucket)
+    rot_mosaic(bucket)
+    ended = command_line("verify", bucket, "--json")
+    (problem,) = json.loads(ended.out)["problems"]
+    assert ended.code == 1
+    assert problem["problem"].endswith("(its SHA-256 differs) (mosaic.zarr/values: all of it)")
+    repaired = command_line("verify", bucket, "--repair", "--json")
+    assert repaired.code == 0
+    assert json.loads(repaired.out)["repair"]["remade"] == [problem["uri"]]
+    assert command_line("verify", bucket).code == 0
+
+
+def test_a_broken_store_is_made_again_where_no_copy_is(
+    bucket: str, survey_png: Survey, command_line: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another machine surveys again what it lacks; where that fails, all is put back as it was."""
+    published = survey_png(bucket)
+    before = map_of(open_archive(bucket), published)
+    rot_mosaic(bucket)
+    monkeypatch.setenv("SPECTRALZOOM_WORK", str(tmp_path / "elsewhere"))
+    with monkeypatch.context() as patch:
+        patch.setattr("flows.publish.survey_command.open_run", _refuse)
+        failed = json.loads(command_line("verify", bucket, "--repair", "--json").out)
+    assert len(failed["repair"]["put_back"]) == len(failed["to_remake"])
+    assert len(json.loads(command_line("verify", bucket, "--json").out)["problems"]) == 1
+    repaired = command_line("verify", bucket, "--repair", "--json")
+    assert repaired.code == 0
+    assert json.loads(repaired.out)["repair"]["complete"]
+    assert command_line("verify", bucket).code == 0
+    np.testing.assert_array_equal(map_of(open_archive(bucket), published), before)
+
+
+def _refuse(*given: object, **more: object) -> None:
+    raise SceneError("the scene is gone")
+
+
+def test_cubes_go_into_a_bucket_and_exports_come_out(
+    bucket: str, survey_png: Survey, tmp_path: Path, command_line: CommandLine, scene_files: Path
+) -> None:
+    """Ingested once and found again; the catalogue is that of a folder, called after the prefix."""
+    words = ("ingest", scene_files / "cube.npy", bucket, "--wavelengths", "450,500,550,600,650,700", "--json")
+    records = [json.loads(command_line(*words).out) for _ in range(2)]
+    assert [record["cached"] for record in records] == [False, True]
+    assert records[0]["uri"] == records[1]["uri"]
+    survey_png(bucket)
+    ended = command_line("export", bucket, "-o", tmp_path / "export", "--json")
+    assert (ended.code, ended.errors) == (0, [])
+    assert "class_map" in json.loads(ended.out)["files"]
+    assert json.loads((tmp_path / "export" / "collection.json").read_text())["id"] == bucket.rpartition("/")[2]
+
+
+def test_a_bucket_that_cannot_be_reached_is_one_error(
+    bucket: str, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No traceback, a cause and what to do; the exit code is 1, and 2 for an address that is none."""
+    missing = command_line("survey", "--out", "s3://no-such-bucket/x", *SMALL)
+    assert missing.code == 1
+    assert "there is no such bucket: create it" in missing.errors[0]
+    monkeypatch.setattr("storage.remote.object_stores.RETRIES", 0)
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
+    silent = command_line("ls", bucket)
+    assert silent.code == 1
+    assert "cannot be reached: check the network and AWS_ENDPOINT_URL" in silent.errors[0]
+    assert command_line("ls", "s3://").code == 2

@@ -1,0 +1,182 @@
+"""A mirror that looks beside the plan: what is laid out for it, found, put right and told."""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from flows.publish.receipt_words import sentences
+from flows.publish.survey_command import run_survey
+from flows.settings.load import load_settings, parse_settings
+from flows.tasks.capture_plan import plan_capture
+from flows.tasks.stages.maps import patch_columns
+from models.network.spectral import SpectralBasis
+from models.reading.inference import Glance
+from pipeline.errors import SettingsError
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import Sweep
+from pipeline.planning.coverage import coarse_sweeps, full_sweeps, reach_px
+from pipeline.simulator.effects.pointing import PointingErrors
+from storage.archive.keys import StageRef
+from storage.arrays.layout import open_group, read_array
+from storage.arrays.mosaics import PatchWriter
+from tests.flows.conftest import FEW_BANDS
+from tests.remembered_work import without_effects
+
+OFF_PX, SEED = 6.0, 0
+
+
+@pytest.fixture(scope="module")
+def surveyed(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
+    """Receipt and archive of a farm in two strips, seen by such a mirror."""
+    archive = tmp_path_factory.mktemp("pointing")
+    flags = {
+        "scene": "farm",
+        "size": "768x512",
+        "bands": FEW_BANDS,
+        "effects": "rotation,slit,smear,vignetting,shot,read-noise",  # without blur, lines far apart are not alike
+        "seed": str(SEED),
+        "budget": "0.7",
+        "pointing_px": str(OFF_PX),
+        "out": str(archive),
+        "engine": "plain",
+        "controls": False,
+    }
+    with without_effects():
+        found = run_survey(load_settings(None, flags), Console(quiet=True)).receipt
+    return json.loads(json.dumps(found)), archive
+
+
+def test_sweeps_are_put_right_by_seams_and_on_the_mosaic(surveyed: tuple[dict[str, Any], Path]) -> None:
+    """What registration finds beside the sweep it held is what the simulator got wrong, within half a pixel."""
+    pointing, errors = surveyed[0]["pointing"], PointingErrors(OFF_PX, 0.0, SEED)
+    coarse = pointing["coarse"]
+    assert len(coarse["sweeps"]) > 1
+    for name, offset in coarse["sweeps"].items():
+        assert np.abs(errors.offset(name) - errors.offset(coarse["held"]) - offset).max() < 0.4
+    assert coarse["residual_rms_px"] is None  # windows are no more than unknowns: that they fit says nothing
+    held = errors.offset(coarse["held"])
+    told = {
+        name: offset for name, offset in pointing["fine"]["sweeps"].items() if name not in pointing["fine"]["not_found"]
+    }
+    assert told
+    for name, offset in told.items():
+        assert np.abs(errors.offset(name) - held - offset).max() < 0.5
+
+
+def test_what_the_mirror_missed_is_told_and_detail_still_helps(surveyed: tuple[dict[str, Any], Path]) -> None:
+    """Seats seen in part are counted, either pass has its sentence, and with patches the map is better than without."""
+    receipt, archive = surveyed
+    values = read_array(open_group(archive / receipt["products"]["patches"]), "values")
+    partly = np.isnan(values).all(axis=3).any(axis=(1, 2))
+    assert receipt["pointing"]["fine"]["partly_seen"] == np.count_nonzero(partly)
+    words = " ".join(sentences(surveyed[0]))
+    assert "The coarse sweeps were put right by up to" in words
+    assert "The fine sweeps were put right by up to" in words
+    accuracy = surveyed[0]["accuracy"]
+    assert accuracy["miou"] > accuracy["none"]["miou"]
+
+
+def test_unseen_pixels_take_the_coarse_look(tmp_path: Path) -> None:
+    """What no line reached of a seat has the columns of the coarse pixel over it; a seat never seen is left out."""
+    grid = SceneGrid(12, 16, 4, 2)
+    weights = SimpleNamespace(
+        basis=SpectralBasis(500, 700, 2), columns=lambda v, nm: v, normalisation=SimpleNamespace(most_value=np.inf)
+    )
+    seats = np.array([1, 6, 7])
+    values = np.random.default_rng(0).normal(size=(3, 4, 4, 2)).astype(np.float16)
+    values[0, :3, 1:], values[1] = np.nan, np.nan
+    coarse = np.random.default_rng(1).normal(size=(*np.array(grid.padded_shape) // 2, 2)).astype(np.float32)
+    writer = PatchWriter(tmp_path / "patches.zarr", seats, grid.seat_origin(seats), 4, np.array([500.0, 700.0]))
+    writer.write(values, np.asarray(np.isfinite(values).all(axis=-1), np.bool_))
+    run = SimpleNamespace(grid=grid, weights=weights, scene=SimpleNamespace(wavelength_nm=np.array([500.0, 700.0])))
+    seen = Glance(grid, coarse, np.empty(0, np.float32))
+    told, columns = patch_columns(run, StageRef("patches", "k", tmp_path), seen)  # type: ignore[arg-type]
+    assert told.tolist() == [1, 7]
+    np.testing.assert_allclose(columns[1], values[2], rtol=1e-3)
+    np.testing.assert_allclose(columns[0][:, 0], values[0][:, 0], rtol=1e-3)
+    np.testing.assert_allclose(columns[0][3], values[0][3], rtol=1e-3)
+    over = coarse[:2, 2:4].repeat(2, axis=0).repeat(2, axis=1)  # seat 1 begins at row 0, column 4
+    np.testing.assert_array_equal(columns[0][:3, 1:], over[:3, 1:])
+
+
+def found_of(**told: Any) -> dict[str, Any]:
+    """What a survey says of one pass."""
+    nothing: dict[str, Any] = {
+        "held": "a",
+        "sweeps": {"a": [0.0, 0.0]},
+        "residual_rms_px": None,
+        "not_found": [],
+        "too_narrow": [],
+    }
+    return {"pointing": {"prior_px": 5.0, "coarse": {**nothing, **told}}}
+
+
+TOLD: dict[str, tuple[dict[str, Any], str]] = {
+    "one sweep": ({}, "The coarse pass is one sweep, which has no seam to be put right by."),
+    "put right": (
+        {"sweeps": {"a": [0, 0], "b": [3, -4]}, "residual_rms_px": 0.123},
+        "The coarse sweeps were put right by up to 5.0 px; 0.12 px rms are left at the seams.",
+    ),
+    "nothing left": ({"sweeps": {"a": [0, 0], "b": [3, -4]}}, "The coarse sweeps were put right by up to 5.0 px."),
+    "none found": (
+        {"held": "the mosaic", "sweeps": {"b": [0, 0]}, "not_found": ["b"]},
+        "Nothing could be told of b: left where the mirror reported.",
+    ),
+    "partly seen": (
+        {"sweeps": {"a": [0, 0], "b": [3, -4]}, "too_narrow": [{}], "partly_seen": 7},
+        "The coarse sweeps were put right by up to 5.0 px. 1 overlaps were too narrow to compare. 7 chosen places were "
+        "not seen whole; what is missing of them is mapped by the coarse look.",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", TOLD)
+def test_every_finding_has_its_sentence(case: str) -> None:
+    """One sweep, corrections, residuals, what could not be told and what was missed are each said once."""
+    told, words = TOLD[case]
+    assert sentences(found_of(**told)) == [words]
+
+
+GRID = SceneGrid(300, 1500, 16, 4)
+OFF = 20.0
+
+
+def shared_px(sweeps: list[Sweep]) -> float:
+    """The least that neighbouring strips share [px]."""
+    camera = parse_settings({}).camera
+    reach = [one.strip_px + reach_px(one.strip_px, GRID.height, camera, one.binning) for one in sweeps]
+    return min(float(left[1] - right[0]) for left, right in pairwise(reach))
+
+
+def test_either_pass_overlaps_and_reaches_by_what_it_needs() -> None:
+    """Neighbours that look as far apart as they can share 64 px, and both ends of the field are seen."""
+    plan = plan_capture(parse_settings({"pointing_px": OFF, "budget": 1.0}), GRID)
+    assert plan.along == "x"
+    assert (plan.overlap_px, plan.margin_px) == (2 * OFF + 64 * 4, 2 * OFF)
+    assert shared_px(plan.coarse) >= plan.overlap_px - 1e-3
+    assert shared_px(plan.full) >= 2 * OFF + 64 - 1e-3
+    assert len(plan.full) == int(np.ceil(1500 / (640 - 2 * OFF - 64)))
+    for sweep in (*plan.coarse, *plan.full):
+        held = sweep.held_px()
+        assert held[0, 0] <= -GRID.height / 2 - 2 * OFF
+        assert held[-1, -1] >= GRID.height / 2 + 2 * OFF
+
+
+def test_a_mirror_that_is_believed_costs_nothing() -> None:
+    """Neither overlaps nor margins nor words; overlaps of a whole line are refused with what could be put right."""
+    settings = parse_settings({"budget": 1.0})
+    plan = plan_capture(settings, GRID)
+    assert plan.overlap_px == 0
+    assert plan.full == full_sweeps(GRID, settings.camera, plan.along)
+    assert plan.coarse == coarse_sweeps(GRID, settings.camera, plan.along)
+    with pytest.raises(SettingsError, match=r"^--pointing-px 192: .* overlap by 640 px .* give less than 192$"):
+        plan_capture(parse_settings({"pointing_px": 192.0}), GRID)
+    assert sentences(found_of(held="the mosaic", sweeps={})) == []

@@ -1,0 +1,168 @@
+"""Lines rendered ahead: the same whoever renders them in whatever blocks, in order, few at a time, errors in turn."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flows.tasks.stages.capture import take_lines
+from pipeline.errors import RigError, SceneError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep
+from pipeline.simulator import render, simulated
+from pipeline.simulator.effects.registry import BY_NAME, effects_on
+from pipeline.simulator.rig_model import Rig
+from pipeline.simulator.scenes.scene import raster_from_values
+from pipeline.simulator.simulated import SimulatedSource
+from pipeline.source import Line
+from storage.arrays.spool import Spool
+from storage.parallel.crew import Crew
+
+CAMERA = LineCamera(samples=48)
+SWEEP = Sweep("s", "fine", "x", strip_px=0.0, start_px=-35.0, lines=70)
+TWO = Crew("threads", 2)
+
+
+def source_of(*effects: str) -> SimulatedSource:
+    """A rig before a small scene of three bands, with some exact effects, or with all that there are."""
+    values = np.random.default_rng(1).random((60, 90, 3))
+    scene = raster_from_values(values, CAMERA, name="t", wavelength_nm=np.linspace(450, 850, 3))
+    return SimulatedSource(scene, Rig(CAMERA), seed=5, chosen=effects_on(*(effects or BY_NAME)))
+
+
+def taken(source: SimulatedSource, crew: Crew, first: int = 0, at_once: int = 16) -> list[Line]:
+    """All lines from the first on."""
+    lines: list[Line] = []
+    take_lines(source, SWEEP, lines.append, crew, first=first, at_once=at_once)
+    return lines
+
+
+def assert_same(lines: list[Line], expected: list[Line]) -> None:
+    """Number by number, and all that is known of each."""
+    assert [line.number for line in lines] == [line.number for line in expected]
+    for line, same in zip(lines, expected, strict=True):
+        np.testing.assert_array_equal(line.data, same.data)
+        assert replace(line, data=same.data) == same
+
+
+@pytest.fixture(scope="module")
+def expected() -> list[Line]:
+    """What the source gives by itself."""
+    return list(source_of().lines(SWEEP))
+
+
+@pytest.mark.parametrize(
+    ("scheduler", "workers", "size"),
+    [  # crews without this process's memory, even of a scheduler that is not there, leave it to threads here
+        *(("threads", 1, 64), ("threads", 2, 1), ("threads", 2, 70), ("threads", 5, 7)),
+        *(("processes", 2, 16), ("tcp://192.0.2.1:8786", 2, 16)),
+    ],
+)
+def test_neither_crew_nor_blocks_change_a_number(
+    expected: list[Line], monkeypatch: pytest.MonkeyPatch, scheduler: str, workers: int, size: int
+) -> None:
+    """With every effect on, in blocks of 1, 7, 64 and all lines, with nothing remembered from before."""
+    monkeypatch.setattr(simulated, "BLOCK_LINES", size)
+    render._looker.cache_clear()
+    assert_same(taken(source_of(), Crew(scheduler, workers), at_once=size), expected)
+
+
+@pytest.mark.parametrize("first", [23, 69, 70])
+def test_a_capture_goes_on_from_any_line(expected: list[Line], first: int) -> None:
+    """The lines are those of an unbroken capture; after the last there is none."""
+    assert_same(taken(source_of(), TWO, first), expected[first:])
+
+
+def test_the_spool_gets_the_same_bytes(tmp_path: Path) -> None:
+    """Numbers and index of one worker's capture and of three workers' are the same files."""
+    source = source_of("rotation", "shot")
+    for workers in (1, 3):
+        with Spool.open(tmp_path / str(workers), 48, 3, header={}) as spool:
+            take_lines(source, SWEEP, spool.append, Crew("threads", workers))
+    for name in ("lines.bil", "lines.index"):
+        assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "3" / name).read_bytes()
+
+
+def test_blocks_wait_for_earlier_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first ends last of those begun: the others wait for it, and only one more is begun than there are workers."""
+    real, others, begun = SimulatedSource.lines_of, threading.Semaphore(0), []
+
+    def unfair(self: SimulatedSource, sweep: Sweep, numbers: range) -> list[Line]:
+        begun.append(numbers.start)
+        if numbers.start:
+            others.release()
+        else:
+            for _ in range(3):
+                assert others.acquire(timeout=30)
+            assert sorted(begun) == [0, 7, 14, 21]
+        return real(self, sweep, numbers)
+
+    monkeypatch.setattr(SimulatedSource, "lines_of", unfair)
+    lines = taken(source_of("rotation"), Crew("threads", 3), at_once=7)
+    assert [line.number for line in lines] == list(range(70))
+
+
+@pytest.mark.parametrize("workers", [2, 4])
+def test_few_blocks_are_held(monkeypatch: pytest.MonkeyPatch, workers: int) -> None:
+    """One a worker is rendered at a time, and one more waits at most to be taken, however slowly lines are."""
+    real, guard, begun, count = SimulatedSource.lines_of, threading.Lock(), [], 0
+    now = held = most = 0
+
+    def counted(self: SimulatedSource, sweep: Sweep, numbers: range) -> list[Line]:
+        nonlocal now, most
+        with guard:
+            begun.append(numbers)
+            now, most = now + 1, max(most, now + 1)
+        lines = real(self, sweep, numbers)
+        with guard:
+            now -= 1
+        return lines
+
+    def take(line: Line) -> None:
+        nonlocal held, count
+        held = max(held, len(begun) - count // 2)
+        count += 1
+
+    monkeypatch.setattr(SimulatedSource, "lines_of", counted)
+    take_lines(source_of("rotation"), SWEEP, take, Crew("threads", workers), at_once=2)
+    assert (count, len(begun)) == (70, 35)
+    assert 1 <= most <= workers
+    assert held <= workers + 1
+
+
+@pytest.mark.parametrize("workers", [2, 4])
+def test_an_error_comes_when_it_is_its_turn(monkeypatch: pytest.MonkeyPatch, workers: int) -> None:
+    """Lines before the first block that fails are taken, and its error is told: no later one's."""
+    real: Callable[..., list[Line]] = SimulatedSource.lines_of
+
+    def failing(self: SimulatedSource, sweep: Sweep, numbers: range) -> list[Line]:
+        if numbers[-1] >= 30:
+            raise SceneError(f"line {numbers.start} and on")
+        return real(self, sweep, numbers)
+
+    monkeypatch.setattr(SimulatedSource, "lines_of", failing)
+    lines: list[Line] = []
+    with pytest.raises(SceneError, match="line 28 and on"):
+        take_lines(source_of("rotation"), SWEEP, lines.append, Crew("threads", workers), at_once=7)
+    assert [line.number for line in lines] == list(range(28))
+
+
+@pytest.mark.parametrize("error", [RigError("disk full"), KeyboardInterrupt()])
+def test_nothing_is_rendered_after_lines_are_refused(error: BaseException) -> None:
+    """A full disk or Ctrl-C at a line ends the capture there, and no thread goes on."""
+    lines, before = [], threading.active_count()
+
+    def take(line: Line) -> None:
+        if line.number == 40:
+            raise error
+        lines.append(line.number)
+
+    with pytest.raises(type(error)):
+        take_lines(source_of("rotation"), SWEEP, take, TWO, at_once=7)
+    assert lines == list(range(40))
+    assert threading.active_count() == before

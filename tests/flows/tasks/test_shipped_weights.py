@@ -1,0 +1,175 @@
+"""Files of weights: those that come with SpectralZoom are small and good; those without hashes are told of."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+from safetensors.torch import load_file, save_file
+
+from flows.cli import main as cli
+from flows.evaluate import command as evaluate_command
+from flows.evaluate.command import run_evaluate
+from flows.evaluate.frames import EvaluateRequest
+from flows.settings.load import load_settings
+from flows.tasks.run import open_run
+from flows.tasks.stages.accuracy import columns_of_all_seats
+from flows.tasks.survey_model import PLAIN_STEPS, shipped_weights, weights_offered, weights_path
+from models.evaluation.metrics import mean_iou
+from models.evaluation.placement import Controls, run_controls
+from models.reading.inference import glance
+from models.weights.files import UNSEALED, Weights, content_key, describe_weights, load_weights
+from models.weights.sealed_files import SEAL, TENSORS
+from pipeline.errors import BudgetError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.planning.coverage import coarse_sweeps, full_sweeps
+from pipeline.planning.plain_scans import ScanRecord
+from pipeline.rectify.region import mosaic_rows
+from pipeline.simulator.rig_model import Rig
+from pipeline.simulator.scenes.farm.farm_plan import CLASSES
+from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, farm_scene
+from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
+from tests.flows.small_fields import write_field, write_weights
+
+PATH = shipped_weights()
+SHAPE = (512, 640)  # smaller farms hold too few pixels of rare classes to rank placements by them
+
+
+@pytest.fixture(scope="module")
+def weights() -> Weights:
+    """The shipped weights."""
+    return load_weights(PATH)
+
+
+@pytest.fixture(scope="module")
+def controls(weights: Weights) -> Controls:
+    """Placements judged on a farm that training has not seen, through the exact rays of the simulated rig."""
+    camera, scene = LineCamera(), farm_scene(41, SHAPE)
+    grid = SceneGrid(*SHAPE, weights.config.patch, weights.config.factor)
+    source = SimulatedSource(scene, Rig(camera), 41)
+    coarse = [SimulatedSweep(source, sweep) for sweep in coarse_sweeps(grid, camera, "x")]
+    mosaic = np.concatenate([rows for _, rows, _ in mosaic_rows(coarse, camera, grid, rows=64)])
+    columns = columns_of_all_seats(
+        source, full_sweeps(grid, camera, "x"), grid, weights, memory=2**30, kernel="catmull-rom"
+    )
+    seen = glance(weights, mosaic, scene.wavelength_nm, grid)
+    return run_controls(weights, seen, columns, np.asarray(scene.labels), share=0.35, seed=41)
+
+
+def test_file_is_sealed_small_and_tells_its_making(weights: Weights) -> None:
+    """Hashes, the key of before, at most 8 MB; command, seed, law of the data, and figures of scenes not trained on."""
+    assert describe_weights(PATH).sealed
+    assert content_key(PATH) == "1e1fce42c3bb18c27d7d"
+    assert PATH.stat().st_size <= 8e6
+    assert weights.record["command"].startswith("spectralzoom train farm")
+    assert weights.record["data"] == FARM_LAW
+    assert weights.record["settings"]["seed"] == 0
+    assert weights.record["validation"]["entropy"]["miou"] > 0.8
+    assert weights.class_names == tuple(entry for entry in CLASSES)
+    split = weights.record["split"]
+    assert not set(split["train"]) & set(split["validation"])
+
+
+def test_plain_scans_have_weights_of_their_own() -> None:
+    """Their coarse pixels are 2 px wide; what they know of scans is what surveys take them for."""
+    plain, two_passes = (describe_weights(shipped_weights(plain=which)) for which in (True, False))
+    assert (plain.config.factor, two_passes.config.factor) == (2, 4)
+    assert plain.class_names == two_passes.class_names
+    assert ScanRecord.read(plain.record["scans"]).steps == PLAIN_STEPS
+    assert all(plain.config.factor % step == 0 for step in PLAIN_STEPS)
+    assert set(two_passes.record["split"]["validation"]) == set(plain.record["split"]["validation"])
+
+
+@pytest.mark.parametrize(
+    ("asked", "plain"),
+    [
+        ({"budget": "0.5"}, [False]),
+        ({"scan_step": "1"}, [True]),
+        ({"scan_step": "2", "compute": "25%"}, [True]),
+        ({"scan_step": "4"}, [False]),
+        ({"seconds": "9"}, [True, False]),
+    ],
+)
+def test_the_look_says_which_weights_read_it(asked: dict[str, str], plain: list[bool]) -> None:
+    """One's own are taken for all; of the house's those that know lines so far apart."""
+    assert weights_offered(load_settings(None, asked)) == tuple(shipped_weights(plain=which) for which in plain)
+    own = load_settings(None, {**asked, "weights": "mine.safetensors"})
+    assert weights_offered(own) == (Path("mine.safetensors"),)
+
+
+@pytest.mark.parametrize(("seconds", "factor", "step"), [(3.5, 2, 2), (2.4, 4, 4)])
+def test_who_has_few_seconds_gets_the_weights_that_read_fewer_lines(
+    tmp_path: Path, seconds: float, factor: int, step: int
+) -> None:
+    """Every 2nd line of 640 x 512 px takes 2.6 s at least; in less every 4th is read by those that know it."""
+    run = open_run(
+        load_settings(None, {"seconds": str(seconds), "size": "640x512", "out": str(tmp_path)}), planning=True
+    )
+    assert (run.described.config.factor, run.settings.scan_step) == (factor, step)
+    assert weights_path(run.settings) == shipped_weights(plain=factor == 2)
+    assert run.settings.weights is None
+
+
+def test_seconds_that_no_weights_have_a_scan_for_are_refused(tmp_path: Path) -> None:
+    """With the least of those weights that read the fewest lines."""
+    asked = load_settings(None, {"seconds": "1", "size": "640x512", "out": str(tmp_path / "a")})
+    with pytest.raises(BudgetError, match=r"--seconds 1; the least is .*every 4th line"):
+        open_run(asked)
+    assert not (tmp_path / "a").exists()
+
+
+def test_detail_where_the_map_is_unsure_beats_chance(controls: Controls) -> None:
+    """At K = 35 % entropy is above random by more than its spread, and more than half of the way to all."""
+    rows = controls.as_dict()
+    assert rows["entropy"]["miou"] > rows["random"]["miou"] + rows["random"]["spread"]
+    none, every = mean_iou(controls.none), mean_iou(controls.every)
+    assert every - none > 0.05
+    assert mean_iou(controls.policies["entropy"]) > (none + every) / 2
+
+
+SAID = "was made before weights had hashes: damage to its numbers cannot be told; to add them now: spectralzoom seal "
+
+
+@pytest.fixture
+def earlier(tmp_path: Path) -> Path:
+    """Small weights as an earlier version wrote them."""
+    path = write_weights(tmp_path / "w.safetensors")
+    about = {name: value for name, value in describe_weights(path).about.items() if name not in (TENSORS, SEAL)}
+    save_file(load_file(path), path, {"about": json.dumps({**about, "format": UNSEALED}, sort_keys=True)})
+    return path
+
+
+def test_a_survey_says_so_until_they_are_sealed(
+    earlier: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One note with the command; its stages keep their keys."""
+    data = write_field(tmp_path / "data")
+    flags = {"scene": str(data / "images" / "001_image.png"), "weights": str(earlier), "out": str(tmp_path / "a")}
+    settings = load_settings(None, {**flags, "budget": 1})
+    before = open_run(settings)
+    assert [note for note in before.notes if SAID in note] == [f"w.safetensors {SAID}{earlier}"]
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["seal", str(earlier)])
+    assert (ended.value.code, capsys.readouterr().err) == (0, f"{earlier}: sealed\n")
+    after = open_run(settings)
+    assert not any(SAID in note for note in after.notes)
+    assert after.weights_key == before.weights_key
+
+
+def test_evaluate_says_so_and_sealing_needs_files(
+    earlier: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """After the figures; without a file one message, exit code 2."""
+    told = io.StringIO()
+    monkeypatch.setattr(evaluate_command, "evaluate_weights", lambda request, show: {"files": [], "data_notes": []})
+    request = EvaluateRequest("data", (earlier,))
+    run_evaluate(request, Console(file=told, width=500), as_json=True)
+    assert f"note: w.safetensors {SAID}{earlier}" in told.getvalue()
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["seal"])
+    assert (ended.value.code, capsys.readouterr().err[:30]) == (2, "error: seal needs files of wei")

@@ -1,0 +1,311 @@
+"""Every stage of a survey fails once by its words and once by a bug: message, exit code, archive, and the next run."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flows.cli.main import main
+from flows.publish import run_folder as publish
+from flows.schedule.field_schedule import moment_words
+from flows.schedule.serve_command import load_fields
+from flows.schedule.times import parse_timetable
+from flows.tasks import prefect_engine as engine
+from flows.tasks.stage import Stage, Wanted
+from flows.tasks.survey import STAGES
+from pipeline.errors import ArchiveError, RigError
+from storage.archive.archive import Archive
+from storage.archive.ledger import Ledger
+from storage.arrays.class_maps import load_class_map
+from tests.flows.conftest import Ended, problems
+
+pytestmark = pytest.mark.usefixtures("no_effects")
+
+RECORDED_S = 30.0  # in which a server has heard of a task that ended
+CAPTURES = ("capture_coarse", "capture_fine")
+NO_REPLY = "no reply from the camera after 2 s; is it on?"
+FULL_DISK = "cannot write to the archive: no space left; make room"
+
+
+def refusal(stage: str) -> RigError | ArchiveError:
+    """What a device says of a capture, and a disk of any other stage."""
+    return RigError(NO_REPLY) if stage in CAPTURES else ArchiveError(FULL_DISK)
+
+
+def failing(stage: str, error: Exception, tried: Callable[[], None] = lambda: None) -> Stage:
+    """The stage, failing when its files are written and not yet published; at once where it has nothing to do."""
+    real = STAGES[stage]
+
+    def fail(*given: Any) -> Wanted:
+        tried()
+        wanted = real(*given)
+        if wanted is None:
+            raise error
+
+        def broken(path: Path) -> None:
+            wanted.build(path)
+            raise error
+
+        return replace(wanted, build=broken)
+
+    return replace(real, wants=fail)
+
+
+def class_map(out: Path) -> np.ndarray:
+    """The one class map of an archive."""
+    (ref,) = Archive.open(out).refs("segment")
+    return load_class_map(ref.path / "class_map.zarr").classes
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What was left when a stage had failed: how the command ended, keys of stores, and what is wrong with them."""
+
+    ended: Ended
+    keys: frozenset[str]
+    problems: list[Any]
+
+
+@dataclass
+class Walk:
+    """One archive on which the same survey was asked for until every stage had failed twice; then it went through."""
+
+    undisturbed: Path
+    out: Path
+    keys: dict[str, str]  # of each stage that makes a store, of the undisturbed survey
+    bugs: dict[str, Trial]
+    refusals: dict[str, Trial]
+    builds: Counter[str]
+    last: dict[str, str]  # states of the run that nothing disturbed
+
+
+@pytest.fixture(scope="module")
+def walk(
+    tmp_path_factory: pytest.TempPathFactory, survey_png: Any, surveyed_png: Any, scene_files: Path, weights: Path
+) -> Walk:
+    """The same command again and again, each stage in turn failing by a bug and then by its words."""
+    folder = tmp_path_factory.mktemp("failures")
+    receipt = surveyed_png(folder / "undisturbed").receipt
+    keys = {stage["name"]: stage["key"] for stage in receipt["stages"] if stage["state"] == "ran"}
+    found = Walk(folder / "undisturbed", folder / "archive", keys, {}, {}, Counter(), {})
+    scene = ["--scene", scene_files / "scene.png", "--labels", scene_files / "labels.png", "--weights", weights]
+    words = ["survey", *scene, "--engine", "plain", "--budget", "0.8", "--no-controls", "--out", found.out]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tempfile, "tempdir", str(folder))
+        for stage in STAGES:
+            patch.setitem(STAGES, stage, counted(stage, found.builds))
+        for stage in STAGES:
+            for trials, error in ((found.bugs, KeyError("north")), (found.refusals, refusal(stage))):
+                with pytest.MonkeyPatch.context() as broken:
+                    broken.setitem(STAGES, stage, failing(stage, error))
+                    ended = command(words)
+                stores = frozenset(ref.key for ref in Archive.open(found.out).refs())
+                trials[stage] = Trial(ended, stores, problems(found.out))
+        receipt = survey_png(found.out).receipt
+        found.last.update({stage["name"]: stage["state"] for stage in receipt["stages"]})
+    return found
+
+
+def counted(stage: str, builds: Counter[str]) -> Stage:
+    """The stage, counting how often its store is made."""
+    real = STAGES[stage]
+
+    def count(*given: Any) -> Wanted | None:
+        wanted = real(*given)
+        if wanted is None:
+            return None
+
+        def made(path: Path) -> None:
+            builds[stage] += 1
+            wanted.build(path)
+
+        return replace(wanted, build=made)
+
+    return replace(real, wants=count)
+
+
+def command(words: list[Any]) -> Ended:
+    """Run ``spectralzoom`` in this process."""
+    out, err = io.StringIO(), io.StringIO()
+    with redirect_stdout(out), redirect_stderr(err), pytest.raises(SystemExit) as exit_:
+        main([str(word) for word in words])
+    return Ended(int(exit_.value.code or 0), out.getvalue(), err.getvalue())
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_stage_that_fails_is_one_message(stage: str, walk: Walk) -> None:
+    """The words of the error, or of a bug in which file its traceback is; the archive holds the stores before it."""
+    before = list(STAGES)[: list(STAGES).index(stage)]
+    for trial in (walk.refusals[stage], walk.bugs[stage]):
+        assert (trial.ended.code, trial.ended.out, len(trial.ended.errors)) == (1, "", 1)
+        assert "Traceback" not in trial.ended.err
+        assert trial.problems == []
+        assert trial.keys == {walk.keys[name] for name in before if name in walk.keys}
+    assert walk.refusals[stage].ended.errors == [str(refusal(stage))]
+    told, _, file = walk.bugs[stage].ended.errors[0].partition("please report ")
+    assert told == "KeyError: 'north'; this is a defect of SpectralZoom: "
+    assert "in broken" in Path(file).read_text() or stage not in walk.keys
+
+
+def test_the_survey_goes_on_as_if_nothing_had_been(walk: Walk) -> None:
+    """Each store was begun three times, twice to fail; the run at last reads all but the last, and draws the map."""
+    assert walk.builds == dict.fromkeys(walk.keys, 3)
+    assert {name for name, state in walk.last.items() if state == "ran"} == {"evaluate"}
+    np.testing.assert_array_equal(class_map(walk.out), class_map(walk.undisturbed))
+    archive = Archive.open(walk.out)
+    assert {ref.key for ref in archive.refs()} == set(walk.keys.values())
+    assert (len(archive.runs()), problems(walk.out)) == (1, [])
+    assert not [*walk.out.rglob("*.part"), *walk.out.glob("spool/*")]
+
+
+def test_a_run_that_cannot_be_drawn_is_not_published(
+    walk: Walk, tmp_path: Path, survey_png: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pictures and receipt come after the last stage: without them there is no run; the next one reads every store."""
+    out = Path(shutil.copytree(walk.undisturbed, tmp_path / "archive"))
+    before = Archive.open(out).runs()
+
+    def refuse(*given: Any) -> None:
+        raise ArchiveError(FULL_DISK)
+
+    with monkeypatch.context() as broken:
+        broken.setattr(publish, "draw_quicklook", refuse)
+        with pytest.raises(ArchiveError, match="no space left"):
+            survey_png(out)
+    assert (Archive.open(out).runs(), problems(out)) == (before, [])
+    states = {stage["state"] for stage in survey_png(out).receipt["stages"]}
+    assert states == {"cached", "skipped"}
+    assert (len(Archive.open(out).runs()), problems(out)) == (len(before) + 1, [])
+
+
+@pytest.fixture(scope="module")
+def server(prefect_home: Path) -> Iterator[None]:
+    """Flows run on the server that surveys of this process share, without the heartbeat that costs a second each."""
+    from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
+
+    with temporary_settings(updates={PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}):
+        yield
+
+
+def newest_run(flow: str, count: int) -> tuple[Any, dict[str, Any]]:
+    """The newest run of a flow, and its ``count`` task runs by their names, as soon as the server has them ended.
+
+    It hears of tasks by events, of the last one after the flow has ended.
+    """
+    from prefect.client.orchestration import get_client
+    from prefect.client.schemas.filters import FlowFilter, FlowFilterName, FlowRunFilter, FlowRunFilterId
+    from prefect.client.schemas.sorting import FlowRunSort
+
+    with get_client(sync_client=True) as client:
+        named = FlowFilter(name=FlowFilterName(any_=[flow]))
+        (run,) = client.read_flow_runs(flow_filter=named, sort=FlowRunSort.START_TIME_DESC, limit=1)
+        of_it, latest = FlowRunFilter(id=FlowRunFilterId(any_=[run.id])), time.monotonic() + RECORDED_S
+        tasks = client.read_task_runs(flow_run_filter=of_it)
+        while time.monotonic() < latest and not (
+            len(tasks) >= count and all(task.state is not None and task.state.is_final() for task in tasks)
+        ):
+            time.sleep(0.2)
+            tasks = client.read_task_runs(flow_run_filter=of_it)
+    return run, {task.name: task for task in tasks}
+
+
+@pytest.mark.parametrize(("stage", "after", "tries"), [("capture_fine", "attend", 3), ("draw_map", "cut_patches", 1)])
+def test_a_stage_that_fails_by_prefect(
+    stage: str, after: str, tries: int, server: None, survey_png: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Task and flow are Failed with the message, the task named by stage and field; a device was asked again.
+
+    Prefect draws an arrow to it, from the stage before that made something.
+    """
+    tried: list[str] = []
+    error = refusal(stage)
+    monkeypatch.setitem(STAGES, stage, failing(stage, error, lambda: tried.append(stage)))
+    monkeypatch.setattr(engine, "RETRY_DELAY_S", 0.0)
+    with pytest.raises(type(error), match=str(error)[:20]):
+        survey_png(tmp_path, engine="prefect")
+    before = list(STAGES)[: list(STAGES).index(stage)]
+    run, tasks = newest_run("survey", len(before) + 1)
+    assert (run.name, run.state.type.value) == ("survey-scene", "FAILED")
+    assert str(error) in run.state.message
+    assert tasks.keys() == {f"{name}-scene" for name in (*before, stage)}
+    assert {tasks[f"{name}-scene"].state.type.value for name in before} == {"COMPLETED"}
+    failed = tasks[f"{stage}-scene"]
+    assert failed.state.type.value == "FAILED"
+    assert str(error) in failed.state.message
+    assert (len(tried), failed.run_count) == (tries, tries)
+    assert [given.id for given in failed.task_inputs["after"]] == [tasks[f"{after}-scene"].id]
+    assert problems(tmp_path) == []
+
+
+def test_a_due_run_of_which_a_stage_fails(
+    server: None,
+    scene_files: Path,
+    weights: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    served: Callable[..., Path],
+) -> None:
+    """The scheduled flow ends Failed with the stage's words alone, the ledger has them, and no run is published."""
+    from flows.schedule.prefect_flows import survey_scheduled
+
+    out, file = tmp_path / "archive", tmp_path / "north.toml"
+    file.write_text(f'scene = "{scene_files / "scene.png"}"\nweights = "{weights}"\nbudget = 0.8\nout = "{out}"\n')
+    (one,) = load_fields([file])
+    due = datetime.now(UTC).replace(microsecond=0) - timedelta(seconds=1)
+    cron = {"cron": f"{due.minute} {due.hour} {due.day} {due.month} *", "timezone": "UTC"}
+    table, due = parse_timetable(cron["cron"], None, "UTC"), due.replace(second=0)
+    told = {"event": "opened", "at": moment_words(due - timedelta(minutes=1)), "late": 0.5, "pid": 1}
+    one.schedule(table, 0.5).ledger.append({**told, "schedule": table.to_dict()})
+    served(file, late=0.5, cron=cron["cron"])
+    with monkeypatch.context() as broken:
+        broken.setitem(STAGES, "cut_patches", failing("cut_patches", refusal("cut_patches")))
+        state = survey_scheduled("north", moment_words(due), return_state=True)
+    run, tasks = newest_run("survey", list(STAGES).index("cut_patches") + 1)
+    assert (state.is_failed(), state.message, run.name) == (True, FULL_DISK, "survey-north")
+    assert tasks["cut_patches-north"].state.type.value == "FAILED"
+    line = Ledger(one.archive, "north").lines()[-1]
+    assert (line["event"], line["reason"]) == ("failed", FULL_DISK)
+    assert (Archive.open(out).runs(), problems(out)) == ([], [])
+
+
+def test_a_reprocessing_of_which_a_stage_fails(
+    server: None,
+    walk: Walk,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    field_file: Callable[..., Path],
+    served: Callable[..., Path],
+) -> None:
+    """It ends Failed and says where the reason stands; the next one makes what was missing, and completes."""
+    from flows.schedule.prefect_flows import reprocess_archive
+
+    out = Path(shutil.copytree(walk.undisturbed, tmp_path / "archive"))
+    served(field_file(out=str(out)), every="1h")
+    archive = Archive.open(out)
+    (missing,) = archive.refs("segment")
+    archive.discard(missing)
+    with monkeypatch.context() as broken:
+        broken.setitem(STAGES, "draw_map", failing("draw_map", refusal("draw_map")))
+        state = reprocess_archive(archive=str(out), return_state=True)
+    run, _ = newest_run("reprocess", 0)
+    assert (state.is_failed(), run.name, run.state.message) == (True, f"reprocess-{out}", state.message)
+    assert state.message == "no field could be reprocessed; reprocess-TIME.json beside the archive says why"
+    (summary,) = tmp_path.glob("reprocess-*.json")
+    assert [row["message"] for row in json.loads(summary.read_text())["fields"]] == [FULL_DISK]
+    assert archive.find("segment", missing.key) is None
+    state = reprocess_archive(archive=str(out), return_state=True)
+    assert (state.is_completed(), state.message, problems(out)) == (True, "done", [])
+    np.testing.assert_array_equal(class_map(out), class_map(walk.undisturbed))

@@ -1,0 +1,139 @@
+"""A stage's code does not change without its version: what an archive holds would otherwise pass for the new result.
+
+After a change, either raise the version of the stage's product, beside the stage (that of ingest in its command) or,
+where the change has no effect on what the stage writes, keep it; then record the code as it is:
+
+    python tests/flows/tasks/test_stage_versions.py
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import re
+import sys
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[3]
+sys.path[:0] = [str(ROOT)] if __name__ == "__main__" else []
+
+from flows.archive import ingest_command  # noqa: E402
+from flows.tasks.stage import all_stages, versions  # noqa: E402
+from tests.flows.tasks.stage_closure import Sources, Target, read_packages  # noqa: E402
+
+VERSIONS = {**versions(), ingest_command.STAGE: ingest_command.VERSION}
+RECORD = Path(__file__).with_name("stage_digests.json")
+LIGHT = ("farm_scene", "raster_from_values", "make_source")  # who looks at what: runs bring it, no stage names it
+BESIDES = {"effects": LIGHT, "capture": (*LIGHT, "field_source"), "evaluate": ("judged_labels",)}
+ROOTS = {ingest_command.STAGE: ("run_ingest",)}
+for _one in all_stages().values():
+    _function = f"{_one.wants.__module__}.{_one.wants.__name__}"
+    ROOTS[_one.product.name] = (*ROOTS.get(_one.product.name, BESIDES.get(_one.product.name, ())), _function)
+OF_RUNS = ("LineCamera", "SceneGrid", "AngularGrid", "CapturePlan")  # roots of every stage that is given a run
+BARRIERS = {
+    "Product": "the numbers that this test compares with",
+    "Settings": "values, which stand in the keys; what acts on them is reached where it does",
+    "CaptureRun": "what stages are given; what of it they do not name themselves is in OF_RUNS, LIGHT or their roots",
+    "SurveyRun": "as CaptureRun",
+    "Archive": "where stores are kept, and under which key; not what is in them",
+    "StageRef": "where a store lies",
+    "Crew": "who does the work: blocks are the same by threads, by processes and on a cluster",
+    "run_blocks": "as Crew",
+    "let_tiles_go": "gives memory back",
+    "read_manifest": "whether a store is whole",
+    "visible": "words of refusals",
+    "StageProgress": "what the terminal shows",
+    "ingest_command._print": "what the terminal shows",
+}
+
+
+@cache
+def sources() -> Sources:
+    """The code as it is."""
+    return Sources(read_packages(ROOT))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _code_is_no_garbage() -> Iterator[None]:
+    """It is half a million nodes: no search looks through them, neither now nor, for they go, in the tests after."""
+    gc.disable()
+    yield
+    sources.cache_clear()
+    gc.enable()
+
+
+def digest_of(stage: str, code: Sources) -> str:
+    """Hash of all code that the stage reaches."""
+    return code.digest(closure_of(stage, code))
+
+
+def closure_of(stage: str, code: Sources) -> set[Target]:
+    """Every definition that decides what the stage writes."""
+    return code.closure([*ROOTS[stage], *(OF_RUNS if stage != ingest_command.STAGE else ())], BARRIERS)
+
+
+def record() -> dict[str, dict[str, int | str]]:
+    """Version and digest of every stage, as the code is."""
+    return {stage: {"version": VERSIONS[stage], "digest": digest_of(stage, sources())} for stage in sorted(VERSIONS)}
+
+
+def test_an_edited_constant_concerns_the_stages_that_reach_it() -> None:
+    """Every stage is watched; how many dead pixels are filled in matters to those that show fields to the model."""
+    assert set(ROOTS) == set(VERSIONS)
+    module, name = sources().named("MOST_DEAD")
+    texts = read_packages(ROOT)
+    edited = re.sub(rf"^{name} = ", f"{name} = 0.5 * ", texts[module], flags=re.M)
+    assert edited != texts[module]
+    changed = sources().edited(module, edited)
+    concerned = {stage for stage in ROOTS if digest_of(stage, changed) != digest_of(stage, sources())}
+    assert concerned == {"attend", "segment", "evaluate"}
+
+
+@pytest.mark.parametrize("stage", sorted(VERSIONS))
+def test_code_changed_means_version_raised(stage: str) -> None:
+    """The code behind each stage is the code that its version was recorded for."""
+    recorded = json.loads(RECORD.read_text())[stage]
+    now = {"version": VERSIONS[stage], "digest": digest_of(stage, sources())}
+    assert now == recorded, f"raise VERSIONS[{stage!r}] or keep it, then run: python tests/flows/{Path(__file__).name}"
+
+
+@pytest.mark.parametrize("barrier", BARRIERS)
+def test_every_barrier_stands_in_a_way(barrier: str) -> None:
+    """A barrier that no stage meets any more goes."""
+    named = {to for stage in ROOTS for target in closure_of(stage, sources()) for to in sources().names(target)}
+    assert sources().named(barrier) in named
+
+
+@pytest.mark.parametrize(
+    ("stage", "names"),
+    {
+        "attend": ("SeatScorer", "encode_packed", "fill_dead", "received_attention", "attention_of_seats", "SceneGrid"),
+        "segment": ("encode_packed", "fill_dead", "MOST_DEAD", "Segmenter", "write_class_tile"),
+        "capture": ("RigSource", "CaptureRunner", "open_mirror", "HeadwallCamera", "fit_clocks", "EFFECTS"),
+        "patches": ("read_seats", "LineCache", "calibrate", "PatchWriter"),
+    }.items(),
+)
+def test_code_is_watched_however_it_is_reached(stage: str, names: tuple[str, ...]) -> None:
+    """What a stage calls through others is part of its code: the model's inside, the rig's drivers."""
+    assert {sources().named(name) for name in names} <= closure_of(stage, sources())
+
+
+def test_words_beside_the_code_concern_no_stage() -> None:
+    """Docstrings and comments may come and change anywhere."""
+    texts = {
+        module: "# A comment.\n"
+        + re.sub(r"^(    def .*:\n)(?= +[a-z])", r'\1        """New words."""\n', text, flags=re.M)
+        for module, text in read_packages(ROOT).items()
+    }
+    reworded = Sources({module: text.replace('"""Give ', '"""Hand over ') for module, text in texts.items()})
+    assert {stage: digest_of(stage, reworded) for stage in ROOTS} == {
+        stage: digest_of(stage, sources()) for stage in ROOTS
+    }
+
+
+if __name__ == "__main__":
+    RECORD.write_text(json.dumps(record(), indent=1) + "\n")

@@ -1,0 +1,359 @@
+"""The whole survey on the plain engine: receipt, stores as a stranger opens them, report, and pixels of no value."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import xarray as xr
+from PIL import Image
+from rich.console import Console
+
+from flows.publish.receipt import check_receipt, comparable
+from flows.publish.run_folder import Published
+from flows.publish.survey_command import run_survey
+from flows.settings.load import load_settings
+from flows.tasks.scene import open_scene
+from models.reading.inference import glance
+from models.weights.files import load_weights, save_weights
+from pipeline.errors import SceneError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import CostModel, Sweep
+from pipeline.planning.coverage import on_scene
+from pipeline.simulator.effects.registry import BY_NAME
+from storage.archive.archive import Archive
+from storage.arrays.class_maps import ClassMap, load_class_map
+from storage.remote.opening import verify_archive
+from tests.conftest import CLASSES, RGB_NM, patchy_scene, random_weights
+from tests.flows.conftest import FEW_BANDS, Page
+from tests.remembered_work import with_effects
+
+STAGES = [
+    "choose_effects",
+    "capture_coarse",
+    "locate",
+    "rectify",
+    "attend",
+    "capture_fine",
+    "cut_patches",
+    "draw_map",
+    "compare_turned",
+    "evaluate",
+]
+ON_REQUEST = ["register_coarse", "register_fine", "ground"]  # skipped without --pointing-px and [pose]
+FARM = (128, 192)
+
+
+@dataclass(frozen=True)
+class Done:
+    """A survey and the archive that it left."""
+
+    published: Published
+    archive: Path
+
+    @property
+    def receipt(self) -> Any:
+        """The receipt."""
+        return self.published.receipt
+
+    def open(self, product: str, inside: str = "") -> xr.Dataset:
+        """A product as a stranger opens it: plain xarray, nothing of this project."""
+        return xr.open_zarr(self.archive / self.receipt["products"][product] / inside, consolidated=False)
+
+    def sweeps(self) -> list[tuple[xr.Dataset, Path]]:
+        """Every stored raw sweep with its folder."""
+        folders = [self.archive / self.receipt["products"][name] for name in ("raw_coarse", "raw_fine")]
+        found = [path for folder in folders for path in sorted(folder.glob("*.zarr"))]
+        return [(xr.open_zarr(path, consolidated=False), path) for path in found]
+
+
+@pytest.fixture(scope="module")
+def farm(tmp_path_factory: pytest.TempPathFactory) -> Done:
+    """The built-in scene, small, with the weights that are shipped and with controls."""
+    out = tmp_path_factory.mktemp("farm")
+    size = {"size": f"{FARM[1]}x{FARM[0]}", "bands": FEW_BANDS}
+    flags = {**size, "budget": "0.9", "engine": "plain", "out": str(out), "seed": "1"}
+    return Done(run_survey(load_settings(None, flags), Console(quiet=True)), out)
+
+
+@pytest.fixture(scope="module")
+def picture(tmp_path_factory: pytest.TempPathFactory, surveyed_png: Any) -> Done:
+    """A PNG with labels, no controls."""
+    out = tmp_path_factory.mktemp("picture")
+    return Done(surveyed_png(out), out)
+
+
+def test_receipt_has_every_field(farm: Done) -> None:
+    """The built-in scene's receipt is whole: stages in order, all ran, accuracy with controls, effects."""
+    receipt = check_receipt(farm.receipt)
+    states = {stage["name"]: stage["state"] for stage in receipt["stages"]}
+    assert {name for name, state in states.items() if state == "skipped"} == set(ON_REQUEST)
+    assert [name for name, state in states.items() if state == "ran"] == STAGES
+    ran = [stage for stage in receipt["stages"] if stage["state"] == "ran"]
+    assert all(stage["wall_s"] > 0 and stage["peak_rss_bytes"] > 0 for stage in ran)
+    for stage in ran:
+        (manifest,) = farm.archive.glob(f"stages/*/{stage['key']}/manifest.json")
+        assert stage["manifest_sha256"] == hashlib.sha256(manifest.read_bytes()).hexdigest()
+    assert all(stage["manifest_sha256"] is None for stage in receipt["stages"] if stage["state"] == "skipped")
+    assert set(receipt["accuracy"]["controls"]) == {"gain", "entropy", "sobel", "random"}
+    assert 0 <= receipt["accuracy"]["miou"] <= 1
+    assert {row["name"] for row in receipt["effects"]} == set(BY_NAME)
+    assert receipt["effects_total"]["bound"] <= receipt["effects_total"]["tolerance"] == 0.1
+    assert 0 < farm.published.looked_twice < 1
+
+
+def test_all_maps_of_a_receipt_are_judged_over_the_classes_of_the_truth(farm: Done) -> None:
+    """This map, none and all have an IoU for the same classes and null for the others, in the store as well."""
+    accuracy: Any = farm.receipt["accuracy"]
+    (stored,) = farm.archive.glob("stages/evaluate/*/accuracy.json")
+    assert "NaN" not in stored.read_text()
+    scene, _ = open_scene(load_settings(None, {"size": f"{FARM[1]}x{FARM[0]}", "seed": "1"}))
+    truth = {scene.class_names[number] for number in np.unique(scene.labels)}
+    for one in (accuracy, accuracy["none"], accuracy["all"]):
+        known = {name: iou for name, iou in one["per_class_iou"].items() if iou is not None}
+        assert set(known) == truth
+        assert one["miou"] == pytest.approx(np.mean(list(known.values())))
+        assert not truth & set(one["false_classes"])
+
+
+def test_savings_add_up_and_ranks_follow_the_scores(farm: Done) -> None:
+    """Ratios are done over full and capture keeps the budget; of captured seats scores fall with the rank."""
+    savings = farm.receipt["savings"]
+    for name, entry in savings.items():
+        if name != "segment_wall_s":
+            assert entry["ratio"] == pytest.approx(entry["done"] / entry["full"]), name
+    assert savings["capture_s"]["done"] <= 0.9 * savings["capture_s"]["every_line_s"] + 1e-9
+    work = savings["multiply_adds"]
+    assert work["done"] == sum(work[part] for part in ("glance", "score", "encode", "decode"))
+    attention, patches = farm.open("attention"), farm.open("patches")
+    score, rank = attention["score"].values.ravel(), attention["rank"].values.ravel()
+    chosen = np.flatnonzero(rank >= 0)
+    assert set(chosen) == set(patches["seat"].values.tolist())
+    ordered = chosen[np.argsort(rank[chosen])]
+    assert (np.sort(rank[chosen]) == np.arange(len(chosen))).all()
+    assert (np.diff(score[ordered]) <= 0).all()
+
+
+@pytest.mark.parametrize("name", ["farm", "picture"])
+def test_savings_are_those_of_the_stored_cubes(name: str, request: pytest.FixtureRequest) -> None:
+    """Lines, samples on the scene and bytes are the cubes'; seconds are the cost model's price of either pass."""
+    done: Done = request.getfixturevalue(name)
+    savings, sweeps = done.receipt["savings"], done.sweeps()
+    shape = tuple(done.open("class_map").sizes[axis] for axis in ("y", "x"))
+    seen = [on_scene(shape, LineCamera(), Sweep(**cube.attrs["sweep"])) for cube, _ in sweeps]
+    assert savings["lines"]["done"] == sum(cube.sizes["line"] for cube, _ in sweeps)
+    assert savings["samples"]["done"] == sum(int(inside.sum()) for inside in seen)
+    assert savings["bytes_raw"]["done"] == sum(cube["dn"].nbytes for cube, _ in sweeps)
+    files = [file for _, path in sweeps for file in path.rglob("*") if file.is_file()]
+    assert savings["bytes_stored"]["done"] == sum(file.stat().st_size for file in files)
+    done: Done = request.getfixturevalue(name)
+    sweeps = [Sweep(**cube.attrs["sweep"]) for cube, _ in done.sweeps()]
+    passes = [[sweep for sweep in sweeps if sweep.kind == kind] for kind in ("coarse", "fine")]
+    assert all(passes)
+    seconds = sum(CostModel().seconds(part, LineCamera()) for part in passes)
+    assert done.receipt["savings"]["capture_s"]["done"] == pytest.approx(seconds)
+
+
+@pytest.mark.usefixtures("choosing_anew")
+def test_same_seed_gives_the_same_receipt(picture: Done, survey_png: Any, tmp_path: Path) -> None:
+    """In another archive, but for times and memory; another seed gives other light along the same path."""
+    again = survey_png(tmp_path / "again").receipt
+    with with_effects():
+        other = survey_png(tmp_path / "other", seed="1").receipt
+    assert comparable(again) == comparable(picture.receipt)
+    assert comparable(other) != comparable(picture.receipt)
+    keys = [{stage["name"]: stage["key"] for stage in receipt["stages"]} for receipt in (again, other)]
+    assert {name for name in STAGES if keys[0][name] == keys[1][name]} == {"locate"}
+
+
+def test_second_run_is_read_from_the_archive(survey_png: Any, surveyed_png: Any, tmp_path: Path) -> None:
+    """The same command again runs no stage, gives the same products, and publishes a run of its own."""
+    first, second = surveyed_png(tmp_path).receipt, survey_png(tmp_path).receipt
+    states = [stage["state"] for stage in second["stages"] if stage["name"] in STAGES]
+    assert states == ["cached"] * len(STAGES)
+    assert comparable(first) == comparable(second)
+    archive = Archive.open(tmp_path)
+    assert len(archive.runs()) == 2
+    assert [finding.problem for finding in verify_archive(archive)] == [None] * (len(STAGES) + 2)
+    assert not list(tmp_path.glob("spool/*"))
+
+
+def test_products_open_with_plain_xarray(farm: Done) -> None:
+    """Named axes, wavelengths in nm and GeoZarr's place; patches where seats were chosen; CF flags; facts of lines."""
+    mosaic, attention, patches, found = (farm.open(name) for name in ("mosaic", "attention", "patches", "class_map"))
+    assert (mosaic["values"].dims, mosaic["values"].dtype) == (("y", "x", "band"), np.float32)
+    assert (mosaic.sizes["y"], mosaic.sizes["x"]) == (FARM[0] // 4, FARM[1] // 4)
+    assert np.isfinite(mosaic["values"].values).all()
+    assert (mosaic["wavelength"].dims, mosaic["wavelength"].attrs["units"]) == (("band",), "nm")
+    assert mosaic.attrs["spatial:dimensions"] == ["y", "x"]
+    assert "CF" in mosaic.attrs["Conventions"]
+    assert patches["values"].dims == ("patch", "y", "x", "band")
+    assert attention["rank"].dims == ("seat_y", "seat_x")
+    across = attention.sizes["seat_x"]
+    np.testing.assert_array_equal(patches["seat_y"].values, patches["seat"].values // across * patches.sizes["y"])
+    assert np.isfinite(patches["values"].values[patches["valid"].values]).all()
+    names = found.attrs["class_names"]
+    assert (found["classes"].dims, (found.sizes["y"], found.sizes["x"])) == (("y", "x"), FARM)
+    assert found["classes"].attrs["flag_meanings"].split() == ["_".join(name.split()) for name in names]
+    assert set(names) == {*farm.receipt["accuracy"]["per_class_iou"], "unknown"}
+    known = found["classes"].values != names.index("unknown")  # which have a probability
+    assert ((found["confidence"].values[known] >= 0) & (found["confidence"].values[known] <= 1)).all()
+    for cube, _ in farm.sweeps():
+        assert (cube["dn"].dims, cube["dn"].dtype) == (("line", "sample", "band"), np.uint16)
+        for name in ("mirror_x", "mirror_y", "time", "exposure_ms", "valid_line"):
+            assert cube[name].dims == ("line",), name
+        assert (abs(cube["mirror_x"]) <= 1).all()
+        assert cube["exposure_ms"].values.tolist() == [100.0] * cube.sizes["line"]
+
+
+def test_without_a_fine_seat_the_map_is_the_glance(survey_png: Any, weights: Path, tmp_path: Path) -> None:
+    """A budget that pays for the coarse pass alone gives the class of the glance, brought up bilinearly."""
+    done = Done(survey_png(tmp_path, budget="0.45"), tmp_path)
+    assert done.published.looked_twice == 0
+    mosaic, drawn = done.open("mosaic"), done.open("class_map")["classes"].values
+    seen = glance(
+        load_weights(weights), mosaic["values"].values, mosaic["wavelength"].values, SceneGrid(*drawn.shape, 8, 4)
+    )
+    logits = torch.from_numpy(seen.probability).log().permute(2, 0, 1)[None]  # up to a constant a pixel
+    fine = torch.nn.functional.interpolate(logits, scale_factor=4.0, mode="bilinear", align_corners=False)
+    assert (fine.argmax(dim=1)[0].numpy() == drawn).mean() > 0.999
+    assert done.receipt["accuracy"]["miou"] == done.receipt["accuracy"]["none"]["miou"]
+
+
+@pytest.mark.usefixtures("no_effects")
+def test_what_is_not_judged_is_left_out(picture: Done, survey_png: Any, scene_files: Path, tmp_path: Path) -> None:
+    """Without controls neither other placements nor `all` are judged; without labels there is no accuracy."""
+    accuracy = picture.receipt["accuracy"]
+    assert accuracy["controls"] == {}
+    assert accuracy["all"]["miou"] is None
+    assert accuracy["gap_closed"] is None
+    assert accuracy["miou"] is not None
+    assert accuracy["none"]["miou"] is not None
+    assert "segment_wall_s" not in picture.receipt["savings"]
+    nm = "640,460,500,550,620,600"
+    found = survey_png(tmp_path, scene=str(scene_files / "cube.npy"), labels=None, wavelengths=nm, budget="1").receipt
+    assert "accuracy" not in check_receipt(found)
+    assert found["stages"][-1]["state"] == "skipped"
+    stored = Done(Published(found, tmp_path, 0.0), tmp_path).open("mosaic")["wavelength"].values
+    assert stored.tolist() == [float(word) for word in nm.split(",")]
+
+
+def test_products_are_where_the_receipt_says_and_open_from_disk(farm: Done) -> None:
+    """Addresses are relative; the report asks the network for nothing; the quicklook is of useful size."""
+    for name, address in farm.receipt["products"].items():
+        assert (farm.archive / address).exists(), name
+    assert (farm.published.folder / "receipt.json").read_text().startswith('{\n  "survey": "farm"')
+    folder = farm.archive / farm.receipt["products"]["report.html"]
+    html = folder.read_text(encoding="utf-8")
+    page = Page(html)
+    assert all(one.startswith("data:image/") for one in page.loaded)
+    assert not re.search(r"@import|url\(", html.partition("<script>")[0])
+    assert "data:image/png;base64," in html
+    with Image.open(farm.archive / farm.receipt["products"]["quicklook.png"]) as image:
+        assert image.format == "PNG"
+        assert min(image.size) >= 600
+
+
+def test_another_policy_looks_at_other_places(picture: Done, survey_png: Any, tmp_path: Path) -> None:
+    """The coarse pass is read from the archive; the seats follow the mask."""
+    mask = np.zeros((96, 128), np.uint8)
+    mask[:16] = 200  # the first two rows of seats
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    given = {"policy": "mask", "mask": str(tmp_path / "mask.png"), "budget": "0.7"}
+    done = Done(survey_png(picture.archive, **given), picture.archive)
+    states = {stage["name"]: stage["state"] for stage in done.receipt["stages"]}
+    assert (states["capture_coarse"], states["attend"]) == ("cached", "ran")
+    rank = done.open("attention")["rank"].values
+    assert (rank[0] >= 0).all() or (rank[1] >= 0).all()
+
+
+GAP = np.s_[20:31, 40:60]  # of 64 x 96 px
+
+
+def _scene(folder: Path, fill: float | None, toml: str = "") -> Path:
+    """A scene with a hole of ``fill``, labels beside it; whole where ``fill`` is None."""
+    folder.mkdir()
+    values, labels = patchy_scene((64, 96), 3, seed=4)
+    if fill is not None:
+        values[GAP] = fill
+    np.save(folder / "scene.npy", values.astype(np.float32))
+    np.save(folder / "labels.npy", labels)
+    (folder / "scene.toml").write_text(toml)
+    return folder / "scene.npy"
+
+
+def _survey(survey_png: Any, scene: Path, **flags: Any) -> Any:
+    labels, nm = str(scene.with_name("labels.npy")), ",".join(map(str, RGB_NM))
+    return survey_png(scene.parent / "a", scene=str(scene), labels=labels, wavelengths=nm, **flags)
+
+
+def _map(survey: Any, scene: Path) -> ClassMap:
+    return load_class_map(scene.parent / "a" / survey.receipt["products"]["class_map"])
+
+
+@pytest.mark.usefixtures("no_effects")
+def test_no_data_neither_darkens_nor_becomes_a_class(survey_png: Any, tmp_path: Path) -> None:
+    """The hole alone has none, the rest of the field is as light as without it, and the receipt counts the pixels."""
+    stated, whole = _scene(tmp_path / "stated", 1e30, "nodata = 1e30"), _scene(tmp_path / "whole", None)
+    one, plain = (_survey(survey_png, scene) for scene in (stated, whole))
+    drawn = _map(one, stated)
+    gap = np.zeros(drawn.classes.shape, np.bool_)
+    gap[GAP] = True
+    np.testing.assert_array_equal(drawn.classes == 255, gap)
+    np.testing.assert_array_equal(np.isnan(drawn.confidence), gap)
+    count = int(gap.sum())
+    assert one.receipt["pixels"] == {
+        "scene_without_a_value": count,
+        "coarse_px_no_reading": 0,
+        "fine_px_no_reading": 0,
+        "map_without_a_class": count,
+    }
+    assert one.receipt["accuracy"]["pixels"] == 64 * 96 - count
+    assert "pixels" not in plain.receipt
+    assert (_map(plain, whole).classes == drawn.classes)[~gap].mean() > 0.9  # light is what it was
+
+
+def test_no_data_that_nobody_stated_ends_a_survey(survey_png: Any, tmp_path: Path) -> None:
+    """In one message with its place, before anything is captured."""
+    scene = _scene(tmp_path / "s", 1e30)
+    said = r"scene.npy has 660 values, the first 1e\+30 at y 20, x 40, band 0, .* write nodata = 1e\+30 into a"
+    with pytest.raises(SceneError, match=said):
+        _survey(survey_png, scene)
+    assert not (scene.parent / "a").exists()
+
+
+@pytest.mark.usefixtures("no_effects")
+def test_readings_that_the_weights_cannot_take_are_counted(survey_png: Any, tmp_path: Path) -> None:
+    """Weights for numbers a million times smaller: no pixel can be read, which the receipt says."""
+    weights = random_weights(RGB_NM, CLASSES)
+    small = replace(weights.normalisation, centre=np.zeros(3, np.float32), spread=np.full(3, 1e-4, np.float32))
+    save_weights(replace(weights, normalisation=small), tmp_path / "w.safetensors")
+    scene = _scene(tmp_path / "s", None)
+    found = _survey(survey_png, scene, weights=str(tmp_path / "w.safetensors"), policy="sobel")
+    pixels = found.receipt["pixels"]
+    assert pixels["coarse_px_no_reading"] == 64 * 96 // 16
+    assert pixels["fine_px_no_reading"] >= 0
+    assert pixels["map_without_a_class"] == 0
+    store = scene.parent / "a" / Path(found.receipt["products"]["class_map"]).parent
+    assert json.loads((store / "strange.json").read_text())["coarse_px"] == 64 * 96 // 16
+
+
+@pytest.mark.usefixtures("no_effects")
+def test_scores_of_any_size_make_a_survey(survey_png: Any, tmp_path: Path) -> None:
+    """A mask of 1e307 buys what a mask of 1 does, without a warning."""
+    scene = _scene(tmp_path / "s", None)
+    mask = np.random.default_rng(0).uniform(0, 1, (64, 96))
+    bought = []
+    for power in (0, 1020):
+        np.save(tmp_path / "mask.npy", np.ldexp(mask, power))
+        found = _survey(survey_png, scene, policy="mask", mask=str(tmp_path / "mask.npy"), budget="0.9")
+        bought.append((found.receipt["savings"]["lines"]["done"], found.receipt["plan"]["score_share"]))
+    assert bought[0] == pytest.approx(bought[1])

@@ -1,0 +1,423 @@
+"""A survey through an emulated rig: the class map of the simulated source, and bad input told in one message."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+import flows.tasks.prefect_engine
+import flows.tasks.rig_field
+import flows.terminal.progress
+from flows.publish.run_folder import Published
+from flows.publish.survey_command import run_survey
+from flows.settings.load import load_settings
+from flows.settings.survey_settings import Settings
+from flows.tasks.run import make_source, open_run
+from flows.tasks.scene import open_scene
+from flows.tasks.stages.effects import chosen_effects
+from pipeline.errors import PoseError, SettingsError
+from pipeline.geometry.mirror import STRAIGHT, Mounting
+from pipeline.geometry.scan import Sweep, exposing
+from pipeline.rig.camera.camera_cubes import mean_frame
+from pipeline.rig.capture.capture_paths import REFERENCES
+from pipeline.rig.capture.capture_runner import RigDevices
+from pipeline.rig.devices import SYSTEM_CLOCK, DeviceGone
+from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock
+from pipeline.rig.emulator.fault_names import CameraFault, make_fault
+from pipeline.rig.emulator.scene_camera import REFERENCE_FRAMES, SceneView
+from pipeline.rig.mirror.pro_mode import Command
+from pipeline.rig.transports import SerialTransport
+from pipeline.simulator.effects.registry import effects_on
+from pipeline.simulator.scenes.scene import RasterScene, raster_from_values
+from pipeline.simulator.simulated import SimulatedSource
+from pipeline.source import References
+from storage.archive.archive import Archive
+from storage.arrays.class_maps import load_class_map
+from storage.arrays.cubes import open_raw_cube
+from storage.remote.opening import verify_archive
+from tests.conftest import patchy_scene
+from tests.flows.conftest import CommandLine
+from tests.pipeline.rig.in_process import InProcessRig, ManualClock
+from tests.remembered_work import without_effects
+
+QUIET = Console(quiet=True)
+SMALL: dict[str, Any] = {
+    "size": "128x128",
+    "bands": "40,90,150,200",
+    "engine": "plain",
+    "controls": False,
+    "budget": 0.8,
+    "rig.panel": 0.99,  # of the farm's white panel
+    "effects": "rotation,slit,smear,vignetting,shot,read-noise",
+}
+
+
+def small_settings(out: Path, **changed: Any) -> Settings:
+    """Settings of a tiny survey."""
+    return load_settings(None, {**SMALL, "out": str(out), **changed})
+
+
+@contextmanager
+def emulated(
+    settings: Settings,
+    effects: Any,
+    patch: pytest.MonkeyPatch,
+    *,
+    scene: RasterScene | None = None,
+    mounting: Mounting = STRAIGHT,
+) -> Iterator[EmulatedRig]:
+    """Devices of surveys are emulated ones before a scene, the settings' by default, with effects, mounted somehow."""
+    seen = open_scene(settings)[0] if scene is None else scene
+    source = replace(make_source(seen, settings), chosen=effects)
+    whole = EmulatedRig(source, ManualClock(10.0), wired=settings.rig.pulses, mounting=mounting)
+    with InProcessRig(whole) as line:
+
+        def open_devices(told: Settings, *_: object) -> RigDevices:
+            return line.devices(told.rig.mirror(told.cost.vector_pairs))
+
+        patch.setattr(flows.tasks.rig_field, "open_devices", open_devices)
+        yield whole
+
+
+def coarse_captures(rig: EmulatedRig) -> int:
+    """How often the camera was told to take coarse lines."""
+    return sum(said.startswith("capture(") and "coarse" in said for said in rig.camera.commands)
+
+
+def class_map_of(published: Published, out: Path) -> np.ndarray[Any, Any]:
+    """The survey's map, (y, x)."""
+    classes = load_class_map(out / published.receipt["products"]["class_map"]).classes
+    return np.asarray(classes)
+
+
+def rows_of(archive: Path, published: Published) -> dict[str, Any]:
+    """Numbers of all lines of a survey, by stage and sweep."""
+    found = {}
+    for name, folder in published.receipt["products"].items():
+        for path in sorted((archive / folder).glob("*.zarr")) if name.startswith("raw_") else ():
+            cube = open_raw_cube(path)
+            assert cube.valid_line.all()
+            found[f"{name} {path.stem}"] = cube.read(0, cube.sweep.lines)
+    return found
+
+
+def references_of_frames(patch: pytest.MonkeyPatch) -> None:
+    """Have the simulated source refer to the means of whole-numbered frames, as a camera's references are."""
+    exact = SimulatedSource.references
+
+    def references(source: SimulatedSource, sweep: Sweep) -> References:
+        if sweep.name == REFERENCES:  # what the frames are made of
+            return exact(source, sweep)
+        exposed = exposing(source.camera, sweep)
+        frames = SceneView(source).references((exposed.exposure_ms, exposed.frame_ms), REFERENCE_FRAMES)
+        dark, white = (
+            mean_frame(frames[name]).mean.reshape(-1, sweep.binning, len(source.wavelength_nm)).sum(axis=1)
+            for name in ("darkReference", "whiteReference")
+        )
+        return replace(exact(source, sweep), dark=dark, white=white)
+
+    patch.setattr(SimulatedSource, "references", references)
+
+
+def test_every_line_is_the_simulated_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By Prefect: coarse sweep, attention, plan and fine sweeps give each line of the simulated survey, and its map."""
+    with without_effects(), pytest.MonkeyPatch.context() as patch:  # but for those that it names
+        references_of_frames(patch)
+        simulated = run_survey(small_settings(tmp_path / "sim"), QUIET)
+    effects = chosen_effects(next(ref for ref in Archive.open(tmp_path / "sim").refs("effects")))
+    settings = small_settings(tmp_path / "rig", source="rig", visit="first", engine="prefect")
+    with emulated(settings, effects, monkeypatch):
+        published = run_survey(settings, QUIET)
+    expected = rows_of(tmp_path / "sim", simulated)
+    found = rows_of(tmp_path / "rig", published)
+    assert list(found) == list(expected)
+    assert len({name.split()[0] for name in found}) == 2
+    for name, rows in expected.items():
+        np.testing.assert_array_equal(found[name], rows, err_msg=name)
+    np.testing.assert_array_equal(class_map_of(published, tmp_path / "rig"), class_map_of(simulated, tmp_path / "sim"))
+
+
+def test_a_plain_scan_by_the_rig_is_the_simulated_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every second line, of a quarter of the exposure: each line, with references so exposed, and the map."""
+    scan = {"budget": None, "scan_step": "2", "scan_exposure_ms": "25"}
+    with without_effects(), pytest.MonkeyPatch.context() as patch:
+        references_of_frames(patch)
+        simulated = run_survey(small_settings(tmp_path / "sim", **scan), QUIET)
+    effects = chosen_effects(next(ref for ref in Archive.open(tmp_path / "sim").refs("effects")))
+    settings = small_settings(tmp_path / "rig", source="rig", visit="first", **scan)
+    with emulated(settings, effects, monkeypatch):
+        published = run_survey(settings, QUIET)
+    expected, found = rows_of(tmp_path / "sim", simulated), rows_of(tmp_path / "rig", published)
+    assert list(found) == list(expected) == ["raw_coarse scan-0"]
+    np.testing.assert_array_equal(found["raw_coarse scan-0"], expected["raw_coarse scan-0"])
+    np.testing.assert_array_equal(class_map_of(published, tmp_path / "rig"), class_map_of(simulated, tmp_path / "sim"))
+
+
+@pytest.fixture(scope="module")
+def straight(tmp_path_factory: pytest.TempPathFactory) -> tuple[Settings, Published]:
+    """A survey through a rig whose mirror is mounted straight."""
+    settings = small_settings(tmp_path_factory.mktemp("straight"), source="rig", visit="first", budget=0.5)
+    with pytest.MonkeyPatch.context() as patch, emulated(settings, {}, patch):
+        return settings, run_survey(settings, QUIET)
+
+
+@pytest.mark.parametrize("axes", ["-x,-y", "y,-x"], ids=["upside down", "turned"])
+def test_a_mirror_mounted_otherwise_gives_the_same_survey_once_it_is_told(
+    straight: tuple[Settings, Published], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, axes: str
+) -> None:
+    """Each line and the map are those of a straight rig; untold they are not, and telling it captures anew."""
+    usual, made = straight
+    untold = replace(usual, out=str(tmp_path / "mounted"))
+    told = replace(untold, rig=replace(usual.rig, mirror_axes=axes))
+    with emulated(usual, {}, monkeypatch, mounting=Mounting(axes)) as rig:
+        wrong = run_survey(untold, QUIET)
+        right = run_survey(told, QUIET)
+        assert coarse_captures(rig) == 2
+    expected, found, other = (
+        rows_of(Path(out), one) for out, one in ((usual.out, made), (told.out, right), (told.out, wrong))
+    )
+    assert list(found) == list(expected)
+    for name, rows in expected.items():
+        np.testing.assert_array_equal(found[name], rows, err_msg=name)
+    maps = [class_map_of(one, Path(out)) for one, out in ((made, usual.out), (right, told.out))]
+    np.testing.assert_array_equal(*maps)
+    coarse = "raw_coarse coarse-0"
+    assert (other[coarse] != expected[coarse]).mean() > 0.5
+
+
+def test_a_mounting_that_does_not_reach_the_field_is_refused_first(tmp_path: Path) -> None:
+    """Before anything moves: the mirror's rest lies where its range ends before the field does."""
+    beside = {"rig.mirror_offset_x": 0.5, "rig.mirror_offset_y": 0.5, "size": "6400x6400"}
+    with pytest.raises(PoseError, match=r"as mounted \(offset 0.5; 0.5\), .* outside the unit disk"):
+        open_run(small_settings(tmp_path, source="rig", **beside), planning=True)
+
+
+@pytest.mark.usefixtures("no_effects")
+def test_pulses_of_frames_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """One pulse a frame, as cameras give: fine lines are stepped by it, coarse ones lie where the mirror's log says."""
+    settings = small_settings(tmp_path, source="rig", visit="first", **{"rig.pulses": "frame", "effects": "none"})
+    with emulated(settings, {}, monkeypatch):
+        published = run_survey(settings, QUIET)
+    told = {
+        name: json.loads((tmp_path / published.receipt["products"][name] / "rig.json").read_text())["captures"]
+        for name in ("raw_coarse", "raw_fine")
+    }
+    assert {one["method"] for one in told["raw_coarse"]} == {"log"}
+    assert {one["method"] for one in told["raw_fine"]} == {"trigger"}
+    assert max(one["residual_px"] for one in told["raw_coarse"]) < 16  # a coarse line
+    truth = run_survey(small_settings(tmp_path / "sim", effects="none"), QUIET)
+    alike = class_map_of(published, tmp_path) == class_map_of(truth, tmp_path / "sim")
+    assert alike.mean() > 0.9
+    assert {finding.kind for finding in verify_archive(Archive.open(tmp_path))} == {"whole"}
+
+
+def test_log_beside_pulses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Every capture is tied by the edges in the mirror's log: lines are the planned ones, where it measured them."""
+    told = {"rig.log_pulses": True, "rig.log_samples": 16000, "effects": "none"}
+    settings = small_settings(tmp_path, source="rig", visit="first", **told)
+    with emulated(settings, {}, monkeypatch):
+        published = run_survey(settings, QUIET)
+    record = json.loads((tmp_path / published.receipt["products"]["raw_coarse"] / "rig.json").read_text())
+    assert record["rig"]["log_pulses"]
+    assert [one["method"] for one in record["captures"]] == ["log"]
+    assert all(one["drift_ppm"] is not None and one["residual_px"] < 2 for one in record["captures"])
+    assert {finding.kind for finding in verify_archive(Archive.open(tmp_path))} == {"whole"}
+
+
+def test_what_the_rig_is_at_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Long before the first line: the path goes up, lines are captured, files are fetched, each with how far it is."""
+    out = io.StringIO()
+    monkeypatch.setattr(flows.terminal.progress, "LINE_EVERY_S", -1.0)  # every word, as bars on a terminal show them
+    settings = small_settings(tmp_path, source="rig", visit="first", budget=0.5)
+    with emulated(settings, {}, monkeypatch):
+        run_survey(settings, Console(file=out, width=200))
+    told = [line.removeprefix("coarse sweep: 0% ") for line in out.getvalue().splitlines() if "sweep: 0% " in line]
+    kinds = [re.sub(r"\d[\d.]*", "N", words) for words in told]
+    wanted = ["path: N of N cells", "capturing: N of N s", "fetching: N of N MB"]
+    coarse = kinds[kinds.index(wanted[0]) :]  # behind the references
+    assert [kind for kind in dict.fromkeys(coarse) if kind in wanted] == wanted
+    assert any(re.fullmatch(r"fetching: (\d+\.\d) of \1 MB", words) for words in told)
+
+
+def test_visits_are_captured_and_broken_ones_gone_on_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A survey whose camera goes away is gone on with by the same command; another visit is captured anew.
+
+    The receipt says that nothing was simulated and holds no password; files of the camera go with the spool.
+    """
+    settings = small_settings(tmp_path, source="rig", visit="first", **{"rig.password": "secret", "budget": 0.5})
+    with emulated(settings, {}, monkeypatch) as rig:
+        rig.camera.faults.left.update({CameraFault.REFUSES_FILES: 3})
+        rig.camera.faults.passes = 6  # files: four of the references, two of the coarse sweep
+        with pytest.raises(DeviceGone, match="camera's file server"):
+            run_survey(settings, QUIET)
+        published = run_survey(settings, QUIET)
+        assert coarse_captures(rig) == 1
+        assert "effects" not in published.receipt
+        assert published.receipt["source"] == "rig"
+        assert published.receipt["settings"]["visit"] == "first"
+        assert "secret" not in (published.folder / "receipt.json").read_text()
+        assert not list((tmp_path / "spool").iterdir())
+        run_survey(replace(settings, visit="second"), QUIET)
+        assert coarse_captures(rig) == 2
+    assert {finding.kind for finding in verify_archive(Archive.open(tmp_path))} == {"whole"}
+
+
+def test_fields_that_differ_in_name_alone_are_captured_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """What a rig saw of one field is not taken for another of the same settings, nor captured twice for the same."""
+    settings = small_settings(tmp_path, source="rig", visit="first", budget=0.5, name="east")
+    with emulated(settings, {}, monkeypatch) as rig:
+        for name in ("east", "west", "east"):
+            run_survey(replace(settings, name=name), QUIET)
+        assert coarse_captures(rig) == 2
+
+
+def test_field_without_a_picture_is_surveyed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weights: Path):
+    """A field of which only size and bands are known: what the rig sees of it is mapped, and nothing judged."""
+    told = {"scene": "field", "bands": None, "wavelengths": "640,550,460", "weights": str(weights), "effects": None}
+    settings = small_settings(tmp_path, source="rig", **told)
+    scene = raster_from_values(
+        patchy_scene((128, 128), 3, 1)[0], settings.camera, name="x", wavelength_nm=np.array([640.0, 550.0, 460.0])
+    )
+    with emulated(settings, {}, monkeypatch, scene=scene):
+        published = run_survey(settings, QUIET)
+    assert len(np.unique(class_map_of(published, tmp_path))) > 1
+    assert published.receipt["scene"].startswith("field/")
+    assert published.receipt["settings"]["visit"]  # the date, so that a later survey is another look
+
+
+def test_survey_over_a_pty_and_sockets_gives_the_same_lines(tmp_path: Path):
+    """Devices behind a real pty, a control socket and FTP, their clock sped up: every line is the simulated one."""
+    settings = small_settings(tmp_path, source="rig", visit="first", budget=0.5)
+    scene, _ = open_scene(settings)
+    source = replace(make_source(scene, settings), chosen=effects_on("rotation", "slit", "smear", "shot"))
+    with EmulatedRig(source, FastClock(40)).serve() as served:
+        rig = {
+            "port": served.port,
+            "host": served.host,
+            "control_port": served.camera_port,
+            "file_port": served.file_port,
+        }
+        told = {f"rig.{name}": value for name, value in rig.items()}
+        published = run_survey(small_settings(tmp_path, source="rig", visit="first", budget=0.5, **told), QUIET)
+    cube = open_raw_cube(tmp_path / published.receipt["products"]["raw_coarse"] / "coarse-0.zarr")
+    np.testing.assert_array_equal(cube.read(0, cube.sweep.lines), source.render(cube.sweep, range(cube.sweep.lines)))
+    assert cube.valid_line.all()
+    told = json.loads((tmp_path / published.receipt["products"]["raw_coarse"] / "rig.json").read_text())
+    assert [one["method"] for one in told["captures"]] == ["trigger"]
+    assert told["rig"]["provenance"] == "assumed"
+
+
+BAD: dict[str, tuple[dict[str, Any], str]] = {
+    "unknown key": ({"rig.prot": "/dev/ttyUSB0"}, r"unknown setting .*prot.*did you mean 'rig.port'"),
+    "unknown word": ({"rig.pulses": "some"}, r"pulses must be one of position, frame, none; got 'some'"),
+    "axes that are none": ({"rig.mirror_axes": "x,x"}, r"mirror.axes must be one of x,y  x,-y .* -y,-x; got 'x,x'"),
+    "clocking as large as a turn": ({"rig.mirror_clocking_deg": 90}, r"clocking.deg must be .* -45 to 45 deg, got 90"),
+    "offset in degrees": ({"rig.mirror_offset_x": 2}, r"mirror.offset.x must be a number from -0.5 to 0.5, got 2"),
+    "port number": ({"rig.control_port": 0}, r"control.port must be a whole number from 1 to 65535, got 0"),
+    "settling in ms": ({"rig.settle_s": 200}, r"settle.s must be a number from 0.01 to 60 s, got 200.*milliseconds"),
+    "no such source": ({"source": "rigg"}, r"source must be one of sim, rig; got 'rigg'"),
+    "memory too large": ({"source": "rig", "cost.vector_pairs": 9000}, r"cost.vector_pairs = 9000: .* 2 to 8191 pairs"),
+    "field without size": (
+        {"source": "rig", "scene": "field", "bands": None, "size": None, "weights": "x"},
+        r"give its size",
+    ),
+    "field without rig": ({"scene": "field", "bands": None}, r"scene 'field' is what stands before a rig"),
+    "frame period of the camera": (
+        {"source": "rig", "camera.exposure_ms": 9500, "camera.readout_ms": 900},
+        r"frame period of 10400 ms is above",
+    ),
+}
+
+
+@pytest.mark.parametrize(("changed", "message"), BAD.values(), ids=BAD)
+def test_bad_setting_is_refused_in_one_message(tmp_path: Path, changed: dict[str, Any], message: str, weights: Path):
+    """What cannot be meant is refused before a device is opened, with what it should be; no archive is made."""
+    told = {**changed, **({"weights": str(weights)} if "weights" in changed else {})}
+    with pytest.raises(SettingsError, match=message):
+        run_survey(small_settings(tmp_path / "out", **told), QUIET)
+    assert not (tmp_path / "out").exists()
+
+
+def free_port() -> int:
+    """A port of this machine that nothing listens at."""
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return int(listener.getsockname()[1])
+
+
+def told_on_the_command_line(command_line: CommandLine, tmp_path: Path, **rig: Any) -> str:
+    """The one error of a survey with such a rig, which ends with 1 and leaves no run."""
+    table = "".join(f"{name} = {json.dumps(value)}\n" for name, value in rig.items())
+    plain = {name: value for name, value in SMALL.items() if "." not in name}
+    rest = "".join(f"{name} = {value!r}\n".replace("False", "false") for name, value in plain.items())
+    (tmp_path / "rig.toml").write_text(f'source = "rig"\n{rest}[rig]\n{table}')
+    ended = command_line("survey", tmp_path / "rig.toml", "--out", tmp_path / "archive")
+    assert ended.code == 1
+    assert len(ended.errors) == 1
+    assert not list((tmp_path / "archive" / "runs").glob("*/receipt.json"))
+    return ended.errors[0]
+
+
+@pytest.mark.parametrize(
+    ("port", "words"),
+    [("/dev/ttyNONE", "/dev/ttyNONE"), ("/dev/null", "/dev/null cannot be opened.*is it a serial port")],
+)
+def test_what_is_no_port(command_line: CommandLine, tmp_path: Path, port: str, words: str):
+    """A port that is not there, and a name that opens and is none."""
+    assert re.search(words, told_on_the_command_line(command_line, tmp_path, port=port))
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [("wrong-firmware", "firmware not known on /dev/"), ("modem", "is this the mirror"), ("mute", "no answer to")],
+)
+def test_another_device_is_not_moved(command_line: CommandLine, tmp_path: Path, fault: str, words: str):
+    """What answers as no mirror controller does, or as none that is known, is told nothing but who it should say."""
+    settings = small_settings(tmp_path)
+    scene, _ = open_scene(settings)
+    rig = EmulatedRig(make_source(scene, settings), FastClock(20), mirror_faults=[make_fault(fault, at=0)])
+    with rig.serve() as served:
+        told = {"port": served.port, "host": served.host, "control_port": served.camera_port, "park_at_close": True}
+        assert words in told_on_the_command_line(command_line, tmp_path, **told)
+    asked = {act.request.command for act in rig.mirror.acts}
+    assert not asked & {Command.SET_VALUE, Command.SET_VALUES, Command.SET_VECTOR}
+    assert not any("=" in act.request.line for act in rig.mirror.acts)
+
+
+def test_default_engine_says_it_once_as_well(
+    command_line: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Through Prefect, which tries again, a port that is not there is one message too, and no traceback."""
+    monkeypatch.setattr(flows.tasks.prefect_engine, "RETRY_DELAY_S", 0.0)
+    file = tmp_path / "rig.toml"
+    file.write_text('source = "rig"\nscene = "farm"\nsize = "96x96"\nbands = [40, 90]\n[rig]\nport = "/dev/ttyNONE"\n')
+    ended = command_line("survey", file, "--out", tmp_path / "archive")
+    assert (ended.code, ended.err.count("/dev/ttyNONE")) == (1, 1)
+    assert ended.err.splitlines()[-1].startswith("error: there is no port /dev/ttyNONE")
+    assert not re.findall(r"Traceback|ERROR|Task run", ended.err)
+
+
+def test_port_in_use_and_camera_unreachable(command_line: CommandLine, tmp_path: Path):
+    """Another program holds the mirror's port; it lets go, and then nobody answers for the camera. Nothing moves."""
+    scene, _ = open_scene(small_settings(tmp_path))
+    rig = EmulatedRig(make_source(scene, small_settings(tmp_path)), SYSTEM_CLOCK)
+    with rig.serve() as served:
+        told = {"port": served.port, "host": "127.0.0.1", "control_port": free_port(), "connect_s": 0.5}
+        other = SerialTransport(served.port, 115200)
+        assert "in use" in told_on_the_command_line(command_line, tmp_path, **told)
+        other.close()
+        error = told_on_the_command_line(command_line, tmp_path, **told)
+        assert f"127.0.0.1:{told['control_port']}" in error
+        assert not rig.mirror.state.players[0].running
+        assert rig.mirror.state.positions(rig.clock.now()).tolist() == [0.0, 0.0]

@@ -1,0 +1,236 @@
+"""The class unknown in a survey: which pixels get it, what is told of them, and what stays as it was without it."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from hypothesis import given
+from hypothesis import strategies as st
+
+from flows.publish.receipt_words import sentences
+from flows.settings.load import load_settings
+from flows.settings.values import parse_unknown
+from flows.tasks.beyond_training import beyond_training
+from models.reading.familiar import Familiar, Limits
+from models.weights.companion_files import FamiliarWeights, TrainedOn, familiar_path, save_familiar
+from models.weights.files import content_key, describe_weights
+from pipeline.errors import SettingsError, WeightsError
+from pipeline.geometry.grid import UNLABELLED
+from storage.arrays.class_maps import ClassNames, with_unknown
+from tests.conftest import CLASSES, RGB_NM, Survey
+
+SEEN = TrainedOn(3, (460.0, 640.0), (3.0, 100.0), 2, CLASSES, (96, 300), (24.0, 60.0), 0.12)
+Maker = Callable[[float], Path]
+
+
+@pytest.fixture(scope="module")
+def judging(weights: Path, tmp_path_factory: pytest.TempPathFactory) -> Maker:
+    """Maker of copies of the tiny weights to which spectra up to a squared distance from the middle are familiar."""
+
+    def make(limit: float) -> Path:
+        path = tmp_path_factory.mktemp("judging") / "w.safetensors"
+        shutil.copy(weights, path)
+        one, table = np.eye(3), np.full((1, 1, 2), limit)
+        limits = Limits(np.array([0.001, 0.05]), np.ones(1), (1,), table, table[0])
+        familiar = Familiar(np.zeros((1, 3)), one[None], 1e-9 * one[None], 1e-9 * one, limits, 3)
+        save_familiar(FamiliarWeights(familiar, content_key(path), SEEN), familiar_path(path))
+        return path
+
+    return make
+
+
+def _stored(out: Path, name: str) -> xr.Dataset:
+    (path,) = out.glob(f"stages/segment/*/{name}.zarr")
+    return xr.open_zarr(path, consolidated=False)
+
+
+def _files(out: Path, kind: str) -> dict[str, bytes]:
+    (store,) = out.glob(f"stages/{kind}/*")
+    return {str(path.relative_to(store.parent)): path.read_bytes() for path in store.rglob("c/*") if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def both(
+    tmp_path_factory: pytest.TempPathFactory, survey_png: Survey, judging: Maker
+) -> tuple[Path, Path, dict[str, Any]]:
+    """The same survey with the class unknown and without; the receipt of the first."""
+    path, out, plain = judging(0.5), tmp_path_factory.mktemp("with"), tmp_path_factory.mktemp("without")
+    receipt = survey_png(out, weights=str(path), effects="none").receipt
+    survey_png(plain, weights=str(path), unknown="off", effects="none")
+    return out, plain, dict(receipt)
+
+
+def test_strange_pixels_get_a_class_of_their_own(both: tuple[Path, Path, dict[str, Any]]) -> None:
+    """Behind those of the weights and without a confidence; all others have what they have without it."""
+    out, plain, receipt = both
+    found, before = (_stored(one, "class_map") for one in (out, plain))
+    classes, shown = found["classes"].values, before["classes"].values
+    unknown = classes == 3
+    assert found["classes"].attrs["flag_meanings"].split() == [*CLASSES, "unknown"]
+    assert before["classes"].attrs["flag_meanings"].split() == list(CLASSES)
+    assert 0.02 < unknown.mean() < 0.98
+    np.testing.assert_array_equal(classes[~unknown], shown[~unknown])
+    assert np.isnan(found["confidence"].values[unknown]).all()
+    assert np.isfinite(found["confidence"].values[~unknown]).all()
+    assert receipt["unknown"] == {"pixels": int(unknown.sum()), "share": float(unknown.mean()), "rate": 0.001}
+
+
+def test_unknown_pixels_count_as_wrong_and_are_no_class_of_the_mean(both: tuple[Path, Path, dict[str, Any]]) -> None:
+    """The truth has three classes, and the map is judged over these."""
+    accuracy = both[2]["accuracy"]
+    assert list(accuracy["per_class_iou"]) == list(CLASSES)
+    assert accuracy["miou"] == pytest.approx(np.mean(list(accuracy["per_class_iou"].values())))
+    assert accuracy["unknown_px"] == both[2]["unknown"]["pixels"]
+    assert "unknown" not in accuracy["false_classes"]
+    assert accuracy["overall_accuracy"] <= 1 - accuracy["unknown_px"] / accuracy["pixels"]
+
+
+def test_without_it_every_bit_is_kept(
+    both: tuple[Path, Path, dict[str, Any]], survey_png: Survey, weights: Path, tmp_path: Path
+) -> None:
+    """Switched off, and by weights that nobody measured: the same keys, and the same bytes under them."""
+    survey_png(tmp_path, weights=str(weights), effects="none")
+    assert _files(tmp_path, "segment") == _files(both[1], "segment")
+    assert not set(_files(both[0], "segment")) & set(_files(both[1], "segment"))
+
+
+def test_of_unknown_pixels_nothing_is_believed(both: tuple[Path, Path, dict[str, Any]]) -> None:
+    """What was seen says nothing of the classes; a later look takes its own word, or a memory keeps its."""
+    out, _, _ = both
+    belief, classes = _stored(out, "belief"), _stored(out, "class_map")["classes"].values
+    np.testing.assert_array_equal(np.isnan(belief["log_probability"].values).all(axis=-1), classes == 3)
+
+
+def test_a_later_visit_goes_on_from_such_a_map(
+    both: tuple[Path, Path, dict[str, Any]], survey_png: Survey, judging: Maker, tmp_path: Path
+) -> None:
+    """What is unknown today is so whatever is remembered there, and its memory stays."""
+    shutil.copytree(both[0], tmp_path, dirs_exist_ok=True)
+    before = set(tmp_path.glob("stages/segment/*"))
+    flags = {"visit": "later", "seed": "1", "prior": "latest", "effects": "none"}
+    receipt = survey_png(tmp_path, weights=str(judging(0.5)), **flags).receipt
+    assert receipt["memory"]["put_aside"] is None
+    (store,) = set(tmp_path.glob("stages/segment/*")) - before
+    found = xr.open_zarr(store / "class_map.zarr", consolidated=False)["classes"].values
+    assert (found == 3).sum() == receipt["unknown"]["pixels"] > 0
+
+
+def test_a_map_of_nothing_known_is_published_and_says_what_to_do(
+    survey_png: Survey, judging: Maker, tmp_path: Path
+) -> None:
+    """Receipt, report, quicklook and accuracy; the sentence names the way out."""
+    published = survey_png(tmp_path, weights=str(judging(1e-6)), effects="none")
+    receipt: Any = published.receipt
+    assert receipt["unknown"]["share"] == 1
+    assert receipt["accuracy"]["miou"] == 0
+    words = " ".join(sentences(receipt))
+    assert "100 % of the map is unknown" in words
+    assert "These weights do not know this field: train" in words
+    assert "--unknown off" in (published.folder / "report.html").read_text(encoding="utf-8")
+    assert json.loads((published.folder / "receipt.json").read_text())["unknown"]["pixels"] == 96 * 128
+
+
+def test_pixels_without_a_value_have_no_class_rather_than_an_unknown_one(
+    survey_png: Survey, judging: Maker, scene_files: Path, tmp_path: Path
+) -> None:
+    """None at all, where everything else is unknown."""
+    values = np.load(scene_files / "cube.npy")[..., :3]
+    values[:8, :8] = np.nan
+    np.save(tmp_path / "holes.npy", values)
+    flags = {"scene": str(tmp_path / "holes.npy"), "labels": None, "wavelengths": ",".join(map(str, RGB_NM))}
+    survey_png(tmp_path / "out", weights=str(judging(1e-6)), effects="none", **flags)
+    classes = _stored(tmp_path / "out", "class_map")["classes"].values
+    assert (classes[:8, :8] == UNLABELLED).all()
+    assert (classes[8:, 8:] == 3).all()
+
+
+def test_a_rate_needs_weights_that_were_measured(survey_png: Survey, weights: Path, tmp_path: Path) -> None:
+    """With the command that measures them; nothing is left behind."""
+    with pytest.raises(WeightsError, match=r"--unknown 1%: nobody measured .* --familiar"):
+        survey_png(tmp_path / "out", weights=str(weights), unknown="1%")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("given", "wanted"), [("AUTO", "auto"), (" off", "off"), ("0.50 %", "0.5%")])
+def test_words_of_the_setting(given: str, wanted: str) -> None:
+    """One word for one meaning."""
+    assert parse_unknown(given) == wanted
+
+
+@pytest.mark.parametrize("given", ["0.5", "12%", "0%", "maybe", "nan%", True])
+def test_other_words_are_refused(given: object) -> None:
+    """A rate has its sign, and is one that limits are known for."""
+    with pytest.raises(ValueError, match=r"must be auto, off, or the share .*0\.05% to 5%, such as 0\.5%"):
+        parse_unknown(given)
+    with pytest.raises(SettingsError, match="unknown"):
+        load_settings(None, {"unknown": given})
+
+
+def test_a_class_that_is_called_unknown_already_keeps_its_name() -> None:
+    """The one behind it has another."""
+    legend = ClassNames(("unknown", "crop"), np.zeros((2, 3), np.uint8))
+    assert with_unknown(legend).names == ("unknown", "crop", "unknown_spectrum")
+
+
+def _notes(weights: Path, nm: tuple[float, ...] = RGB_NM, **flags: Any) -> tuple[str, ...]:
+    scene: Any = SimpleNamespace(wavelength_nm=np.array(nm), shape=(96, 128))
+    return beyond_training(load_settings(None, flags), scene, describe_weights(weights), SEEN, weights)
+
+
+@given(st.integers(96, 300), st.floats(3.0, 100.0))
+def test_a_survey_within_training_has_no_note(weights: Path, day: int, exposure_ms: float) -> None:
+    """Whatever the day and the light."""
+    assert _notes(weights, day=day, hour=12, scan_step=1, scan_exposure_ms=exposure_ms) == ()
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        ({"day": 20, "hour": 12}, r"day 20 of the year \(January; it saw April to October\); a sun"),
+        ({"scan_step": 1, "scan_exposure_ms": 1}, r"lines of 1 ms \(it saw 3 ms and more\)"),
+        ({"coarse_exposure_ms": 2}, "lines of 2 ms"),
+        ({"nm": (460.0, 470.0, 480.0)}, "the bands reach 2 of the weights' 3 spectral columns"),
+        ({"nm": (460.0, 900.0, 1500.0, 1600.0)}, r"3 of 4 bands, which lie outside of its 460-640 nm"),
+    ],
+)
+def test_what_training_did_not_see_is_told_in_one_note(weights: Path, flags: dict[str, Any], words: str) -> None:
+    """With what it saw, and what to do."""
+    nm = flags.pop("nm", RGB_NM)
+    (note,) = _notes(weights, nm, **flags)
+    assert re.search(words, note), note
+    assert "spectralzoom train DATASET --init" in note
+
+
+def test_a_pixel_of_another_size_is_told(weights: Path) -> None:
+    """Before weights that know pixels of 1 cm."""
+    scene: Any = SimpleNamespace(wavelength_nm=np.array(RGB_NM), shape=(96, 128))
+    other = TrainedOn(3, SEEN.wavelength_nm, SEEN.exposure_ms, 2, CLASSES, None, None, 0.01)
+    (note,) = beyond_training(load_settings(None, {}), scene, describe_weights(weights), other, weights)
+    assert "pixels of 12 cm of the ground (it saw 1 cm)" in note
+
+
+def test_areas_without_labels_count_unknown_pixels_for_sure(
+    survey_png: Survey, judging: Maker, tmp_path: Path, command_line: Any
+) -> None:
+    """An export's table estimates known classes by what is believed of their pixels; all shares add up to one."""
+    path = str(judging(0.5))
+    published = survey_png(tmp_path / "archive", weights=path, effects="none", accuracy=False)
+    ended = command_line("export", tmp_path / "archive", "-o", tmp_path / "maps")
+    assert ended.code == 0, ended.err
+    (found,) = (tmp_path / "maps").rglob("areas.csv")
+    with found.open() as text:
+        table = {row["class"]: row for row in csv.DictReader(text)}
+    unknown = table["unknown"]
+    assert float(unknown["estimated_share"]) == pytest.approx(published.receipt["unknown"]["share"], abs=1e-5)
+    assert float(unknown["standard_error_share"]) == 0
+    assert sum(float(row["estimated_share"]) for row in table.values()) == pytest.approx(1, abs=1e-4)
