@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-import flows.tasks.prefect_engine
+import flows.tasks.prefect_tasks
 import flows.tasks.rig_field
 import flows.terminal.progress
 from flows.publish.run_folder import Published
@@ -399,7 +399,7 @@ def test_default_engine_says_it_once_as_well(
     command_line: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """Through Prefect, which tries again, a port that is not there is one message too, and no traceback."""
-    monkeypatch.setattr(flows.tasks.prefect_engine, "RETRY_DELAY_S", 0.0)
+    monkeypatch.setattr(flows.tasks.prefect_tasks, "RETRY_DELAY_S", 0.0)
     file = tmp_path / "rig.toml"
     file.write_text('source = "rig"\nscene = "farm"\nsize = "96x96"\nbands = [40, 90]\n[rig]\nport = "/dev/ttyNONE"\n')
     ended = command_line("survey", file, "--out", tmp_path / "archive")
