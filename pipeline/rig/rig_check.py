@@ -78,7 +78,7 @@ def check_mirror(connect: Callable[[], MirrorDriver], clock: Clock, *, move: boo
     ``connect`` opens the device, which is closed again. Errors become rows.
     """
     rows: list[CheckRow] = []
-    with _warnings(rows, "mirror"):
+    with _warnings(rows, "mirror") as heard:
         try:
             mirror = connect()
         except RigError as error:
@@ -86,7 +86,7 @@ def check_mirror(connect: Callable[[], MirrorDriver], clock: Clock, *, move: boo
             return rows
         try:
             if isinstance(mirror, MirrorController):
-                playing = _ask_mirror(mirror, rows)
+                playing = _ask_mirror(mirror, rows, heard)
             else:
                 rows.append(CheckRow("mirror", CONNECT, f"{type(mirror).__name__} is there"))
                 playing = False
@@ -193,7 +193,7 @@ def _edges_row(edges: int, folder: str, pulses: Pulses) -> CheckRow:
     return CheckRow("mirror", asked, came, "fail", f'set pulses = "{wired}" in [rig]; it is "{pulses}"')
 
 
-def _ask_mirror(mirror: MirrorController, rows: list[CheckRow]) -> bool:
+def _ask_mirror(mirror: MirrorController, rows: list[CheckRow], heard: list[str]) -> bool:
     """Add rows of the shipped mirror's identity and state; return whether a path plays."""
     found, playing = mirror.identity(), False
     try:
@@ -212,7 +212,9 @@ def _ask_mirror(mirror: MirrorController, rows: list[CheckRow]) -> bool:
         else:
             rows.append(CheckRow("mirror", "path", "no path plays"))
             rows.append(CheckRow("mirror", "temperature", f"{mirror.temperature():.1f} deg C"))
+            before = len(heard)
             _row(rows, "mirror", "frames with and without a CRC", partial(_answered_frames, mirror))
+            del heard[before:]  # refusals of frames that are sent for this are no fault of the line
     except RigError as error:
         rows.append(failed("mirror", "status", error))
     return playing
@@ -283,14 +285,14 @@ def _row(rows: list[CheckRow], device: Device, asked: str, ask: Callable[[], str
 
 
 @contextmanager
-def _warnings(rows: list[CheckRow], device: Device) -> Iterator[None]:
-    """Make a row of what the drivers warned of: answers that were late, damaged, or not asked for."""
+def _warnings(rows: list[CheckRow], device: Device) -> Iterator[list[str]]:
+    """Make a row of the drivers' warnings, which are yielded: answers that were late, damaged, or not asked for."""
     logger, heard = logging.getLogger("pipeline.rig"), logging.Handler(logging.WARNING)
     words: list[str] = []
     heard.emit = lambda record: words.append(record.getMessage())  # type: ignore[method-assign]
     logger.addHandler(heard)
     try:
-        yield
+        yield words
     finally:
         logger.removeHandler(heard)
         if words and rows and rows[0].asked != CONNECT:  # that row says it all

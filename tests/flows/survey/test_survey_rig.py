@@ -59,6 +59,7 @@ SMALL: dict[str, Any] = {
     "controls": False,
     "budget": 0.8,
     "rig.panel": 0.99,  # of the farm's white panel
+    "rig.pulses": "position",
     "effects": "rotation,slit,smear,vignetting,shot,read-noise",
 }
 

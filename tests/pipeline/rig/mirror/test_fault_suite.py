@@ -19,7 +19,7 @@ from pipeline.rig.mirror.registers import VectorRegister, X, Y
 from tests.pipeline.rig.in_process import InProcessTransport, ManualClock
 
 SEEDS = range(8)
-SETTINGS = MirrorSettings(expected_id="MR-E", read_back="all")
+SETTINGS = MirrorSettings(expected_id="MR-E", read_back="all", with_crc=True)
 PATH = np.stack([np.linspace(-0.5, 0.5, 47), np.linspace(0.3, 0.1, 47)], axis=-1)
 MOST_QUIET = 6  # times the time of silence that is waited for before a request
 EPSILON_S = 1e-6
