@@ -177,7 +177,7 @@ class SurveyRig(MirrorLink):
     camera_driver: str = stated(
         "",
         "Driver of a camera of another make, as module:function; by default that of the Nano-Hyperspec",
-        example="folder_camera:open_camera",
+        example="lab:camera",
     )
     mirror_axes: Axes = assumed(
         Mounting.axes,
