@@ -130,8 +130,9 @@ def test_the_pages_camera_takes_a_sweep(tmp_path: Path) -> None:
         (told,) = source.record["captures"]
     assert [line.number for line in found] == list(range(FINE.lines))
     assert all(line.valid for line in found)
-    assert (told["method"], told["folder"]) == ("log", f"{told['folder'].rpartition('-')[0]}-0")
-    stored = envi.open(str(tmp_path / "incoming" / f"{told['folder']}.hdr")).open_memmap(interleave="bip")
+    assert (told["method"], told["folder"]) == ("log", f"{capture_prefix(FINE)}-0")
+    header = tmp_path / "incoming" / f"{capture_prefix(FINE)}-0.hdr"
+    stored = envi.open(str(header)).open_memmap(interleave="bip")
     np.testing.assert_array_equal([line.data for line in found], stored)
     np.testing.assert_allclose([line.time_s for line in found], CAMERA.mid_exposure_s(np.arange(FINE.lines)), atol=1e-6)
     off = np.array([(line.mirror_x, line.mirror_y) for line in found]) - line_positions(FINE, CAMERA)
