@@ -142,7 +142,7 @@ def check_triggers(
             return rows
         try:
             rows += _triggers(devices, clock, pulses, exposed)
-        except RigError as error:
+        except PipelineError as error:
             rows.append(failed("mirror", TRIGGERS, error))
             for stop in (devices.camera.stop, devices.steering.halt):
                 with suppress(RigError):
@@ -153,6 +153,7 @@ def check_triggers(
 
 
 def _triggers(devices: RigDevices, clock: Clock, pulses: Pulses, exposed: LineCamera) -> list[CheckRow]:
+    """Return a row of the path by its own clock, and one of the path by edges."""
     mirror, camera = devices.steering, devices.camera
     mirror.goto(0.0, 0.0)
     mirror.settle(SETTLE_S)
@@ -187,9 +188,9 @@ def _edges_row(edges: int, folder: str, pulses: Pulses) -> CheckRow:
     if 0 < edges < EDGES.lines:
         return CheckRow("mirror", asked, came, "fail", "edges are lost: look at the cable from camera to mirror")
     if pulses == wired:
-        return CheckRow("mirror", asked, f"{came}, as pulses = {pulses!r} says")
+        return CheckRow("mirror", asked, f'{came}, as pulses = "{pulses}" says')
     if pulses == "none":
-        return CheckRow("mirror", asked, f"{came}; pulses = {wired!r} would step the mirror by them")
+        return CheckRow("mirror", asked, f'{came}; pulses = "{wired}" would step the mirror by them')
     return CheckRow("mirror", asked, came, "fail", f'set pulses = "{wired}" in [rig]; it is "{pulses}"')
 
 

@@ -180,11 +180,17 @@ def test_rig_in_order(command_line: CommandLine, tmp_path: Path) -> None:
 
 
 def test_what_is_not_tried_is_said(command_line: CommandLine) -> None:
-    """Edges need both devices, in order: one alone, or one that failed, leaves the setting on trust."""
+    """Edges need both devices in order: one alone, one that failed, or a path that plays leave the setting on trust."""
     with served() as rig:
-        for more, why in (((), "without a camera"), (("--camera", NOWHERE), "as something above failed")):
+        for more, why in (((), "without a camera"), (("--camera", NOWHERE), "as not all of the above is in order")):
             ended = command_line("rig", "check", "--port", rig.port, *more, "--move", "--json")
             assert json.loads(ended.out)["rows"][-1]["came"].startswith(f"not tried {why}; pulses")
+        for player in rig.rig.mirror.state.players:
+            player.start, player.end, player.running, player.frequency_hz = 0, 10, True, 0.001
+        ended = command_line("rig", "check", "--port", rig.port, "--camera", camera_of(rig), "--move", "--json")
+        assert json.loads(ended.out)["rows"][-1]["came"].startswith(f"not tried {why}; pulses")
+        assert all(player.running for player in rig.rig.mirror.state.players)
+        assert not rig.rig.camera.captures
 
 
 def test_a_driver_that_cannot_be_imported_is_refused(command_line: CommandLine, tmp_path: Path) -> None:

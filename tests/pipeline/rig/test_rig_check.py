@@ -256,7 +256,7 @@ def test_edges_of_a_capture_say_how_the_cable_is(wired: Pulses, edges: int) -> N
         ("none", "position", "fail", 'set pulses = "none" in [rig]; it is "position"'),
         ("frame", "position", "fail", 'set pulses = "frame" in [rig]; it is "position"'),
         ("position", "frame", "fail", 'set pulses = "position" in [rig]; it is "frame"'),
-        ("frame", "none", "ok", "pulses = 'frame' would step the mirror by them"),
+        ("frame", "none", "ok", 'pulses = "frame" would step the mirror by them'),
     ],
 )
 def test_edges_beside_another_setting(wired: Pulses, pulses: Pulses, verdict: str, words: str) -> None:
@@ -264,6 +264,22 @@ def test_edges_beside_another_setting(wired: Pulses, pulses: Pulses, verdict: st
     row = trigger_rows(wired, pulses)[-1]
     assert row.verdict == verdict
     assert words in (row.mend if verdict == "fail" else row.came)
+
+
+def test_edges_that_are_lost_fail() -> None:
+    """Two edges of four frames fit no setting: the cable is to be looked at."""
+    with rig(wired="frame") as line:
+        whole, left = line.rig.camera.pulses, [2]
+
+        def fewer(from_s: float, to_s: float) -> Any:
+            found = whole(from_s, to_s)[: left[0]]
+            left[0] -= len(found)
+            return found
+
+        line.rig.mirror.pulses = fewer
+        row = check_triggers(lambda: line.devices(MirrorSettings()), line.clock, "frame", CAMERA)[-1]
+    assert (row.verdict, row.came[:19]) == ("fail", "2 edges in 4 frames")
+    assert "edges are lost: look at the cable" in row.mend
 
 
 def test_a_capture_that_fails_leaves_nothing_running() -> None:
