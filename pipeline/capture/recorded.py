@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, NoReturn
 
 import numpy as np
@@ -64,9 +65,7 @@ class RecordedSweep:
         """Record any sweep: its lines with their exposures (line,) [ms]; lines that follow each other are one read."""
 
         def read_lines(numbers: Numbers) -> NDArray[np.uint16]:
-            edges = np.flatnonzero(np.diff(numbers, prepend=-2, append=-2) != 1)
-            runs = [numbers[first:stop] for first, stop in zip(edges[:-1], edges[1:], strict=True)]
-            return np.concatenate([lines.read(int(run[0]), int(run[-1]) + 1) for run in runs])
+            return np.concatenate([lines.read(first, stop) for first, stop in line_runs(numbers)])
 
         return cls(
             lines.sweep, lines.references, lines.position, lines.time_s, exposure_ms, lines.valid_line, read_lines
@@ -78,7 +77,7 @@ class RecordedSweep:
 
     @cached_property
     def tangents(self) -> Floats:
-        """(line, 2) where the line centres lie, along the line and along the scan, as scene tangents; NaN if unknown."""
+        """(line, 2) where the line centres lie, along the line and along the scan, as scene tangents, or NaN."""
         known = np.isfinite(self.position).all(axis=1)
         found = np.full(self.position.shape, np.nan)
         found[known] = direction_to_scene(position_to_direction(self.position[known]))
@@ -334,6 +333,12 @@ class RecordedSource:
         return begins
 
 
+def line_runs(numbers: Numbers) -> list[tuple[int, int]]:
+    """Give (start, stop) of the runs of ascending line numbers that follow each other."""
+    edges = np.flatnonzero(np.diff(numbers, prepend=-2, append=-2) != 1)
+    return [(int(numbers[first]), int(numbers[stop - 1]) + 1) for first, stop in pairwise(edges)]
+
+
 def nearest_line(scan_px: Floats, wanted_px: Floats) -> tuple[Numbers, Floats]:
     """Find the line nearest to each wanted place: its number, and how far it lies [px].
 
@@ -365,7 +370,7 @@ def sum_references(references: References, samples: int) -> References:
         references,
         dark=grouped(references.dark).sum(axis=1, dtype=np.float32),
         white=grouped(references.white).sum(axis=1, dtype=np.float32),
-        bad=None if references.bad is None else grouped(references.bad).any(axis=1),
+        bad=None if references.bad is None else np.asarray(grouped(references.bad).any(axis=1), np.bool_),
         flat=None if references.flat is None else grouped(references.flat).mean(axis=1, dtype=np.float32),
     )
 

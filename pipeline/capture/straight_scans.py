@@ -83,8 +83,8 @@ def fit_sweep(
     back = np.maximum.accumulate(way) - way
     if (turned := back > MOST_BACK * abs(distance)).any():
         raise SceneError(
-            f"sweep {name} turns back at line {lines[np.argmax(turned)]}; give each way of the scan a sweep of its own, "
-            "by a column 'sweep' in the pointing table"
+            f"sweep {name} turns back at line {lines[np.argmax(turned)]}; give each way of the scan a sweep of its "
+            "own, by a column 'sweep' in the pointing table"
         )
     strip, bend = float(np.median(across)), np.abs(across - np.median(across))
     most = MOST_BEND * camera.samples

@@ -200,6 +200,11 @@ class RawCube:
         """Raw numbers of the lines ``start`` to ``stop``, (line, sample, band) uint16; fastest on multiples of 64."""
         return read_array(self.group, "dn", slice(start, stop))
 
+    def read_lines(self, numbers: NDArray[np.intp]) -> NDArray[np.uint16]:
+        """Raw numbers of single lines, (line, sample, band) uint16; decodes each chunk that holds one of them once."""
+        with damage_named(f"{self.group.store_path}/dn"):
+            return np.asarray(self.group["dn"].oindex[numbers])  # type: ignore[union-attr]
+
     def read_window(self, lines: slice, samples: slice) -> NDArray[np.uint16]:
         """Raw numbers of some lines and samples, (line, sample, band) uint16; decodes the chunks that hold them."""
         return read_array(self.group, "dn", (lines, samples))

@@ -37,7 +37,7 @@ from pipeline.geometry.mirror import RIM_SLACK, STRAIGHT, Mounting, check_reach
 from pipeline.lazy import deferred
 
 if TYPE_CHECKING:
-    from pyarrow import parquet
+    from pyarrow import parquet  # type: ignore[import-untyped]
 else:
     parquet = deferred("pyarrow.parquet")
 
@@ -55,6 +55,7 @@ BESIDE = ("line", "sweep", "time", "exposure_ms", "valid")
 ACCEPTED = (*BESIDE, *(name for names in KINDS.values() for name in names))
 TABLE_ENDINGS = (".csv", ".tsv", ".txt", ".parquet")
 ENDINGS = (*TABLE_ENDINGS, ".toml")
+WORDS = {"": math.nan, "none": math.nan, "true": 1.0, "false": 0.0}
 LARGEST_TABLE = 1 << 28  # bytes; a row has about 60
 
 
@@ -67,6 +68,7 @@ class LinePointing:
     valid: NDArray[np.bool_]  # (line,)
     time_s: Floats | None = None  # (line,) of mid exposure
     exposure_ms: Floats | None = None  # (line,)
+    part: tuple[str, ...] | None = None  # (line,) names of the sweeps that a table of one cube cuts it into
     notes: tuple[str, ...] = ()
 
 
@@ -85,19 +87,20 @@ class PointingTable:
         """Names in the column ``sweep``, in the order of the file; none without it."""
         return tuple(dict.fromkeys(self.sweep or ()))
 
-    def of_sweep(self, name: str, lines: int, mounting: Mounting = STRAIGHT) -> LinePointing:
-        """Give the pointing of a sweep's ``lines`` lines: rows with its name, or all without a column ``sweep``.
+    def of_cube(self, name: str, lines: int, mounting: Mounting = STRAIGHT, *, alone: bool = False) -> LinePointing:
+        """Give the pointing of a cube's ``lines`` lines: rows whose ``sweep`` is its name, or all without that column.
 
-        ``mounting`` leads from the device's positions to the model's. Raises SceneError: the table has no row or
-        another number of rows for the sweep, a value that is no number, out of range or beyond the mirror, times that
-        do not rise, or no valid row.
+        Where the cube is ``alone``, and no row has its name, the column cuts it into sweeps. ``mounting`` leads from
+        the device's positions to the model's. Raises SceneError: the table has no row or another number of rows for the
+        cube, a value that is no number, out of range or beyond the mirror, times that do not rise, or no valid row.
         """
         rows = np.arange(len(self.columns[KINDS[self.kind][0]]))
-        if self.sweep is not None:
+        cut = self.sweep is not None and alone and name not in self.sweeps
+        if self.sweep is not None and not cut:
             rows = np.array([row for row in rows if self.sweep[row] == name], np.intp)
             if not len(rows):
                 raise SceneError(
-                    f"{self.path} has no row for the sweep {name!r}; its column 'sweep' names "
+                    f"{self.path} has no row for the cube {name!r}; its column 'sweep' names "
                     f"{', '.join(self.sweeps[:8])}"
                 )
         if len(rows) != lines:
@@ -112,12 +115,13 @@ class PointingTable:
             raise SceneError(f"{self.path} calls no line of {name} valid; set valid = 1 for lines that can be used")
         for column in (*KINDS[self.kind], "time", "exposure_ms"):
             self._check_known(column, rows, valid)
-        time_s = self._times(rows, valid)
+        time_s = self._times(rows)
         exposure_ms = None
         if "exposure_ms" in self.columns:
             exposure_ms = _filled(self.columns["exposure_ms"][rows], valid)
             self._refuse(rows, exposure_ms <= 0, "exposure_ms", "expected a time above 0 ms")
-        return LinePointing(self.kind, self._positions(rows, valid, mounting), valid, time_s, exposure_ms)
+        part = tuple(self.sweep[row] for row in rows) if self.sweep is not None and cut else None
+        return LinePointing(self.kind, self._positions(rows, valid, mounting), valid, time_s, exposure_ms, part)
 
     def _in_order(self, rows: NDArray[np.intp], lines: int) -> NDArray[np.intp]:
         """The rows by their line numbers, where the table has them (SceneError: they are not 0 to lines - 1)."""
@@ -133,7 +137,8 @@ class PointingTable:
             return np.ones(len(rows), np.bool_)
         values = self.columns["valid"][rows]
         self._refuse(rows, ~np.isin(values, (0, 1)), "valid", "expected 0 or 1")
-        return values == 1
+        flags: NDArray[np.bool_] = values == 1
+        return flags
 
     def _check_known(self, column: str, rows: NDArray[np.intp], valid: NDArray[np.bool_]) -> None:
         if column in self.columns:
@@ -142,7 +147,7 @@ class PointingTable:
                 rows, valid & ~np.isfinite(values), column, "expected a number; set valid = 0 where it is not known"
             )
 
-    def _times(self, rows: NDArray[np.intp], valid: NDArray[np.bool_]) -> Floats | None:
+    def _times(self, rows: NDArray[np.intp]) -> Floats | None:
         """(line,) times, NaN where a line is not valid and has none (SceneError: they do not rise)."""
         if "time" not in self.columns:
             return None
@@ -206,10 +211,12 @@ def load_pointing_table(path: Path) -> PointingTable:
     Raises SceneError: it cannot be read, has no row, a column that is not known, a cell that is no number, or not
     exactly one kind of pointing.
     """
+    header: list[str]
+    cells: Sequence[Sequence[object]]
     if path.suffix.lower() == ".parquet":
         header, cells, first_row = *_parquet_cells(path), 1
     else:
-        header, cells, first_row = *_csv_cells(path), 2
+        header, cells, first_row = *_csv_cells(path), 2  # the header is row 1
     unknown = [name for name in header if name not in ACCEPTED]
     if unknown or len(set(header)) < len(header):
         twice = next((name for name in header if header.count(name) > 1), None)
@@ -240,7 +247,7 @@ def _numbers(path: Path, name: str, cells: Sequence[object], first_row: int) -> 
     for number, cell in enumerate(cells):
         text = str(cell).strip().lower()
         try:
-            values[number] = {"": math.nan, "none": math.nan, "true": 1.0, "false": 0.0}.get(text) or float(text)
+            values[number] = WORDS[text] if text in WORDS else float(text)
         except ValueError:
             raise SceneError(
                 f"{path}, row {number + first_row}: {name} = {str(cell)[:40]!r} is no number; write numbers with a "
@@ -284,8 +291,8 @@ def _parquet_cells(path: Path) -> tuple[list[str], list[list[object]]]:
         table = parquet.read_table(path)
     except ImportError as error:
         raise SceneError(
-            f"{path} is Parquet, and pyarrow, which reads it, is not installed; install spectralzoom[parquet], or write "
-            "the table as CSV"
+            f"{path} is Parquet, and pyarrow, which reads it, is not installed; install spectralzoom[parquet], or "
+            "write the table as CSV"
         ) from error
     except (OSError, ValueError) as error:  # pyarrow's errors are of these
         raise SceneError(f"{path} cannot be read as Parquet: {error}; write the table anew, or as CSV") from error
