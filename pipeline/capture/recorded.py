@@ -317,7 +317,7 @@ class RecordedSource:
                 data=data[number],
                 mirror_x=float(one.position[line, 0]),
                 mirror_y=float(one.position[line, 1]),
-                time_s=float(one.time_s[line]) + self._begins_s[place] - self._begins_s[int(picked.place[0])],
+                time_s=float(one.time_s[line]) + (self._begins_s[place] - self._begins_s[int(picked.place[0])]),
                 exposure_ms=float(one.exposure_ms[line]),
                 valid=bool(one.valid_line[line]) and not bool(picked.again[number]),
             )
