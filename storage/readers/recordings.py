@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.capture.recorded import RecordedSource, RecordedSweep, line_runs, sum_references
 from pipeline.capture.straight_scans import covered_field, fit_sweep, flat_camera, flat_positions
-from pipeline.errors import ArchiveError, SceneError, SettingsError, WavelengthError
+from pipeline.errors import ArchiveError, IncompleteStoreError, SceneError, SettingsError, WavelengthError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import STRAIGHT, Mounting
 from pipeline.geometry.scan import Sweep
@@ -150,27 +150,28 @@ def find_raw_cubes(address: str | Path) -> list[Path] | None:
     """
     text = str(address).rstrip("/")
     place, _, run = text.rpartition("/runs/")
-    remote = is_remote(text)
-    if not remote:
-        path = Path(address)
-        if not path.exists():
-            raise SceneError(f"there is no recording {path}; check the name (seen from {Path.cwd()})")
-        if path.is_dir() and _is_raw_cube(path):
-            return [path]
-        found = sorted(one for one in path.glob("*.zarr") if _is_raw_cube(one)) if path.is_dir() else []
-        if found:
-            return found
-        whole = path.resolve()
-        place, run = (str(whole.parents[1]), whole.name) if whole.parent.name == "runs" else ("", "")
-    if run and is_archive(place):
+    if place and run and is_archive(place):
         return _cubes_of_run(place, run)
-    if remote or (Path(address) / "stages").is_dir():
+    if is_remote(text) or (Path(text) / "stages").is_dir():
         return _cubes_of_run(text, None)
-    return None
+    path = Path(text)
+    if not path.exists():
+        raise SceneError(f"there is no recording {path}; check the name (seen from {Path.cwd()})")
+    if not path.is_dir():
+        return None
+    if _is_raw_cube(path):
+        return [path]
+    return sorted(one for one in path.glob("*.zarr") if _is_raw_cube(one)) or None
 
 
 def _is_raw_cube(path: Path) -> bool:
-    return find_zarr_store(path) == path and "sweep" in open_group(path).attrs
+    """Whether a folder is a store that a survey wrote its lines into; other stores are judged by who reads them."""
+    if not (path / "zarr.json").is_file():
+        return False
+    try:
+        return "sweep" in open_group(path).attrs
+    except IncompleteStoreError:
+        return False
 
 
 def _cubes_of_run(address: str, name: str | None) -> list[Path]:
@@ -323,7 +324,7 @@ def _fitting_bits(camera: LineCamera, cubes: Sequence[RecordedFile], notes: list
                 "12 (unsigned) into the header if they are unsigned"
             )
         if values.max() > full:
-            needed = int(values.max() * camera.full_scale_dn // full).bit_length()
+            needed = (int(values.max()) * camera.full_scale_dn // full).bit_length()
             if needed > bits:
                 bits = needed
                 notes.append(f"{cube.name}: numbers reach {values.max()}, so {bits} bits are taken for camera.bits")
