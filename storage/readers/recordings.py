@@ -16,9 +16,10 @@ and ``mirror at rest = 1`` where it was taken so.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,7 +33,10 @@ from pipeline.geometry.scan import Sweep
 from pipeline.rectify.detector import find_bad_elements
 from pipeline.rig.camera.camera_texts import listed_numbers
 from pipeline.source import References
+from storage.archive.keys import array_digest
+from storage.archive.manifests import manifest_sha256
 from storage.archive.records import read_run
+from storage.archive.staging import MANIFEST_NAME
 from storage.arrays.cubes import RawCube, open_raw_cube
 from storage.arrays.layout import open_group
 from storage.readers.cube_sources import CubeSource
@@ -77,6 +81,22 @@ class Recording:
     camera: LineCamera
     has_mirror: bool
     notes: tuple[str, ...]
+    light: tuple[str, ...]  # what the numbers are known by without reading them: a manifest's hash, or file stamps
+
+    def key(self) -> dict[str, Any]:
+        """Give what captures from the recording depend on: lines, references, bands and light, but no place or name."""
+        arrays = [
+            array
+            for one in self.sweeps
+            for array in (one.position, one.time_s, one.exposure_ms, one.valid_line, *_frames(one.references))
+        ]
+        return {
+            "light": list(self.light),
+            "sweeps": [asdict(one.sweep) for one in self.sweeps],
+            "lines": [array_digest(array) for array in arrays],
+            "by_mirror": [one.references.by_mirror for one in self.sweeps],
+            "wavelength_nm": self.wavelength_nm.tolist(),
+        }
 
     def source(self, field_shape: tuple[int, int] | None = None) -> RecordedSource:
         """Give it as a source of lines for a field of (y, x) px; None takes the field that the sweeps cover.
@@ -133,7 +153,25 @@ def open_recording(
     sweeps = tuple(_of_raw_cube(cube) for cube in cubes)
     if given.samples is not None:
         camera = replace(camera, samples=given.samples)
-    return Recording(str(address), sweeps, first.wavelength_nm, first.fwhm_nm, camera, True, ())
+    light = tuple(_light_of_store(path) for path in stores)
+    return Recording(str(address), sweeps, first.wavelength_nm, first.fwhm_nm, camera, True, (), light)
+
+
+def _frames(references: References) -> list[NDArray[Any]]:
+    frames = (references.dark, references.white, references.panel, references.bad, references.flat)
+    return [np.zeros(0) if frame is None else frame for frame in frames]
+
+
+def _light_of_store(path: Path) -> str:
+    """The hash of the manifest of the capture that a raw cube lies in, with its name; stamps of its files without."""
+    if (path.parent / MANIFEST_NAME).is_file():
+        return f"{path.name} {manifest_sha256(path.parent)}"
+    return " ".join(_stamps(sorted(file for file in path.rglob("*") if file.is_file())))
+
+
+def _stamps(files: Iterable[Path]) -> list[str]:
+    """Name, size and time of change of files."""
+    return [f"{file.name}:{file.stat().st_size}:{file.stat().st_mtime_ns}" for file in files]
 
 
 def _of_raw_cube(cube: RawCube) -> RecordedSweep:
@@ -237,7 +275,10 @@ def _open_files(path: Path, camera: LineCamera, given: RecordedWith) -> Recordin
     bands = cubes[0].source.bands
     assert bands.wavelength_nm is not None
     unique = tuple(dict.fromkeys(notes))
-    return Recording(str(path), tuple(sweeps), bands.wavelength_nm, bands.fwhm_nm, camera, not any(without), unique)
+    light = tuple(_stamps(file for cube in cubes for file in cube.source.files))
+    return Recording(
+        str(path), tuple(sweeps), bands.wavelength_nm, bands.fwhm_nm, camera, not any(without), unique, light
+    )
 
 
 def _find_cubes(path: Path) -> list[Path]:

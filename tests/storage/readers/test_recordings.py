@@ -361,3 +361,23 @@ def test_a_headwall_folder_is_a_recording(tmp_path: Path) -> None:
     assert recording.camera.frame_ms == pytest.approx(10.0)
     assert (sweep.references.dark.min(), sweep.references.white.max()) == (60, 3000)
     assert "frames are taken to be stamped as their exposure begins" in recording.notes
+
+
+def test_the_key_of_a_recording_is_its_content(files: Path, tmp_path: Path) -> None:
+    """It is the same under another address, and another for other numbers, pointing or frames."""
+    key = open_recording(files, CAMERA).key()
+    moved = files.rename(tmp_path / "moved")
+    assert open_recording(moved, CAMERA).key() == open_recording(moved / "scan-0.hdr", CAMERA).key() == key
+    np.save(tmp_path / "dark.npy", np.full((64, 3), 7.0))
+    keys = [key, open_recording(moved, CAMERA, RecordedWith(dark=tmp_path / "dark.npy")).key()]
+    text = (moved / "scan-0.pointing.csv").read_text()
+    (moved / "scan-0.pointing.csv").write_text(text.replace("0.05,", "0.06,", 1))
+    keys.append(open_recording(moved, CAMERA).key())
+    (moved / "scan-0.pointing.csv").write_text(text)
+    content = bytearray((moved / "scan-0.bil").read_bytes())
+    content[100] ^= 1
+    (moved / "scan-0.bil").write_bytes(content)
+    keys.append(open_recording(moved, CAMERA).key())
+    assert all(one != other for at, one in enumerate(keys) for other in keys[:at])
+    stored = [open_recording(path, CAMERA).key() for path in (tmp_path / "raw", tmp_path / "raw" / "scan-0.zarr")]
+    assert stored[0] == stored[1]
