@@ -33,7 +33,8 @@ ReadLines = Callable[[Numbers], NDArray[np.uint16]]
 
 BLOCK_LINES = 64  # read at a time
 STRIP_PX = 1.0  # a planned strip may lie so far beside the recorded one
-REACH_STEPS = 0.75  # and a planned line from the nearest recorded one: half their distance, more where that varies
+REACH_STEPS = 0.75  # and a planned line from the nearest recorded one: half their distance, more where that varies,
+PLANNED_REACH = 0.5  # or so much of the planned distance of lines, where that is more
 FINE_ENOUGH = 1.5  # recorded lines may lie so many times farther apart than planned ones
 SAME_PX = 1e-6  # distances that differ by less are equal: of two lines the first counts
 
@@ -192,6 +193,21 @@ class RecordedSource:
         served = self.sweeps[int(self.pick(sweep).place[0])] if sweep.lines else self.sweeps[0]
         return sum_references(served.references, sweep.binning // served.sweep.binning)
 
+    def cut_to_recorded(self, sweep: Sweep) -> Sweep | None:
+        """Give a sweep without the lines at either end that were never taken; None where none of its lines was.
+
+        Plans begin and end a few lines beyond the field, where a recording may have none. A line that is missing in
+        between stays, for `lines` to name it.
+        """
+        if self._own(sweep) is not None:
+            return sweep
+        served = max((self._nearest(sweep, group)[0] >= 0 for group in self._groups), key=np.count_nonzero)
+        taken = np.flatnonzero(served)
+        if not len(taken):
+            return None
+        first, last = int(taken[0]), int(taken[-1])
+        return replace(sweep, start_px=sweep.start_px + first * sweep.step, lines=last + 1 - first)
+
     def pick(self, sweep: Sweep) -> PickedLines:
         """Choose the recorded lines that serve a sweep; nothing is read.
 
@@ -224,7 +240,7 @@ class RecordedSource:
 
     def _own(self, sweep: Sweep) -> int | None:
         """Number of the recorded sweep that is the one asked for, by its lines; its exposure decides among several."""
-        alike = [number for number, one in enumerate(self.sweeps) if _path(one.sweep) == _path(sweep)]
+        alike = [number for number, one in enumerate(self.sweeps) if _same_lines(one.sweep, sweep)]
         exposed = [number for number in alike if self.sweeps[number].sweep.exposure_ms == sweep.exposure_ms]
         return next(iter(exposed or alike), None)
 
@@ -259,7 +275,8 @@ class RecordedSource:
                 candidates = np.flatnonzero((one.valid_line == usable) & np.isfinite(one.tangents[:, 1]))
                 if not len(candidates):
                     continue
-                reach = REACH_STEPS * max(one.line_distance / self.camera.ifov_rad, 1.0)
+                apart = one.line_distance / self.camera.ifov_rad
+                reach = max(REACH_STEPS * apart, PLANNED_REACH * sweep.step)
                 scan_px = one.tangents[candidates, 1] / self.camera.ifov_rad
                 near, distance = nearest_line(scan_px, sweep.line_px())
                 better = open_lines & (distance <= reach) & (distance < best - SAME_PX)
@@ -375,9 +392,15 @@ def sum_references(references: References, samples: int) -> References:
     )
 
 
-def _path(sweep: Sweep) -> tuple[object, ...]:
-    """What says where a sweep's lines lie and how wide their samples are."""
-    return sweep.along, sweep.strip_px, sweep.start_px, sweep.lines, sweep.step, sweep.binning
+def _same_lines(one: Sweep, other: Sweep) -> bool:
+    """Whether two sweeps have the same lines and samples; places are compared as derived sweeps state them."""
+    apart = max(abs(one.strip_px - other.strip_px), abs(one.start_px - other.start_px))
+    return apart <= SAME_PX and (one.along, one.lines, one.step, one.binning) == (
+        other.along,
+        other.lines,
+        other.step,
+        other.binning,
+    )
 
 
 def _equal(one: References, other: References) -> bool:

@@ -173,6 +173,39 @@ def test_a_line_that_was_never_taken_is_named(asked: Sweep, message: str) -> Non
     assert counted.numbers == []
 
 
+def test_a_plan_is_cut_to_what_was_recorded() -> None:
+    """Lines beyond either end go, those of a gap stay, and of a plan elsewhere nothing is left."""
+    source = simulated()
+    lower, upper = replace(FULL, lines=30), replace(FULL, name="scan-1", start_px=10.5, lines=30)
+    recorded = recorded_source(source, [record(source, lower), record(source, upper)])
+    beyond = Sweep("coarse-0", "coarse", "x", 0.0, -49.5, 30, step=4, binning=4)
+    assert recorded.cut_to_recorded(beyond) == replace(beyond, start_px=-41.5, lines=21)
+    inside = replace(lower, name="fine", lines=10)
+    assert recorded.cut_to_recorded(inside) == inside
+    assert recorded.cut_to_recorded(replace(inside, strip_px=64.0)) is None
+    with pytest.raises(NotRecordedError, match="line 8 of sweep coarse-0 was never taken: it lies at -8 px"):
+        next(recorded.lines(replace(beyond, start_px=-41.5, lines=21)))
+
+
+def test_a_coarse_line_beside_a_gap_takes_what_lies_within_its_own_lines() -> None:
+    """Where lines 1 to 3 were lost, line 0 serves the coarse line in whose four lines it lies."""
+    source = simulated()
+    whole = record(source, FULL)
+    lost = replace(whole, valid_line=~np.isin(np.arange(80), [1, 2, 3]))
+    picked = recorded_source(source, [lost]).pick(Sweep("c", "coarse", "x", 0.0, -39.5, 20, step=4, binning=4))
+    assert picked.line[:2].tolist() == [0, 5]
+
+
+def test_a_plan_that_differs_by_rounding_is_the_recorded_sweep() -> None:
+    """Measured positions that stray keep their lines where the plan is the recording's own but for its last digits."""
+    source = simulated()
+    whole = record(source, FULL)
+    strayed = replace(whole, position=whole.position + np.random.default_rng(0).normal(0, 3e-4, (80, 2)))
+    recorded = recorded_source(source, [strayed])
+    picked = recorded.pick(replace(FULL, name="planned", strip_px=3e-7, start_px=FULL.start_px - 2e-7))
+    assert picked.line.tolist() == list(range(80))
+
+
 def test_finer_lines_than_were_recorded_are_refused() -> None:
     """A coarse recording serves no fine request, neither by its binning nor by its distance of lines."""
     source = simulated()
