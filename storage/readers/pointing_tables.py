@@ -307,19 +307,19 @@ def load_played_vector(path: Path, mounting: Mounting = STRAIGHT) -> PlayedVecto
     beyond the mirror.
     """
     try:
-        told = tomllib.loads(_text(path))
+        stated = tomllib.loads(_text(path))
     except tomllib.TOMLDecodeError as error:
         raise SceneError(f"{path} cannot be read as TOML: {error}; write vector, rate_hz and start_s") from error
-    if unknown := sorted(set(told) - {"vector", "rate_hz", "start_s"}):
+    if unknown := sorted(set(stated) - {"vector", "rate_hz", "start_s"}):
         raise SceneError(f"{path} has the entry {unknown[0]!r}; accepted are vector, rate_hz, start_s")
-    if not isinstance(told.get("vector"), str):
+    if not isinstance(stated.get("vector"), str):
         raise SceneError(f'{path} names no vector; add the line vector = "positions.csv"')
-    rate_hz, start_s = told.get("rate_hz"), told.get("start_s", 0.0)
+    rate_hz, start_s = stated.get("rate_hz"), stated.get("start_s", 0.0)
     for name, value, least in (("rate_hz", rate_hz, 0.0), ("start_s", start_s, -math.inf)):
         if isinstance(value, bool) or not isinstance(value, int | float) or not least < value < math.inf:
             above = " above 0" if least == 0 else ""
             raise SceneError(f"{path}: {name} = {value!r}, expected a number{above}; correct it")
-    file = path.parent / told["vector"]
+    file = path.parent / stated["vector"]
     try:
         values = np.load(file, allow_pickle=False) if file.suffix == ".npy" else _csv_numbers(file)
         if values.dtype.kind not in "iuf":

@@ -498,25 +498,25 @@ def _line_reader(source: CubeSource, own: NDArray[np.intp]) -> Callable[[NDArray
     return read_lines
 
 
-def _middle_s(source: CubeSource, told_s: Floats | None, camera: LineCamera, notes: list[str]) -> Floats:
-    """(line,) times of mid exposure since the first exposure began: as told, by the files' stamps, or even."""
+def _middle_s(source: CubeSource, stated_s: Floats | None, camera: LineCamera, notes: list[str]) -> Floats:
+    """(line,) times of mid exposure since the first exposure began: as stated, by the files' stamps, or even."""
     at = np.arange(source.shape[0])
-    if told_s is None and source.lines.time_s is not None:
+    if stated_s is None and source.lines.time_s is not None:
         exposure_ms = camera.exposure_ms
         if source.lines.exposure_ms is not None:
             exposure_ms = float(np.nanmedian(source.lines.exposure_ms))
-        told_s = source.lines.time_s + exposure_ms * 5e-4
+        stated_s = source.lines.time_s + exposure_ms * 5e-4
         notes.append("frames are taken to be stamped as their exposure begins")
-    if told_s is None or not np.isfinite(told_s).any():
+    if stated_s is None or not np.isfinite(stated_s).any():
         notes.append(f"nothing says when lines were taken: one every {camera.frame_ms:g} ms is assumed")
         return np.asarray(camera.mid_exposure_s(at.astype(np.float64)))
-    known = np.isfinite(told_s)
-    return told_s if known.all() else np.interp(at, at[known], told_s[known])
+    known = np.isfinite(stated_s)
+    return stated_s if known.all() else np.interp(at, at[known], stated_s[known])
 
 
-def _exposures(source: CubeSource, told_ms: Floats | None, camera: LineCamera, name: str, notes: list[str]) -> Floats:
-    """(line,) exposures [ms]: as told, by the files, or the camera's."""
-    known = source.lines.exposure_ms if told_ms is None else told_ms
+def _exposures(source: CubeSource, stated_ms: Floats | None, camera: LineCamera, name: str, notes: list[str]) -> Floats:
+    """(line,) exposures [ms]: as stated, by the files, or the camera's."""
+    known = source.lines.exposure_ms if stated_ms is None else stated_ms
     if known is None:
         notes.append(f"{name}: nothing says the exposure: {camera.exposure_ms:g} ms is assumed")
         return np.full(source.shape[0], camera.exposure_ms)
