@@ -24,8 +24,8 @@ from storage.readers.array_files import split_step
 from storage.readers.cube_sources import Bands, CubeSource, ReadLines, unpacked
 
 ROWS = ("y", "line", "lines", "row", "rows", "lat", "latitude", "northing", "downtrack", "along_track")
-COLUMNS = ("x", "sample", "samples", "column", "columns", "col", "lon", "longitude", "easting")
-COLUMNS += ("crosstrack", "across_track")
+_ACROSS = ("crosstrack", "across_track")
+COLUMNS = ("x", "sample", "samples", "column", "columns", "col", "lon", "longitude", "easting", *_ACROSS)
 BANDS = ("band", "bands", "wavelength", "wavelengths", "channel", "channels", "spectral")
 TIMES = ("time", "t", "date", "dates", "step", "visit")
 WAVELENGTHS = ("wavelength", "wavelengths", "radiation_wavelength")
@@ -84,7 +84,7 @@ def spectral_names(arrays: Arrays) -> set[str]:
 
 
 def dims_of(array: Any) -> list[str]:
-    """Names of an array's axes as Zarr v3 or xarray's v2 keeps them; empty where there are none."""
+    """Names of an array's axes as Zarr v3 or xarray's v2 keeps them, those of files with groups as paths; or none."""
     metadata = getattr(array, "metadata", None)
     named = getattr(metadata, "dimension_names", None) or array.attrs.get("_ARRAY_DIMENSIONS")
     return ["" if name is None else str(name) for name in named] if isinstance(named, list | tuple) else []
@@ -195,7 +195,7 @@ def _chosen(arrays: Arrays, variable: str | None, path: Path, *, series: bool) -
 
 def _moment(array: Any, step: int | None, path: Path, name: str) -> Moment | None:
     """The step that is meant, of an array with an axis of time (SceneError: none is named, or one that it lacks)."""
-    words = [word.lower() for word in dims_of(array)]
+    words = [_word(dim) for dim in dims_of(array)]
     unnamed = 0 if array.ndim == 4 and not any(words) else None
     known = set(words) & set(ROWS) and set(words) & set(COLUMNS)
     axis = next((at for at, word in enumerate(words) if known and word in TIMES), unnamed)
@@ -218,13 +218,13 @@ def _axes(arrays: Arrays, name: str, path: Path, moment: Moment | None) -> tuple
     named, own = dims_of(array), [axis for axis in range(array.ndim) if moment is None or axis != moment.axis]
     if len(own) not in (2, 3):
         raise SceneError(f"{path} holds shape {array.shape}; expected y, x and band; store one time or level")
-    if not any(word.lower() in (*ROWS, *COLUMNS, *BANDS, *TIMES) or word in arrays for word in named):
+    if not any(_word(dim) in (*ROWS, *COLUMNS, *BANDS, *TIMES) or dim in arrays for dim in named):
         spectral = [axis for axis in _spectral_axes(arrays, array) if axis in own]
         if len(own) == 2 or len(spectral) != 1 or spectral == own[-1:]:
             return tuple(own), ("dims have no names, read as y, x, band",)
         rest = [axis for axis in own if axis not in spectral]
         return (*rest, *spectral), (f"dims have no names, read as y, x and band: axis {spectral[0]} (from 0) is band",)
-    words = {axis: named[axis].lower() for axis in own}
+    words = {axis: _word(named[axis]) for axis in own}
     found = [[at for at, word in words.items() if word in known] for known in (ROWS, COLUMNS, BANDS)]
     found[2] = found[2] or [at for at in words if _is_spectral(arrays.get(named[at]))]
     if any(len(places) != 1 for places in found[: len(own)]) or (len(own) == 2 and found[2]):

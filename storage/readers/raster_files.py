@@ -34,6 +34,7 @@ from storage.readers.cube_sources import (
     check_numbers,
 )
 from storage.readers.envi_cubes import open_envi_cube
+from storage.readers.hdf_cubes import HDF_ENDINGS
 from storage.readers.raster_tags import (
     bad_bands,
     bad_bands_said,
@@ -193,7 +194,7 @@ def _named_bands(names: list[str]) -> tuple[list[int], tuple[float, ...] | None,
 
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp")
-SCENE_ENDINGS = (*IMAGE_ENDINGS, *TIFF_ENDINGS, ".npy", *NAMED_ENDINGS, ".hdr")
+SCENE_ENDINGS = (*IMAGE_ENDINGS, *TIFF_ENDINGS, ".npy", *NAMED_ENDINGS, ".hdr", *HDF_ENDINGS)
 
 _PILLOW_LIMIT = threading.RLock()  # it is the process's, not a call's
 _FORMATS = ("PNG", "JPEG", "BMP")  # whatever the ending says; Pillow's others may run programs
@@ -201,11 +202,17 @@ _BYTES = {"I": 4, "F": 4, "I;16": 2, "I;16L": 2, "I;16B": 2}  # a number, by Pil
 _WITH_VARIABLE = re.compile(
     r"^(?P<path>.+\.(?:mat|npz|zarr|npy)):(?P<variable>[^/\\:]+(?::\d+)?)$", re.IGNORECASE | re.DOTALL
 )
+_WITH_GROUPS = re.compile(
+    r"^(?P<path>.+\.(?:nc4?|h5|hdf5|he5)):(?P<variable>[^:]+(?::\d+)?)$", re.IGNORECASE | re.DOTALL
+)
 
 
 def split_variable(address: str | Path) -> tuple[Path, str | None]:
-    """``scene.mat:cube`` -> path and variable, with the step of time in ``cube:3``; None where none is named."""
-    found = _WITH_VARIABLE.match(str(address))
+    """``scene.mat:cube`` -> path and variable, with the step of time in ``cube:3``; None where none is named.
+
+    The variable of a NetCDF or HDF5 file may begin with its groups: ``scene.h5:SERC/Reflectance/Reflectance_Data``.
+    """
+    found = _WITH_VARIABLE.match(str(address)) or _WITH_GROUPS.match(str(address))
     return (Path(address), None) if found is None else (Path(found["path"]), found["variable"])
 
 
@@ -221,6 +228,10 @@ def load_raster(address: str | Path, *, dims: int) -> Raster:
     if not path.is_file():
         raise SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
     ending = path.suffix.lower()
+    if ending in HDF_ENDINGS:
+        raise SceneError(
+            f"{path} is read as a scene alone; write labels, masks and reference frames as TIFF, PNG or .npy"
+        )
     if ending in TIFF_ENDINGS and (guess := content_guess(path)):
         raise SceneError(f"{path} cannot be read as {ending}: {guess}")
     if ending not in SCENE_ENDINGS:
@@ -247,7 +258,7 @@ _BEGINNINGS = {  # of files, and the endings that go with them
     b"MM\0*": TIFF_ENDINGS,
     b"\x93NUMPY": (".npy",),
     b"PK\x03\x04": (".npz",),
-    b"\x89HDF": (".mat",),
+    b"\x89HDF": (".mat", *HDF_ENDINGS),
     b"MATLAB": (".mat",),
 }
 

@@ -29,6 +29,7 @@ from storage.arrays.layout import create_array, create_group, image_spec, write_
 from storage.arrays.quicklooks import LineThumbnail, write_quicklook
 from storage.readers.cube_sources import BLOCK_LINES, Bands, CubeSource, LineFacts, check_cube_source
 from storage.readers.envi_cubes import DATA_ENDINGS, find_envi_pair, open_envi_cube
+from storage.readers.hdf_cubes import HDF_ENDINGS, open_hdf_cube
 from storage.readers.headwall_folders import find_reference, open_envi_source, open_headwall_cube
 from storage.readers.labels import load_frame_or_raster
 from storage.readers.raster_files import (
@@ -42,7 +43,7 @@ from storage.readers.raster_files import (
 from storage.readers.scene_toml import BandWavelengths, SceneSettings, find_scene_settings, settle_wavelengths
 from storage.readers.zarr_scenes import find_zarr_store, open_zarr_cube
 
-Reader = Literal["zarr", "headwall", "envi", "raster"]
+Reader = Literal["zarr", "headwall", "envi", "hdf", "raster"]
 
 
 def reader_of(address: str | Path) -> Reader:
@@ -56,6 +57,8 @@ def reader_of(address: str | Path) -> Reader:
         return "headwall" if find_zarr_store(path) is None else "zarr"
     if path.suffix.lower() == ".hdr":
         return "envi"
+    if path.suffix.lower() in HDF_ENDINGS and path.is_file():
+        return "hdf"
     if path.suffix.lower() in SCENE_ENDINGS or not path.is_file():
         return "raster"
     beside = {path.with_name(path.name + ".hdr").name.lower(), path.with_suffix(".hdr").name.lower()}
@@ -83,6 +86,8 @@ def open_cube_source(
             found = [(kind, find_reference(path, kind)) for kind, frame in stated if frame is None]
         case "envi":
             source = open_envi_source(path)
+        case "hdf":
+            source = open_hdf_cube(path, variable)
         case "raster":
             source = _raster_source(address)
     for kind, frame in (*found, *stated):
@@ -121,7 +126,7 @@ def load_frame(address: str | Path) -> tuple[NDArray[np.float32], tuple[Path, ..
         case "envi":
             files: tuple[Path, ...] = find_envi_pair(path)
             values = open_envi_cube(path).values
-        case "raster":
+        case "hdf" | "raster":
             values, files = load_raster(address, dims=3).values, (path,)
     if values.dtype.kind not in "uif":
         raise SceneError(f"{path} holds {values.dtype}, expected the real numbers of a reference frame")
