@@ -20,7 +20,7 @@ from flows.terminal.progress import StageProgress, put_out
 from pipeline.errors import SettingsError
 from pipeline.readings import MOST_VALUE
 from storage.archive.whole_files import write_whole
-from storage.readers.label_files import listed_names
+from storage.readers.label_files import is_store, listed_names
 from storage.readers.raster_files import split_variable
 from storage.readers.scene_drafts import FoundClass, SceneDraft, draft_scene
 from storage.readers.scene_toml import SETTINGS_NAME
@@ -52,7 +52,7 @@ def run_init(source: str, console: Console, *, force: bool = False) -> dict[str,
     to; else as `draft_scene`.
     """
     place, _ = split_variable(source)
-    path = (place if place.is_dir() and place.suffix.lower() != ".zarr" else place.parent) / SETTINGS_NAME
+    path = (place if place.is_dir() and not is_store(place) else place.parent) / SETTINGS_NAME
     if path.exists() and not force:
         raise SettingsError(f"there is a {path} already; change it by hand, or write a new one with --force")
     with writing(path.parent, "folder"), _set_aside(path):

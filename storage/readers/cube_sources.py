@@ -83,6 +83,7 @@ class Raster:
     geobox: GeoBox | None = None  # where its pixels lie on the earth
     void: NDArray[np.bool_] | None = None  # (y, x) pixels that are transparent or masked: they have no value
     bad_bands: tuple[int, ...] = ()  # that the file itself calls bad, from 0
+    scaling: str = ""  # scale and offset that were applied to the file's numbers, for hashes
 
     def three_axes(self, path: Path) -> NDArray[Any]:
         """(y, x, band) values; two axes are one band (SceneError: it has others)."""

@@ -17,6 +17,7 @@ from storage.readers.label_files import (
     folders_within,
     image_folder,
     is_label_name,
+    is_store,
     listed_names,
     match_folder,
     scene_entries,
@@ -197,7 +198,7 @@ class _Scenes:
 
 def _scenes(path: str | Path, train_mask: str | Path | None) -> _Scenes:
     file, _ = split_variable(path)
-    if not file.is_dir() or file.suffix.lower() == ".zarr":
+    if not file.is_dir() or is_store(file):
         if not file.exists():
             raise SceneError(f"there is no file or folder {file}; check the name (seen from {Path.cwd()})")
         return _Scenes({file.stem: str(path)})

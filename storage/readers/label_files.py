@@ -59,12 +59,12 @@ class MatchedFiles:
 
 
 def scene_entries(folder: Path) -> list[Path]:
-    """Files and Zarr stores of a folder that may be scenes or labels, by name; hidden ones are nobody's."""
+    """Files, Zarr stores and .SAFE folders that may be scenes or labels, by name; hidden ones are nobody's."""
     return sorted(
         entry
         for entry in folder.iterdir()
         if not entry.name.startswith(".")
-        and ((entry.suffix.lower() in SCENE_ENDINGS and entry.is_file()) or _is_store(entry))
+        and ((entry.suffix.lower() in SCENE_ENDINGS and entry.is_file()) or is_store(entry))
     )
 
 
@@ -95,7 +95,7 @@ def match_folder(folder: Path) -> MatchedFiles:
 
 def find_label(scene: Path) -> Path | None:
     """The label file of one scene by its name; None where there is none (SceneError: there are several)."""
-    if not scene.parent.is_dir() or (scene.is_dir() and not _is_store(scene)):
+    if not scene.parent.is_dir() or (scene.is_dir() and not is_store(scene)):
         return None
     try:
         beside = [entry for entry in scene_entries(scene.parent) if is_label_name(entry) and entry != scene]
@@ -112,7 +112,7 @@ def is_label_name(path: Path) -> bool:
 
 def folders_within(folder: Path) -> str:
     """Words for the folders of a folder in which images lie, for whoever looks for some; nothing where none does."""
-    inner = [entry for entry in sorted(folder.iterdir()) if entry.is_dir() and not _is_store(entry)]
+    inner = [entry for entry in sorted(folder.iterdir()) if entry.is_dir() and not is_store(entry)]
     found = [entry for entry in inner if not entry.name.startswith(".") and scene_entries(image_folder(entry))]
     return f"; there are some in its folders {listed_names(found)}: name one" if found else ""
 
@@ -124,8 +124,9 @@ def listed_names(paths: Iterable[Path]) -> str:
     return ", ".join(names[:SHOWN]) + more
 
 
-def _is_store(entry: Path) -> bool:
-    return entry.suffix.lower() == ".zarr" and entry.is_dir()
+def is_store(entry: Path) -> bool:
+    """Whether a folder is one scene: a Zarr store or a product of Sentinel-2."""
+    return entry.suffix.lower() in (".zarr", ".safe") and entry.is_dir()
 
 
 def _in_label_folders(folder: Path) -> list[Path]:

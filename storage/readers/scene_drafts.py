@@ -22,11 +22,12 @@ from storage.readers.label_files import (
     folders_within,
     image_folder,
     is_label_name,
+    is_store,
     listed_names,
     match_folder,
 )
 from storage.readers.labels import MIXED, MOST_FOUND_CLASSES, load_codes, shown_value, value_of_code
-from storage.readers.raster_files import IMAGE_ENDINGS, TIFF_ENDINGS, image_shape, open_tiff_rows, split_variable
+from storage.readers.raster_files import IMAGE_ENDINGS, ROW_ENDINGS, image_shape, open_tiff_rows, split_variable
 from storage.readers.scan_files import open_cube_source
 from storage.readers.scene_files import scene_number
 from storage.readers.scene_toml import ClassValue
@@ -73,7 +74,7 @@ def draft_scene(address: str | Path, report: Report = lambda done, name: None) -
     their values are mixed.
     """
     path, _ = split_variable(address)
-    alone = not path.is_dir() or path.suffix.lower() == ".zarr"
+    alone = not path.is_dir() or is_store(path)
     if not path.exists():
         raise SceneError(f"there is no file or folder {path}; check the name (seen from {Path.cwd()})")
     found = _one_file(path) if alone else match_folder(image_folder(path))
@@ -203,7 +204,7 @@ def _shape(image: Path) -> tuple[int, int, int]:
     """(y, x, band) of an image, by its head where it has one."""
     if image.suffix.lower() in IMAGE_ENDINGS:
         return image_shape(image)
-    rows = open_tiff_rows(image) if image.suffix.lower() in TIFF_ENDINGS else None
+    rows = open_tiff_rows(image) if image.suffix.lower() in ROW_ENDINGS else None
     return open_cube_source(image).shape if rows is None else rows.shape
 
 

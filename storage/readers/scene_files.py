@@ -124,6 +124,7 @@ def load_scene_file(
     some_bands = () if chosen == list(range(count)) else (f"bands {bands_text(chosen)} of {count}, counted from 0",)
     stated: tuple[str, ...] = () if settings.nodata is None else (f"nodata {settings.nodata!r}",)
     stated += () if gaps is None else (f"void {hashlib.sha256(np.packbits(gaps).tobytes()).hexdigest()}",)
+    stated += (raster.scaling,) if raster.scaling else ()
     light_hash = _digest(_content_hash(file, raster), variable, chosen, light.centre_nm.tolist(), widths, *stated)
     content_hash = light_hash
     if found is not None:
