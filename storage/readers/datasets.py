@@ -23,6 +23,7 @@ from storage.readers.label_files import (
     scene_entries,
 )
 from storage.readers.labels import found_classes, load_codes
+from storage.readers.polygon_labels import is_polygon_file, polygon_classes
 from storage.readers.raster_files import SCENE_ENDINGS, split_variable
 from storage.readers.scene_files import SceneFile, label_file, load_scene_file, scene_number
 from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings
@@ -64,6 +65,14 @@ class DataSet:
         settings = find_scene_settings(Path(next(iter(self.files.values()))))
         if settings.classes:
             return {}
+        polygons = [file for file in self.label_files.values() if is_polygon_file(file)]
+        if polygons and len(polygons) < len(self.label_files):
+            raise SceneError(
+                f"{self.path}: some labels are polygons ({listed_names(polygons)}) and some are pictures; name their"
+                f" classes in a {SETTINGS_NAME}, or use one kind"
+            )
+        if polygons:
+            return dict(polygon_classes(polygons, settings))
         return found_classes(self.label_files.values(), settings.unlabelled)
 
     @property

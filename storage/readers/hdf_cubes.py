@@ -288,6 +288,7 @@ def _hdf_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
     arrays: dict[str, FileArray] = {}
 
     def visit(name: str, item: Any) -> None:
+        """Keep an array of numbers, or a single text."""
         if not isinstance(item, h5py.Dataset) or item.external or item.is_virtual or item.shape is None:
             return
         about = _plain(item.attrs)
