@@ -90,7 +90,8 @@ def open_safe_rows(path: Path, resolution: str | None = None) -> TiffRows:
     if metadata is None or not images:
         lacking = "metadata (MTD_MSIL1C.xml or MTD_MSIL2A.xml)" if metadata is None else f"bands of {wanted} (.jp2)"
         raise SceneError(
-            f"{path} has no {lacking}; give a Sentinel-2 product of level 1C or 2A as its .SAFE folder or .zip"
+            f"{path} has no {lacking}; give a Sentinel-2 product of level 1C or 2A as its .SAFE folder or .zip, and"
+            " unpack a .zip of anything else"
         )
     said = _radiometry(product, metadata)
     opened = [open_image_rows(path, product.address(name)) for name in images.values()]

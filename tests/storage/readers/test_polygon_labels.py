@@ -1,4 +1,4 @@
-"""Labels that are polygons: on a map and in pixels, in every format, found by name, and one message for each mistake."""
+"""Labels that are polygons: on a map and in pixels, in every format, found by name; one message for each mistake."""
 
 from __future__ import annotations
 
@@ -19,7 +19,9 @@ from storage.readers.scene_drafts import draft_scene
 from storage.readers.scene_files import load_scene_file
 
 pytestmark = pytest.mark.filterwarnings(
-    "ignore:Use `@` matmul:PendingDeprecationWarning", "ignore:Dataset has no geotransform"
+    "ignore:Use `@` matmul:PendingDeprecationWarning",
+    "ignore:Dataset has no geotransform",
+    "ignore:'crs' was not provided",
 )
 PLACE = Affine(2, 0, 400_000, 0, -2, 5_700_000)
 SHAPE = 10, 12  # (y, x)
@@ -140,7 +142,7 @@ def test_labels_are_found_by_their_names(name: str, tmp_path: Path) -> None:
 
 
 def test_a_folder_of_scenes(tmp_path: Path) -> None:
-    """Each scene has its own polygons; classes are those of all files by name, and init writes them with their shares."""
+    """Each scene has its own polygons; classes are those of all files by name, and init finds them with shares."""
     for name, crops in (("a", ["wheat", "maize"]), ("b", ["maize", "oats"])):
         scene(tmp_path, f"{name}.tif")
         written(tmp_path / f"{name}.gpkg", crop=crops)
@@ -158,7 +160,7 @@ def test_a_folder_of_scenes(tmp_path: Path) -> None:
     with rasterio.open(tmp_path / "c_mask.tif", "w", "GTiff", SHAPE[1], SHAPE[0], 1, dtype="uint8") as file:
         file.write(np.ones((1, *SHAPE), np.uint8))
     scene(tmp_path, "c.tif")
-    with pytest.raises(SceneError, match="some labels are polygons .* and some are pictures"):
+    with pytest.raises(SceneError, match=r"some labels are polygons .* and some are pictures"):
         _ = load_data_set(tmp_path).classes
 
 
