@@ -86,6 +86,12 @@ def open_hdf_cube(path: Path, variable: str | None = None) -> CubeSource:
         level = next((one for one in _PRISMA_LEVELS if _PRISMA.format(one, "VNIR") in arrays), None)
         if level is not None and variable is None:
             return _prisma_cube(path, level, arrays, attributes)
+        if any(name.startswith("HDFEOS/SWATHS/PRS_") for name in arrays):
+            what = "is a PRISMA product of level 1" if level is None else f"has {variable} as a part of one cube"
+            raise SceneError(
+                f"{path} {what}, which is not read; give a product of level 2B, 2C or 2D by its name alone, and --bands"
+                " for some of its bands"
+            )
         cube = find_cube(arrays, variable, path)
         near = _in_scope(arrays, cube.name)
         for name in spectral_names(arrays) | {dim for dim in cube.dims if dim in near}:

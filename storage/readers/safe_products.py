@@ -48,11 +48,8 @@ def is_safe_product(path: Path) -> bool:
     """Tell whether an address is a Sentinel-2 product: a folder with its metadata, one called .SAFE, or a .zip."""
     if path.suffix.lower() == ".zip":
         return path.is_file()
-    return path.is_dir() and (path.suffix.lower() == ".safe" or any(map(_METADATA.search, _names_in(path))))
-
-
-def _names_in(folder: Path) -> list[str]:
-    return [entry.name for entry in folder.iterdir()]
+    named = path.suffix.lower() == ".safe"
+    return path.is_dir() and (named or any((path / f"MTD_MSIL{level}.xml").is_file() for level in ("1C", "2A")))
 
 
 @dataclass(frozen=True)

@@ -141,6 +141,13 @@ def test_prisma_reflectance(tmp_path: Path) -> None:
     assert "a PRISMA product of level 2D; 2 bands without a wavelength are left out" in scene.provenance
 
 
+def test_one_spectrometer_of_prisma(tmp_path: Path) -> None:
+    """Its axes are y, band and x: it is refused by its own name, and part of the whole."""
+    prisma_file(tmp_path / "PRS_L2D.he5")
+    with pytest.raises(SceneError, match="has VNIR_Cube as a part of one cube, which is not read"):
+        load_scene_file(f"{tmp_path / 'PRS_L2D.he5'}:VNIR_Cube")
+
+
 def test_prisma_in_sensor_geometry(tmp_path: Path) -> None:
     """Level 2C has no map grid, and says so."""
     prisma_file(tmp_path / "PRS_L2C.he5", "C")
@@ -255,6 +262,11 @@ def short_list(path: Path) -> None:
     prisma_file(path, List_Cw_Vnir=np.ones(3, np.float32))
 
 
+def level_1(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        file["HDFEOS/SWATHS/PRS_L1_HCO/Data Fields/VNIR_Cube"] = np.ones((7, 4, 6), np.uint16)
+
+
 def linked_outside(path: Path) -> None:
     neon_file(path.with_name("other.h5"))
     with h5py.File(path, "w") as file:
@@ -271,6 +283,7 @@ def linked_outside(path: Path) -> None:
         (no_cube, "has no array of numbers with the axes y, x and band; it has none"),
         (lost_attribute, "lacks what products of its kind have: .*L2ScaleSwirMax"),
         (short_list, r"Vnir_Cube has the shape \(7, 4, 6\) and 3 wavelengths"),
+        (level_1, "is a PRISMA product of level 1, which is not read; give a product of level 2B, 2C or 2D"),
         (linked_outside, "has no array of numbers with the axes y, x and band; it has none"),
     ],
 )
