@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -271,8 +272,12 @@ def _is_classic(path: Path) -> bool:
 
 
 def _classic_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
-    """Arrays and attributes of a NetCDF file of version 3, which is no HDF5."""
-    data = xr.open_dataset(path, engine="scipy", decode_cf=False)
+    """Arrays and attributes of a NetCDF file of version 3, which is no HDF5.
+
+    The file is read whole: asked for more bytes than it has, it would take the memory for them first.
+    """
+    check_memory(path, 3 * path.stat().st_size)
+    data = xr.open_dataset(BytesIO(path.read_bytes()), engine="scipy", decode_cf=False)
     arrays = {
         str(name): FileArray(
             one.shape,
