@@ -22,9 +22,11 @@ from storage.archive.staging import file_hash
 from storage.readers.cube_sources import BLOCK_LINES, Raster, machine_bytes, scene_lines
 from storage.readers.label_files import find_label
 from storage.readers.labels import Labels, load_frame_or_raster, load_labels
+from storage.readers.polygon_labels import is_polygon_file, load_polygon_labels
 from storage.readers.raster_files import split_variable
 from storage.readers.scan_files import known_bands, open_cube_source, reader_of
 from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings, settle_wavelengths
+from storage.readers.zone_files import split_layer
 
 if TYPE_CHECKING:
     from odc.geo.geobox import GeoBox
@@ -78,15 +80,15 @@ def load_scene_file(
     classes: Mapping[str, ClassValue] | None = None,
     labels_needed: bool = True,
 ) -> SceneFile:
-    """Read a scene from an image, .npy, .npz, .mat, ENVI, Zarr or a Headwall folder.
+    """Read a scene from an image, .npy, .npz, .mat, ENVI, Zarr, NetCDF, HDF5, Sentinel-2 or a Headwall folder.
 
     ``path`` may be ``FILE.mat:VARIABLE`` or ``STORE.zarr:ARRAY``, and end in a step of time, ``FILE.npy:STEP``. Axes
     are y, x, band; two axes are one band. What comes in lines with dark and white frames is taken over the white panel.
     What is given here wins over the ``scene.toml`` beside the file, and that over what the file says: a file of class
-    numbers or colours on the same pixels (frames of HyKo2 and RANUS bring their own, others are found by their names),
-    bands to use, counted from 0, and wavelengths [nm], one for each band used or for each of the file. ``classes`` are
-    those of a scene.toml that states none. Labels found by their names that cannot be used are left out with a note
-    where no ``labels_needed``. Raises SceneError: a file is missing, damaged, of a kind or shape that
+    numbers or colours on the same pixels, or of polygons (frames of HyKo2 and RANUS bring their own, others are found
+    by their names), bands to use, counted from 0, and wavelengths [nm], one for each band used or for each of the file.
+    ``classes`` are those of a scene.toml that states none. Labels found by their names that cannot be used are left out
+    with a note where no ``labels_needed``. Raises SceneError: a file is missing, damaged, of a kind or shape that
     cannot be used, or the labels do not fit. WavelengthError: wavelengths are missing, or their number, unit or range
     is wrong.
     """
@@ -115,7 +117,7 @@ def load_scene_file(
         found, label_note = layout.labels, (layout.label_note,)
     else:
         try:
-            found, label_note = _labels(file, shape, labels, settings, classes or {})
+            found, label_note = _labels(file, shape, raster.geobox, labels, settings, classes or {})
         except SceneError as error:
             if labels_needed or not by_name:
                 raise
@@ -124,6 +126,7 @@ def load_scene_file(
     some_bands = () if chosen == list(range(count)) else (f"bands {bands_text(chosen)} of {count}, counted from 0",)
     stated: tuple[str, ...] = () if settings.nodata is None else (f"nodata {settings.nodata!r}",)
     stated += () if gaps is None else (f"void {hashlib.sha256(np.packbits(gaps).tobytes()).hexdigest()}",)
+    stated += (raster.scaling,) if raster.scaling else ()
     light_hash = _digest(_content_hash(file, raster), variable, chosen, light.centre_nm.tolist(), widths, *stated)
     content_hash = light_hash
     if found is not None:
@@ -327,7 +330,7 @@ def label_file(scene: Path, settings: SceneSettings) -> tuple[Path | None, str]:
         )
     told = settings.labels.replace("{number}", number or "").replace("{name}", scene.stem)
     address = settings.path.parent / told
-    if told != settings.labels and not address.is_file():
+    if told != settings.labels and not split_layer(address)[0].is_file():
         return None, f"no labels: there is no {address}"
     return address, ""
 
@@ -335,6 +338,7 @@ def label_file(scene: Path, settings: SceneSettings) -> tuple[Path | None, str]:
 def _labels(
     scene: Path,
     shape: tuple[int, int],
+    geobox: GeoBox | None,
     stated: str | Path | None,
     settings: SceneSettings,
     classes: Mapping[str, ClassValue],
@@ -342,10 +346,14 @@ def _labels(
     address, why_none = (stated, "") if stated is not None else label_file(scene, settings)
     if address is None:
         return None, (why_none,) if why_none else ()
-    found = load_labels(address, shape, classes=settings.classes or classes, unlabelled=settings.unlabelled)
+    known, notes = settings.classes or classes, tuple[str, ...]()
+    if is_polygon_file(address):
+        found, notes = load_polygon_labels(address, shape, geobox, settings=replace(settings, classes=known))
+    else:
+        found = load_labels(address, shape, classes=known, unlabelled=settings.unlabelled)
     how = f"classes from {settings.path}" if settings.classes else f"{len(found.names)} classes as found in the file"
     by_name = "" if stated is not None or settings.labels is not None else ", found by its name"
-    return found, (f"labels from {address}{by_name}, {how}", *_one_class_note(found))
+    return found, (f"labels from {address}{by_name}, {how}", *notes, *_one_class_note(found))
 
 
 def _one_class_note(found: Labels) -> tuple[str, ...]:
