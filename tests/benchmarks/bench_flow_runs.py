@@ -37,7 +37,8 @@ def rows() -> list[Row]:
 def _row(what: str, spent: list[float], goal_s: float) -> Row:
     median = statistics.median(spent)
     load = f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}"
-    counted = f"`--engine prefect` less `--engine plain`, {len(spent)} rounds in turn: {min(spent):.1f} to {max(spent):.1f} s; {load}"
+    spread = f"{len(spent)} rounds in turn: {min(spent):.1f} to {max(spent):.1f} s"
+    counted = f"`--engine prefect` less `--engine plain`, {spread}; {load}"
     return Row(f"Prefect's processor time, {what}", f"{median:.1f} s", f"<= {goal_s:g} s", median <= goal_s, counted)
 
 
