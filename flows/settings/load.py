@@ -357,7 +357,7 @@ def _scene_wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str
     if scene == RIG_FIELD and settings.source != RIG:
         yield f"scene {RIG_FIELD!r} is what stands before a rig: give --source rig, or a file"
     if settings.is_map and scene in BUILT_IN_SCENES:
-        yield f"source 'raster' takes the pixels of a file, and the scene {scene} is drawn: give --source sim, or a file"
+        yield f"source 'raster' takes the pixels of a file, and {scene} is drawn: give --source sim, or a file"
     if settings.size is not None and scene not in (*BUILT_IN_SCENES, RIG_FIELD):
         yield f"size is for built-in scenes ({', '.join(BUILT_IN_SCENES)}); {scene} has its own"
     for name, value in {"day": settings.day, "hour": settings.hour}.items():

@@ -192,22 +192,22 @@ class Settings:
     )
     compute: Compute | None = stated(
         None,
-        "Of a uniform scan or a raster read in detail what promises most for so much of the multiply-adds of reading everything, "
-        "25%, or for so many, 4e9; the rest is read from its coarse means",
+        "Of a uniform scan or a raster read in detail what promises most for so much of the multiply-adds of reading "
+        "everything, 25%, or for so many, 4e9; the rest is read from its coarse means",
         example="25%",
         why=ALL_OF_IT,
     )
     bytes_kept: BytesKept | None = stated(
         None,
-        "Of a uniform scan or a raster keep in detail what promises most within so much of the bytes of all its pixels and coarse "
-        "means, 40%, or within so many before compression, 500MB",
+        "Of a uniform scan or a raster keep in detail what promises most within so much of the bytes of all its pixels "
+        "and coarse means, 40%, or within so many before compression, 500MB",
         example="40%",
         why=ALL_OF_IT,
     )
     least_gain: float | None = stated(
         None,
-        "Of a uniform scan or a raster keep and read in detail only seats that promise at least so much, for the policies gain and "
-        "entropy",
+        "Of a uniform scan or a raster keep and read in detail only seats that promise at least so much, for the "
+        "policies gain and entropy",
         "nat per px",
         0,
         100,

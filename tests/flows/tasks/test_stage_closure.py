@@ -105,9 +105,9 @@ def test_an_edited_expression_changes_the_digest(edit: dict[str, str]) -> None:
         | {"flows.tasks.stages": STAGE.replace("numpy as np", "numpy").replace("np.", "numpy.")},
         {"flows.tasks.stages": STAGE.replace("brighter as more", "brighter").replace("more(", "brighter(")},
         {
-            "flows.tasks.stages": STAGE.replace(
-                "from pipeline import sums", "from pipeline.sums import total"
-            ).replace("sums.t", "t")
+            "flows.tasks.stages": STAGE.replace("from pipeline import sums", "from pipeline.sums import total").replace(
+                "sums.t", "t"
+            )
         },
     ],
 )
