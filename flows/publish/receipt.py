@@ -187,10 +187,11 @@ def build_receipt(
 ) -> Receipt:
     """Put a receipt together in its fixed order and check that nothing is missing (ShapeError names what is).
 
-    ``savings`` are `COSTS`, of a raster `OF_A_RASTER`, and, where measured, ``segment_wall_s``, each with the fields of `Saving`. ``accuracy`` has
-    the fields of `Accuracy`, ``judged`` is when it was worked out; None where the map is not judged, or not yet:
-    ``accuracy_is`` says which. ``simulation`` has ``effects``, rows with name, state, variant, bound, measured, cost_s,
-    why, unit, and ``total``, their sums; None for a source that is not simulated. ``findings``: see `FINDINGS`.
+    ``savings`` are `COSTS`, of a raster `OF_A_RASTER`, and, where measured, ``segment_wall_s``, each with the fields of
+    `Saving`. ``accuracy`` has the fields of `Accuracy`, ``judged`` is when it was worked out; None where the map is not
+    judged, or not yet: ``accuracy_is`` says which. ``simulation`` has ``effects``, rows with name, state, variant,
+    bound, measured, cost_s, why, unit, and ``total``, their sums; None for a source that is not simulated.
+    ``findings``: see `FINDINGS`.
     """
     receipt: dict[str, object] = {**asdict(header), "stages": [asdict(stage) for stage in stages]}
     receipt["savings"] = {name: savings[name] for name in (*COSTS, "segment_wall_s") if name in savings}

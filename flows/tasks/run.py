@@ -159,10 +159,14 @@ class SurveyRun(CaptureRun):
         return {"weights": self.weights_key, **({} if self.device == PROCESSOR else {"device": self.device})}
 
     @property
+    def chooses(self) -> bool:
+        """Whether patches are chosen by their scores; where all are seen and read there is nothing to choose."""
+        return not self.plan.plain or self.budget is not None
+
+    @property
     def controls(self) -> bool:
         """Whether other placements of seats are judged too; a plain scan that is read whole places none."""
-        places = not self.plan.plain or self.budget is not None or self.raster is not None
-        return self.settings.controls and places
+        return self.settings.controls and (self.chooses or self.raster is not None)
 
     @cached_property
     def labels(self) -> NDArray[np.uint8] | None:

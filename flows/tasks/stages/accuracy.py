@@ -202,7 +202,8 @@ def _controls_mode(run: SurveyRun, seen: Glance, controls: Controls) -> dict[str
 def _segment_seconds(run: SurveyRun, seen: Glance, patches: StageRef, columns: NDArray[np.float32]) -> dict[str, float]:
     """Wall time of the model from spectral columns to the map, the better of two each [s].
 
-    As captured: glance, scores and map. With every seat there is nothing to choose: the map alone.
+    As captured: glance, scores where some are chosen, and map. With every seat there is nothing to choose: the map
+    alone.
     """
     (seats, own), settings = patch_columns(run, patches, seen), run.settings
     valid = run.grid.valid_seats()
@@ -211,7 +212,8 @@ def _segment_seconds(run: SurveyRun, seen: Glance, patches: StageRef, columns: N
 
     def look_choose_draw() -> None:
         looked = glance_of_columns(run.weights, seen.columns, run.grid)
-        score_seats(settings.policy, looked, seed=settings.seed, mask=run.mask, network=network)
+        if run.chooses:
+            score_seats(settings.policy, looked, seed=settings.seed, mask=run.mask, network=network)
         segment(run.weights, looked, own, seats)
 
     return {
