@@ -151,7 +151,7 @@ def scene_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def survey_png(scene_files: Path, weights: Path) -> Survey:
-    """Survey scene.png with its labels by the simulated rig, on the plain engine, into a folder; keywords change flags, None drops one."""
+    """Survey scene.png with its labels by the simulated rig into a folder; keywords change flags, None drops one."""
 
     def survey(out: Path, console: Console | None = None, **flags: Any) -> Published:
         given = {
