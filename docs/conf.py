@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from flows.settings.documents import settings_table  # noqa: E402
-from flows.tasks.stage import all_stages  # noqa: E402
+from flows.tasks.open_survey import STAGES  # noqa: E402
 
 project = "SpectralZoom"
 version = release = metadata.version("spectralzoom")
@@ -44,11 +44,10 @@ nitpick_ignore_regex = [("py:.*", ".*")]
 
 def stage_table() -> str:
     """Markdown: every stage in the order of a survey, from the records that the survey itself runs by."""
-    head = "| stage | on terminals | stored as, version | made of | work grows with |\n|---|---|---|---|---|\n"
+    head = "| stage | on terminals | stored as, version | work grows with |\n|---|---|---|---|\n"
     return head + "".join(
-        f"| `{one.name}` | {one.title} | `stages/{one.product.name}`, {one.product.version} "
-        f"| {', '.join(f'`{name}`' for name in one.of) or 'nothing'} | {one.unit} |\n"
-        for one in all_stages().values()
+        f"| `{one.name}` | {one.title} | `stages/{one.product.name}`, {one.product.version} | {one.unit} |\n"
+        for one in STAGES.values()
     )
 
 

@@ -69,6 +69,10 @@ class SceneError(PipelineError, ValueError):
     """A scene, label or mask file cannot be used."""
 
 
+class NotRecordedError(SceneError):
+    """A line is asked of a recording that was never taken."""
+
+
 class WavelengthError(SceneError):
     """Wavelengths do not fit the bands, the unit or the range."""
 

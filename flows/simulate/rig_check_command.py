@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 from rich.box import SIMPLE_HEAD
@@ -15,12 +16,13 @@ from flows.settings.load import load_settings
 from flows.terminal.processes import DONE, FAILED, PARTLY
 from flows.terminal.progress import on_stdout, print_json
 from pipeline.errors import SettingsError
+from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import CostModel
-from pipeline.rig.camera.headwall_camera import HeadwallCamera
-from pipeline.rig.device_settings import SurveyRig
+from pipeline.rig.device_settings import CameraLimits, SurveyRig
+from pipeline.rig.devices import SYSTEM_CLOCK
 from pipeline.rig.emulator.fault_names import fault_table
-from pipeline.rig.mirror.mirror_controller import open_mirror
-from pipeline.rig.rig_check import CheckRow, Device, check_camera, check_mirror, works
+from pipeline.rig.opening import open_camera_driver, open_devices, open_mirror_driver
+from pipeline.rig.rig_check import TRIGGERS, CheckRow, Device, check_camera, check_mirror, check_triggers, works
 
 LIST = "list"
 _COLOURS = {"ok": "green", "warn": "yellow", "fail": "bold red"}
@@ -48,6 +50,7 @@ class CheckRequest:
     camera: bool = True
     move: bool = False
     vector_pairs: int = CostModel.vector_pairs
+    exposed: LineCamera = field(default_factory=LineCamera)  # times of a capture whose edges are counted
 
 
 def check_request(settings: Path | None, port: str | None, camera: str | None, *, move: bool = False) -> CheckRequest:
@@ -59,21 +62,30 @@ def check_request(settings: Path | None, port: str | None, camera: str | None, *
     if camera is not None:
         rig = _at(rig, camera)
     both = settings is not None or port is camera is None
-    return CheckRequest(rig, both or port is not None, both or camera is not None, move, wanted.cost.vector_pairs)
+    mirror_asked, camera_asked = both or port is not None, both or camera is not None
+    return CheckRequest(rig, mirror_asked, camera_asked, move, wanted.cost.vector_pairs, wanted.camera)
 
 
 def run_check(request: CheckRequest, console: Console, *, as_json: bool = False) -> int:
     """Check the devices, with a table on stdout; 0 where nothing failed, 3 where one of two works, 1 otherwise."""
-    rig = request.rig
+    rig = replace(request.rig, park_at_close=False)  # the square ends at 0; 0 by itself
+    limits = CameraLimits(most_rate_hz=request.exposed.max_rate_hz)
     asked: dict[Device, bool] = {"mirror": request.mirror, "camera": request.camera}
-    settings = replace(rig.mirror(request.vector_pairs), park_at_close=False)  # the square ends at 0; 0 by itself
     rows: list[CheckRow] = []
     if request.mirror:
         with console.status(f"asking the mirror at {rig.port}"):
-            rows += check_mirror(lambda: open_mirror(settings), move=request.move)
+            open_mirror = partial(open_mirror_driver, rig, request.vector_pairs)
+            rows += check_mirror(open_mirror, SYSTEM_CLOCK, move=request.move)
     if request.camera:
         with console.status(f"asking the camera at {rig.host}"):
-            rows += check_camera(HeadwallCamera.at(rig.camera, rig.files), rig.files)
+            rows += check_camera(partial(open_camera_driver, rig, limits))
+    why_not = _why_no_triggers(request, rows)
+    if request.mirror and why_not:
+        rows.append(CheckRow("mirror", TRIGGERS, f'not tried {why_not}; pulses = "{rig.pulses}" is taken on trust'))
+    elif request.mirror:
+        with console.status("asking what steps a path"):
+            connect = partial(open_devices, rig, request.vector_pairs, limits)
+            rows += check_triggers(connect, SYSTEM_CLOCK, rig.pulses, request.exposed)
     good = [works(rows, device) for device, is_asked in asked.items() if is_asked]
     code = DONE if all(good) else PARTLY if any(good) else FAILED
     if not as_json:
@@ -91,6 +103,15 @@ def run_check(request: CheckRequest, console: Console, *, as_json: bool = False)
         }
     )
     return code
+
+
+def _why_no_triggers(request: CheckRequest, rows: Sequence[CheckRow]) -> str:
+    """Return why no path is played; "" where one is."""
+    if not request.move:
+        return "without --move"
+    if not request.camera:
+        return "without a camera"
+    return "" if all(row.verdict == "ok" for row in rows) else "as not all of the above is in order"
 
 
 def _print(rows: Sequence[CheckRow], console: Console) -> None:

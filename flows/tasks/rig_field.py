@@ -11,13 +11,12 @@ from typing import Any
 from flows.settings.survey_settings import Settings
 from pipeline.geometry.mirror import STRAIGHT
 from pipeline.geometry.scan import Sweep, exposing, sweep_positions
+from pipeline.rig import opening
 from pipeline.rig.camera.camera_files import KeptInMemory
-from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.capture.capture_runner import RigDevices
 from pipeline.rig.capture.rig_source import RigSource
 from pipeline.rig.device_settings import CameraLimits, check_times
 from pipeline.rig.devices import SYSTEM_CLOCK, Clock
-from pipeline.rig.mirror.mirror_controller import open_mirror
 from pipeline.simulator.effects.effect import Effect
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.source import Source
@@ -52,8 +51,16 @@ class RigField:
 
 
 def rig_field(scene: RasterScene, settings: Settings, planned: Sequence[Sweep]) -> RigField:
-    """The rig, not yet connected; SettingsError: times the camera does not take, PoseError: beyond the mirror."""
+    """The rig, not yet connected.
+
+    Raises
+    ------
+    SettingsError : the camera does not take such times, or a driver of another make cannot be imported.
+    PoseError : the mirror, as it is mounted, does not reach the field.
+    """
     camera, rig = settings.camera, settings.rig
+    opening.factory_of(rig, "mirror_driver")
+    opening.factory_of(rig, "camera_driver")
     for exposed in {exposing(camera, sweep) for sweep in planned} | {camera}:
         check_times(exposed.exposure_ms, exposed.frame_ms, CameraLimits(most_rate_hz=camera.max_rate_hz))
     if rig.mounting != STRAIGHT:
@@ -72,19 +79,6 @@ def rig_field(scene: RasterScene, settings: Settings, planned: Sequence[Sweep]) 
 
 
 def open_devices(settings: Settings, clock: Clock = SYSTEM_CLOCK) -> RigDevices:
-    """Connect to mirror and camera; nothing moves.
-
-    Raises DeviceGone: no such port, in use, not permitted, or the camera is not there; DeadlinePassed: nothing answers;
-    RigError: another device does.
-    """
-    rig = settings.rig
-    mirror = open_mirror(rig.mirror(settings.cost.vector_pairs), clock, known=True)
+    """Connect to mirror and camera, as `pipeline.rig.opening.open_devices` does. Nothing moves."""
     limits = CameraLimits(most_rate_hz=settings.camera.max_rate_hz)
-    camera = HeadwallCamera.at(rig.camera, rig.files, limits=limits, clock=clock)
-    devices = RigDevices(mirror, camera, clock)
-    try:
-        camera.is_capturing()
-    except BaseException:
-        devices.close()
-        raise
-    return devices
+    return opening.open_devices(settings.rig, settings.cost.vector_pairs, limits, clock)

@@ -129,7 +129,7 @@ class MirrorLink:
     )
     retries: int = stated(Patience.retries, "Of requests that only read; motions are sent once", "", 0, 20)
     quiet_s: float = assumed(Patience.quiet_s, "Silence after which an answer that is owed will not come", "s", 0, 5)
-    with_crc: bool = assumed(True, "Requests carry a CRC")
+    with_crc: bool = assumed(False, "Requests carry a CRC; `rig check` tries both")
     strict_crc: bool = stated(False, "Refuse replies whose CRC does not fit, which is warned of otherwise")
     ends: Ends = assumed("exclusive", "What the mirror takes the end of a range for")  # erratum E14
     read_back: ReadBack = stated("sampled", "How much of a path is read back and compared")
@@ -169,6 +169,16 @@ class SurveyRig(MirrorLink):
     of the assumed values somebody has confirmed.
     """
 
+    mirror_driver: str = stated(
+        "",
+        "Driver of a mirror of another make, as module:function; by default that of the MR-E-2",
+        example="lab:mirror",
+    )
+    camera_driver: str = stated(
+        "",
+        "Driver of a camera of another make, as module:function; by default that of the Nano-Hyperspec",
+        example="lab:camera",
+    )
     mirror_axes: Axes = assumed(
         Mounting.axes,
         "What the device's X and Y are of a mirror mounted straight: '-x,-y' is upside down, 'y,-x' turned",
@@ -200,9 +210,9 @@ class SurveyRig(MirrorLink):
         FileServer.read_twice, "Read the camera's files twice: FTP has no checksums, so two readings have to agree"
     )
     pulses: Pulses = assumed(
-        "position",
+        "none",
         "At the mirror's trigger input: one a held position (a pulse generator between camera and mirror), one a frame "
-        "(steps fine sweeps only), or none",
+        "(steps fine sweeps only), or none: the path then goes by the mirror's clock",
     )
     log_pulses: bool = stated(
         False, "Read the mirror's log with pulses too: lines lie where it measured, tied by edges"

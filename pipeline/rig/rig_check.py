@@ -1,20 +1,33 @@
-"""What `rig check` asks of both devices. Nothing moves and nothing is set, unless the square is asked for."""
+"""Questions of `rig check` to both devices. Nothing moves and nothing is set, unless ``move`` is asked for.
+
+Every driver is asked to connect, and with ``move`` to go round a small square and to play a path that stays at 0; 0.
+The shipped drivers are asked for more: identity, status, temperature, frames with and without a CRC, files.
+"""
 
 from __future__ import annotations
 
 import logging
 import math
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Literal
 
+import numpy as np
+
 from pipeline.errors import PipelineError, RigError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep
 from pipeline.rig.camera.camera_files import log_in
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
-from pipeline.rig.device_settings import FileServer
+from pipeline.rig.capture.capture_paths import capture_prefix
+from pipeline.rig.capture.capture_runner import POLL_S, SLACK_S, RigDevices
+from pipeline.rig.device_settings import Pulses
+from pipeline.rig.devices import Clock
+from pipeline.rig.drivers import CameraDriver, MirrorDriver
 from pipeline.rig.mirror.mirror_controller import MirrorController, check_model
-from pipeline.rig.mirror.registers import Status
+from pipeline.rig.mirror.registers import Status, Trigger
 
 Verdict = Literal["ok", "warn", "fail"]
 Device = Literal["mirror", "camera"]
@@ -23,6 +36,9 @@ SQUARE = ((0.03, 0.03), (0.03, -0.03), (-0.03, -0.03), (-0.03, 0.03))  # within 
 NEAR, FAR = 0.002, 0.02  # of the disk's radius: a position read back is right within NEAR, and lost beyond FAR
 SETTLE_S = 2.0
 LOG_HZ, LOGGED = 1000.0, 8
+CELLS, OWN_HZ, OWN_S = 40, 20.0, 0.5  # of a path that stays at 0; 0: its cells, its rate, and how long it is played
+EDGES = Sweep("check", "coarse", "x", 0.0, 0.0, lines=4, step=8, binning=8)  # a capture whose edges are counted
+TRIGGERS = "what steps a path"
 MOST_NAMED = 5  # entries of a listing, warnings
 CONNECT = "connect"
 RESTLESS = "look for wind, a loose mount or a drive that hunts; a survey waits for rest in vain"
@@ -56,46 +72,131 @@ def works(rows: Sequence[CheckRow], device: Device) -> bool:
     return bool(verdicts) and "fail" not in verdicts
 
 
-def check_mirror(connect: Callable[[], MirrorController], *, move: bool = False) -> list[CheckRow]:
-    """Ask a mirror controller who it is and how it is; with ``move`` send it round a small square.
+def check_mirror(connect: Callable[[], MirrorDriver], clock: Clock, *, move: bool = False) -> list[CheckRow]:
+    """Ask a mirror for its identity and state; with ``move`` send it round a small square.
 
-    ``connect`` opens the port and greets the device there. It is closed again. Errors become rows.
+    ``connect`` opens the device, which is closed again. Errors become rows.
     """
     rows: list[CheckRow] = []
-    with _warnings(rows, "mirror"):
+    with _warnings(rows, "mirror") as heard:
         try:
             mirror = connect()
         except RigError as error:
             rows.append(failed("mirror", CONNECT, error))
             return rows
         try:
-            _ask_mirror(mirror, rows, move=move)
+            if isinstance(mirror, MirrorController):
+                playing = _ask_mirror(mirror, rows, heard)
+            else:
+                rows.append(CheckRow("mirror", CONNECT, f"{type(mirror).__name__} is there"))
+                playing = False
+            if move and (playing or any(row.verdict == "fail" for row in rows)):
+                rows.append(CheckRow("mirror", "move", "nothing was moved", "warn", "mend what is named above first"))
+            elif move:
+                _move(mirror, clock, rows)
         finally:
             mirror.close()
     return rows
 
 
-def check_camera(camera: HeadwallCamera, server: FileServer) -> list[CheckRow]:
-    """Ask a camera whether it captures and what it holds, and log in to its files. Errors become rows."""
+def check_camera(connect: Callable[[], CameraDriver]) -> list[CheckRow]:
+    """Ask a camera whether it captures, and the shipped one for its files. Errors become rows."""
     rows: list[CheckRow] = []
     with _warnings(rows, "camera"):
+        try:
+            camera = connect()
+        except RigError as error:
+            rows.append(failed("camera", CONNECT, error))
+            return rows
         try:
             if camera.is_capturing():
                 mend = "is another program at work? Else stop it"
                 rows.append(CheckRow("camera", "whether it captures", "a capture runs", "warn", mend))
             else:
                 rows.append(CheckRow("camera", "whether it captures", "no capture runs"))
-            _row(rows, "camera", "list its files", lambda: _listing(camera))
+            if isinstance(camera, HeadwallCamera):
+                _row(rows, "camera", "list its files", partial(_listing, camera))
         except RigError as error:
             rows.append(failed("camera", CONNECT, error))
         finally:
             camera.close()
-        _row(rows, "camera", f"log in to its files, port {server.port}", lambda: log_in(server))
+        if isinstance(camera, HeadwallCamera):
+            _row(rows, "camera", f"log in to its files, port {camera.server.port}", partial(log_in, camera.server))
     return rows
 
 
-def _ask_mirror(mirror: MirrorController, rows: list[CheckRow], *, move: bool) -> None:
-    found = mirror.identity()
+def check_triggers(
+    connect: Callable[[], RigDevices], clock: Clock, pulses: Pulses, exposed: LineCamera
+) -> list[CheckRow]:
+    """Play a path by the mirror's own clock, and then by the edges of a capture of four frames: row by row what came.
+
+    All positions of the path are 0; 0, so the mirror stays there. ``pulses`` is the setting that the edges are compared
+    with, ``exposed`` the camera whose times the capture has. Errors become rows.
+    """
+    rows: list[CheckRow] = []
+    with _warnings(rows, "mirror"):
+        try:
+            devices = connect()
+        except RigError as error:
+            rows.append(failed("mirror", TRIGGERS, error))
+            return rows
+        try:
+            rows += _triggers(devices, clock, pulses, exposed)
+        except PipelineError as error:
+            rows.append(failed("mirror", TRIGGERS, error))
+            for stop in (devices.camera.stop, devices.steering.halt):
+                with suppress(RigError):
+                    stop()
+        finally:
+            devices.close()
+    return rows
+
+
+def _triggers(devices: RigDevices, clock: Clock, pulses: Pulses, exposed: LineCamera) -> list[CheckRow]:
+    """Return a row of the path by its own clock, and one of the path by edges."""
+    mirror, camera = devices.steering, devices.camera
+    mirror.goto(0.0, 0.0)
+    mirror.settle(SETTLE_S)
+    mirror.load_path(np.zeros((CELLS, 2)))
+    mirror.run(0, CELLS, OWN_HZ)
+    clock.sleep(OWN_S)
+    stepped = mirror.index()
+    mirror.halt()
+    camera.configure(exposed.exposure_ms, exposed.frame_ms)
+    mirror.run(0, CELLS, OWN_HZ, 1, Trigger.RISING_EDGE)
+    capture = camera.capture(EDGES.lines, prefix=capture_prefix(EDGES))
+    until = clock.now() + EDGES.lines * exposed.frame_ms / 1000 + SLACK_S
+    while camera.is_capturing():
+        if clock.now() >= until:
+            raise RigError(f"the capture {capture.folder} of {EDGES.lines} frames does not end; look at the camera")
+        clock.sleep(POLL_S)
+    edges = mirror.index()
+    mirror.halt()
+    came = f"{stepped} cells in {OWN_S:g} s at {OWN_HZ:g} Hz"
+    mend = "the path did not step: is it the mirror that the documents are of?"
+    clockwork = CheckRow("mirror", "a path by its own clock", came, *(() if stepped else ("fail", mend)))
+    return [clockwork, _edges_row(edges, capture.folder, pulses)]
+
+
+def _edges_row(edges: int, folder: str, pulses: Pulses) -> CheckRow:
+    """Return which pulses the edges of a capture of four frames show, beside the setting."""
+    more = " or more" if edges >= CELLS - 1 else ""
+    came = f"{edges}{more} edges in {EDGES.lines} frames ({folder} on the camera)"
+    found: dict[int, Pulses] = {0: "none", EDGES.lines: "frame"}
+    wired = found.get(edges, "position")
+    asked = "a path by edges at the trigger input"
+    if 0 < edges < EDGES.lines:
+        return CheckRow("mirror", asked, came, "fail", "edges are lost: look at the cable from camera to mirror")
+    if pulses == wired:
+        return CheckRow("mirror", asked, f'{came}, as pulses = "{pulses}" says')
+    if pulses == "none":
+        return CheckRow("mirror", asked, f'{came}; pulses = "{wired}" would step the mirror by them')
+    return CheckRow("mirror", asked, came, "fail", f'set pulses = "{wired}" in [rig]; it is "{pulses}"')
+
+
+def _ask_mirror(mirror: MirrorController, rows: list[CheckRow], heard: list[str]) -> bool:
+    """Add rows of the shipped mirror's identity and state; return whether a path plays."""
+    found, playing = mirror.identity(), False
     try:
         check_model(found, mirror.wire.port, mirror.settings.expected_id)
         rows.append(CheckRow("mirror", "identity", found.words))
@@ -112,12 +213,22 @@ def _ask_mirror(mirror: MirrorController, rows: list[CheckRow], *, move: bool) -
         else:
             rows.append(CheckRow("mirror", "path", "no path plays"))
             rows.append(CheckRow("mirror", "temperature", f"{mirror.temperature():.1f} deg C"))
+            before = len(heard)
+            _row(rows, "mirror", "frames with and without a CRC", partial(_answered_frames, mirror))
+            del heard[before:]  # refusals of frames that are sent for this are no fault of the line
     except RigError as error:
         rows.append(failed("mirror", "status", error))
-    if move and (playing or any(row.verdict == "fail" for row in rows)):
-        rows.append(CheckRow("mirror", "move", "nothing was moved", "warn", "mend what is told above first"))
-    elif move:
-        _move(mirror, rows)
+    return playing
+
+
+def _answered_frames(mirror: MirrorController) -> str:
+    """Return which frames are answered; those of the settings are, or nothing could be asked so far."""
+    own = mirror.settings.with_crc
+    why = mirror.why_unanswered(with_crc=not own)
+    if not why:
+        return f"both are answered; with_crc = {str(own).lower()} is set"
+    words = {False: "without", True: "with"}
+    return f"frames {words[own]} a CRC are answered, frames {words[not own]} one are not: {why}"
 
 
 def _status(mirror: MirrorController, *, playing: bool) -> CheckRow:
@@ -136,7 +247,7 @@ def _status(mirror: MirrorController, *, playing: bool) -> CheckRow:
     return CheckRow("mirror", "status", status.sentence)
 
 
-def _move(mirror: MirrorController, rows: list[CheckRow]) -> None:
+def _move(mirror: MirrorDriver, clock: Clock, rows: list[CheckRow]) -> None:
     """Send the mirror to the corners of a square and back to the middle; stops at the first error."""
     for x, y in (*SQUARE, (0.0, 0.0)):
         asked = f"go to {x:g}; {y:g}"
@@ -144,8 +255,8 @@ def _move(mirror: MirrorController, rows: list[CheckRow]) -> None:
             mirror.goto(x, y)
             mirror.settle(SETTLE_S)
             mirror.start_log(LOG_HZ)
-            mirror.wire.clock.sleep(2 * LOGGED / LOG_HZ)
-            found = mirror.read_log(LOGGED).position.astype(float).mean(axis=0)
+            clock.sleep(2 * LOGGED / LOG_HZ)
+            found = mirror.read_log().position[:LOGGED].astype(float).mean(axis=0)
         except RigError as error:
             rows.append(failed("mirror", asked, error))
             return
@@ -175,14 +286,14 @@ def _row(rows: list[CheckRow], device: Device, asked: str, ask: Callable[[], str
 
 
 @contextmanager
-def _warnings(rows: list[CheckRow], device: Device) -> Iterator[None]:
-    """Make a row of what the drivers warned of: answers that were late, damaged, or not asked for."""
+def _warnings(rows: list[CheckRow], device: Device) -> Iterator[list[str]]:
+    """Make a row of the drivers' warnings, which are yielded: answers that were late, damaged, or not asked for."""
     logger, heard = logging.getLogger("pipeline.rig"), logging.Handler(logging.WARNING)
     words: list[str] = []
     heard.emit = lambda record: words.append(record.getMessage())  # type: ignore[method-assign]
     logger.addHandler(heard)
     try:
-        yield
+        yield words
     finally:
         logger.removeHandler(heard)
         if words and rows and rows[0].asked != CONNECT:  # that row says it all

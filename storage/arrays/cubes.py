@@ -200,6 +200,11 @@ class RawCube:
         """Raw numbers of the lines ``start`` to ``stop``, (line, sample, band) uint16; fastest on multiples of 64."""
         return read_array(self.group, "dn", slice(start, stop))
 
+    def read_lines(self, numbers: NDArray[np.intp]) -> NDArray[np.uint16]:
+        """Raw numbers of single lines in ascending order, (line, sample, band) uint16; decodes each chunk once."""
+        parts = np.split(numbers, np.flatnonzero(np.diff(numbers // SHARD_ROWS)) + 1)
+        return np.concatenate([self.read(int(part[0]), int(part[-1]) + 1)[part - part[0]] for part in parts])
+
     def read_window(self, lines: slice, samples: slice) -> NDArray[np.uint16]:
         """Raw numbers of some lines and samples, (line, sample, band) uint16; decodes the chunks that hold them."""
         return read_array(self.group, "dn", (lines, samples))

@@ -239,10 +239,12 @@ class EnviFile:
     description: str = ""
     nodata: float | None = None
     geobox: GeoBox | None = None  # where the image lies on a map
+    ending: str = ".img"  # of the file with the numbers
+    more: Mapping[str, str] = field(default_factory=dict)  # further entries of the header
 
 
 def write_envi(header: Path, file: EnviFile, blocks: Blocks) -> Path:
-    """Write ``NAME.hdr`` and the numbers beside it, ``NAME.img`` in any order of bands; gives the latter's path.
+    """Write ``NAME.hdr`` and the numbers beside it, in any order of bands; gives the latter's path, ``NAME.img``.
 
     A pair that is there is replaced; a header never stands beside numbers that are not its own. Blocks of lines come in
     order; memory: two blocks. Raises ShapeError: the blocks do not fill the file, or the type or interleave is none of
@@ -250,7 +252,7 @@ def write_envi(header: Path, file: EnviFile, blocks: Blocks) -> Path:
     refuses.
     """
     text = header_text(file)
-    data, kind = header.with_suffix(".img"), np.dtype(file.dtype)
+    data, kind = header.with_suffix(file.ending), np.dtype(file.dtype)
     with written_aside(header.parent, [data.name, header.name]) as aside:
         with (aside / data.name).open("wb") as stream:
             reached = 0
@@ -307,6 +309,7 @@ def _header_fields(file: EnviFile) -> Iterator[tuple[str, str]]:
             if values.shape != (bands,):
                 raise ShapeError(f"{key} has shape {values.shape}, the file has {bands} bands; give one a band")
             yield key, _listed([repr(number) for number in values.tolist()])
+    yield from file.more.items()
 
 
 def _listed(words: list[str]) -> str:

@@ -79,6 +79,7 @@ def measure(px: int) -> Moments:
             "engine": "plain",
             "controls": False,
             "rig.panel": 0.99,
+            "rig.pulses": "position",
         }
         settings = load_settings(None, told)
         moments = Moments()

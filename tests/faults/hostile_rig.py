@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from pipeline.errors import PipelineError
 from pipeline.rig.camera.camera_files import KeptInMemory, RemoteFile, fetch_files
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.device_settings import CameraAddress, ControlPatience, FileServer, MirrorSettings
+from pipeline.rig.devices import SYSTEM_CLOCK
 from pipeline.rig.mirror.mirror_controller import open_mirror
 from pipeline.rig.rig_check import CheckRow, check_camera, check_mirror
 from tests.faults.fault_table import Clock, Row, told_wrong
@@ -122,7 +124,7 @@ def meet_camera(rng: np.random.Generator, found: Outcome) -> None:
         camera = HeadwallCamera.at(CameraAddress("127.0.0.1", control.port), server, patience=PATIENCE)
         kept = KeptInMemory()
         most_s = 2 * ASKED_S + PATIENCE.deadline_s + 3 * server.stall_s + SLACK_S
-        found.judge("camera", most_s, lambda: messages(check_camera(camera, server)))
+        found.judge("camera", most_s, lambda: messages(check_camera(lambda: camera)))
         most_s = server.most_s(SIZE) + 4 * server.stall_s + SLACK_S
         file = RemoteFile("/captured/a/raw_0", None, False, most=SIZE)
         found.judge("files", most_s, lambda: fetch_files(server, [file], kept) or [])
@@ -136,7 +138,9 @@ def meet_mirror(rng: np.random.Generator, found: Outcome) -> None:
         settings = MirrorSettings(
             f"socket://127.0.0.1:{mirror.port}", deadline_s=MIRROR.deadline_s, quiet_s=MIRROR.quiet_s
         )
-        found.judge("mirror", MIRROR_S + SLACK_S, lambda: messages(check_mirror(lambda: open_mirror(settings))))
+        found.judge(
+            "mirror", MIRROR_S + SLACK_S, lambda: messages(check_mirror(partial(open_mirror, settings), SYSTEM_CLOCK))
+        )
 
 
 class HostileMirror(Hostile):

@@ -56,6 +56,7 @@ class PulledRig:
             "host": "127.0.0.1",
             "control_port": self._address[0],
             "file_port": self._address[1],
+            "pulses": self.rig.camera.wired,
             "panel": round(float(panel.mean()), 6),
             "provenance": "emulated",
         }

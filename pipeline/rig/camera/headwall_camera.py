@@ -6,7 +6,7 @@ import logging
 import re
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Self, TypeVar
 
 from pipeline.errors import RigError, SettingsError
@@ -33,6 +33,7 @@ from pipeline.rig.device_settings import (
     check_times,
 )
 from pipeline.rig.devices import SYSTEM_CLOCK, Clock, DeadlinePassed, DeviceRefused, StateUnknown
+from pipeline.rig.drivers import Capture, FrameClaim
 from pipeline.rig.transports import SocketTransport, Transport
 
 LOG = logging.getLogger(__name__)
@@ -48,31 +49,8 @@ _RAW = re.compile(r"raw_\d+", re.IGNORECASE)
 _REFERENCE = re.compile(r"(dark|white)[a-z_]*", re.IGNORECASE)
 
 
-@dataclass(frozen=True)
-class Capture:
-    """A capture that the camera acknowledged."""
-
-    folder: str
-    sent_s: float  # when the command was sent, by the clock of the rig's drivers
-    acknowledged_s: float  # when its reply was whole: exposures began between the two, or soon after
-
-
 class CaptureUnknown(StateUnknown):
     """A capture was sent and not acknowledged; what was found on asking stands in the message."""
-
-
-@dataclass(frozen=True)
-class FrameClaim:
-    """What a capture was asked for: frames, in all its cubes, of so many numbers of 16 bits."""
-
-    frames: int
-    samples: int
-    bands: int
-
-    @property
-    def frame_bytes(self) -> int:
-        """Bytes of a frame."""
-        return 2 * self.samples * self.bands
 
 
 class HeadwallCamera:

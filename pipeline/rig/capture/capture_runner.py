@@ -25,13 +25,12 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, exposing
 from pipeline.json_lines import read_checked, with_check
 from pipeline.rig.camera.camera_files import Kept
-from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.capture import JOURNAL
 from pipeline.rig.capture.capture_paths import LEAD, CapturePath, CaptureRecord, LoggedPath, UntiedError, capture_prefix
 from pipeline.rig.capture.line_positions import LinePositions, MirrorTrack, line_edges
 from pipeline.rig.device_settings import SurveyRig
 from pipeline.rig.devices import Clock
-from pipeline.rig.mirror.mirror_controller import MirrorController
+from pipeline.rig.drivers import CameraDriver, MirrorDriver
 from pipeline.rig.mirror.path_player import MotionLog
 from pipeline.rig.mirror.registers import Trigger
 from pipeline.source import AT_REST
@@ -169,8 +168,8 @@ def say_nothing(words: str) -> None:
 class RigDevices:
     """Both devices, connected, and the clock that their drivers go by."""
 
-    steering: MirrorController
-    camera: HeadwallCamera
+    steering: MirrorDriver
+    camera: CameraDriver
     clock: Clock
 
     def close(self) -> None:
@@ -269,7 +268,7 @@ class CaptureRunner:
         at_rest = replace(AT_REST, exposure_ms=exposure_ms)
         self._configure(exposing(self._camera, at_rest))
         if self._rig.white_at_rest:
-            self.devices.steering.park()
+            self.devices.steering.goto(0.0, 0.0)
             self.devices.steering.settle(self._rig.settle_s)
         with self._stopped_on_error():
             capture = self.devices.camera.capture(1, prefix=prefix)

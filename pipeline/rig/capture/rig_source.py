@@ -31,7 +31,6 @@ from pipeline.geometry.mirror import STRAIGHT
 from pipeline.geometry.scan import Sweep, exposing
 from pipeline.rig.camera.camera_cubes import as_references
 from pipeline.rig.camera.camera_files import NOT_LOGGED_IN, Kept
-from pipeline.rig.camera.headwall_camera import FrameClaim
 from pipeline.rig.capture.capture_paths import (
     REFERENCES,
     CapturePath,
@@ -46,6 +45,7 @@ from pipeline.rig.capture.capture_paths import (
 from pipeline.rig.capture.capture_runner import CaptureJournal, CaptureRunner, RigDevices, Say, say_nothing
 from pipeline.rig.device_settings import SurveyRig
 from pipeline.rig.devices import DeviceRefused, StateUnknown
+from pipeline.rig.drivers import FrameClaim
 from pipeline.simulator.simulated import check_binning
 from pipeline.source import Line, References
 

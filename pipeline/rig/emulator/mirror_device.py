@@ -4,7 +4,9 @@ Both modes of the documented protocol. Assumed, as the documents leave it open: 
 a line that is not known, ERROR one that is known and cannot be read; a position beyond the rim is pulled in to it, and
 the answer says to which side it lay; a reset is answered by OK, and what comes while the controller boots is lost; in
 pro mode bytes that are no frame are answered by error 0001 at the next boundary, requests are checked by their CRC
-after GOPROCRC alone, and replies always carry it.
+after GOPROCRC alone, and replies always carry it. Two other firmwares are emulated, too: one that checks the CRC of
+requests after GOPRO as well (``crc="required"``), and one that knows no GOPROCRC and sends 00 00 in the CRC's place
+(``crc="absent"``).
 """
 
 from __future__ import annotations
@@ -270,15 +272,18 @@ class MirrorDevice:
         self.acts.append(Act(self.clock.now(), request))
         if request.damaged is not None:  # answered to the command that the bytes seem to hold, if any
             command = request.damaged.data[1] if len(request.damaged.data) > 1 else 0
-            return encode(refuse(command & ~ERROR_FLAG, ErrorCode.FRAME_INVALID))
+            return self._framed(refuse(command & ~ERROR_FLAG, ErrorCode.FRAME_INVALID))
         if request.frame is not None:
             if self.mode is Mode.PRO_CRC and not request.frame.crc_good:
-                return encode(refuse(request.frame.command & ~ERROR_FLAG, ErrorCode.CRC_WRONG))
+                return self._framed(refuse(request.frame.command & ~ERROR_FLAG, ErrorCode.CRC_WRONG))
             reply = self.registers.answer(request.frame)
             if reply.command == Command.SET_MODE:
                 self.set_mode(Mode.SIMPLE)
-            return encode(reply)
+            return self._framed(reply)
         return self._simple(request.line).encode("ascii") + END
+
+    def _framed(self, reply: Frame) -> bytes:
+        return encode(reply, with_crc=self.unit.crc != "absent")
 
     def _simple(self, line: str) -> str:
         """Carry out a line, in capitals and without its end, and give the answer without an end."""
@@ -298,8 +303,8 @@ class MirrorDevice:
             case simple.ACKNOWLEDGE:
                 self.state.acknowledge()
             case simple.GO_PRO:
-                self.set_mode(Mode.PRO)
-            case simple.GO_PRO_CRC:
+                self.set_mode(Mode.PRO_CRC if self.unit.crc == "required" else Mode.PRO)
+            case simple.GO_PRO_CRC if self.unit.crc != "absent":
                 self.set_mode(Mode.PRO_CRC)
             case simple.RESET:
                 self.restart()

@@ -95,6 +95,15 @@ class MirrorController(Closing):
         with self._modes.simple() as lines:
             return lines.temperature()
 
+    def why_unanswered(self, *, with_crc: bool) -> str:
+        """Try frames with a CRC, or without, and come back to those of the settings; return why none is answered.
+
+        Return "" where they are answered. Nothing moves. Raises RigError where a path plays, as `temperature` does.
+        """
+        self._check_idle("try other frames")
+        with self._modes.simple():
+            return self._modes.why_unanswered(with_crc=with_crc)
+
     def goto(self, x: float, y: float) -> None:
         """Send the mirror to a position and hold it there; comes back once that is acknowledged, not at rest.
 

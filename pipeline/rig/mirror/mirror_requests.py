@@ -9,7 +9,7 @@ import logging
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import TypeVar
 
@@ -164,7 +164,7 @@ class ProLink:
     """
 
     wire: Wire
-    with_crc: bool = True
+    with_crc: bool = False
     strict_crc: bool = False
 
     def ask(self, frame: Frame, name: str, parse: Callable[[bytes], Answer]) -> Answer:
@@ -240,6 +240,9 @@ class Identity:
         return f"{self.device or 'no id'}, version {self.version or 'unknown'}, serial {self.serial or 'unknown'}"
 
 
+_FRAMES = {False: "frames without a CRC", True: "frames with a CRC"}
+
+
 class Modes:
     """A controller whose mode is known. Between calls it is in pro mode."""
 
@@ -252,15 +255,11 @@ class Modes:
         """Find the controller in either mode, ask what it is, and leave it in pro mode. Nothing moves.
 
         Raises DeadlinePassed where nothing answers in either mode, RigError where something else does, or DeviceGone.
+        Where frames are not answered as the settings send them, the error says whether they are the other way.
         """
         with self.pro.wire.lock:
             self.found_in_pro = False
-            try:
-                self._greet()
-            except DeadlinePassed:
-                LOG.info("%s does not answer in simple mode; it may be in pro mode", self.pro.wire.port)
-                self._leave_pro()
-                self.found_in_pro = True
+            self.found_in_pro = self._find()
             said = []
             for request in (ID, VERSION, SERIAL):
                 try:
@@ -268,8 +267,25 @@ class Modes:
                 except DeviceRefused as error:  # other firmware may not know it
                     LOG.warning("%s", error)
                     said.append("")
-            self._enter_pro()
+            try:
+                self._enter_pro()
+            except (DeadlinePassed, DeviceRefused) as error:
+                raise self._with_advice(error) from error
             return Identity(*said)
+
+    def why_unanswered(self, *, with_crc: bool) -> str:
+        """Try frames with a CRC, or without, from simple mode and back to it: return why none is answered, else "".
+
+        Nothing moves. Raises DeadlinePassed, DeviceRefused or DeviceGone where simple mode is not reached again.
+        """
+        tried = Modes(replace(self.pro, with_crc=with_crc))
+        try:
+            tried._enter_pro()
+        except (DeadlinePassed, DeviceRefused) as error:
+            tried._find()
+            return str(error)
+        tried._leave_pro()
+        return ""
 
     @contextmanager
     def simple(self) -> Iterator[SimpleLink]:
@@ -284,12 +300,29 @@ class Modes:
             finally:
                 self._enter_pro()
 
+    def _find(self) -> bool:
+        """Reach simple mode from either mode, and return whether it was pro mode."""
+        try:
+            self._greet()
+        except DeadlinePassed:
+            LOG.info("%s does not answer in simple mode; it may be in pro mode", self.pro.wire.port)
+            self._leave_pro()
+            return True
+        return False
+
     def _leave_pro(self) -> None:
         try:
-            self.pro.tell(go_simple(), "changing to simple mode")
+            self._ask_for_simple(self.pro)
+        except DeviceRefused as error:  # an earlier session may have sent frames the other way
+            LOG.info("%s; asking the other way", error)
+            self._ask_for_simple(replace(self.pro, with_crc=not self.pro.with_crc))
+        self._greet()
+
+    def _ask_for_simple(self, link: ProLink) -> None:
+        try:
+            link.tell(go_simple(), "changing to simple mode")
         except DeadlinePassed as error:  # it may have changed all the same; the greeting tells
             LOG.info("%s; greeting it all the same", error)
-        self._greet()
 
     def _greet(self) -> None:
         try:
@@ -304,6 +337,16 @@ class Modes:
             self._lines.do(words, "write")
         except DeadlinePassed as error:  # it may have changed all the same; the status tells
             LOG.info("%s; asking for the status all the same", error)
-        except DeviceRefused as error:
-            raise DeviceRefused(f"{error}. Firmware without {words}? Turn mirror.with_crc over") from error
         self.pro.ask(ask_status(), "the status", cell_int)
+
+    def _with_advice(self, error: DeadlinePassed | DeviceRefused) -> RigError:
+        """Return the error of a pro mode that was not reached, with the setting that reaches it where there is one."""
+        own, other = self.pro.with_crc, not self.pro.with_crc
+        try:
+            self._find()
+            if self.why_unanswered(with_crc=other):
+                return error
+        except RigError:
+            return error
+        setting = f"with_crc = {str(other).lower()}"
+        return DeviceRefused(f"{_FRAMES[own]}: {error}. It answers {_FRAMES[other]}; set {setting} in [rig]")

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
-from flows.tasks.stage import versions_made_again
+from flows.tasks.open_survey import versions_made_again
 from flows.terminal.figures import format_bytes, format_percent
 from storage.archive.archive import Archive
 from storage.maintenance.garbage import clear_up

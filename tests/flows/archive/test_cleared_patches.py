@@ -15,7 +15,7 @@ from flows.archive.export_command import run_export
 from flows.archive.plan_command import forecast
 from flows.archive.reprocess_command import ReprocessRequest, run_judge, run_reprocess
 from flows.settings.load import load_settings
-from flows.tasks.stage import versions_made_again
+from flows.tasks.open_survey import versions_made_again
 from flows.terminal.processes import DONE
 from models.weights.files import save_weights
 from storage.archive.archive import Archive

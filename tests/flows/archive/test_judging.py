@@ -16,8 +16,8 @@ from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
 from flows.cli.model_verbs import _run_address
 from flows.publish import run_folder as publish
 from flows.publish.receipt import check_receipt, comparable, is_pending
+from flows.tasks.open_survey import STAGES
 from flows.tasks.stages import accuracy as evaluation
-from flows.tasks.survey import STAGES
 from models.weights.files import save_weights
 from pipeline.errors import SettingsError
 from storage.archive.archive import Archive
@@ -110,7 +110,7 @@ def test_the_run_is_published_before_its_map_is_judged(
     real, seen = STAGES["evaluate"], list[Any]()
 
     def looking(*given: Any) -> Any:
-        wanted = real.needed(*given)
+        wanted = real.wants(*given)
 
         def building(path: Path) -> None:
             seen.append((Archive.open(out).runs(), *receipts(out)))

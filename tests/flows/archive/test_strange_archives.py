@@ -13,8 +13,8 @@ import pytest
 from flows.cli.main import main
 from flows.publish import survey_command
 from flows.publish.run_folder import Published
-from flows.tasks.prefect_engine import EngineUnavailable
-from flows.tasks.stage import versions
+from flows.tasks.local_server import ServerUnavailable
+from flows.tasks.open_survey import versions
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.archive.manifests import _seal, _text
@@ -207,9 +207,9 @@ def test_no_verb_leaves_the_archive(
     """Each verb ends with an answer or one message; what lies beside the archive stays, and none of it is shown."""
 
     def no_server(*given: object) -> None:  # else each repair waits for one
-        raise EngineUnavailable("none here")
+        raise ServerUnavailable("none here")
 
-    monkeypatch.setattr(survey_command, "survey_with_prefect", no_server)
+    monkeypatch.setattr(survey_command, "_prefect_server", no_server)
     root = tmp_path / "archive"
     change(small_survey(Archive.open(root), simulated=False), lead)
     secrets = [tmp_path / "secret", root / "secret", root / "stages" / "secret"]

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from flows.tasks.survey import STAGES
+from flows.tasks.open_survey import STAGES
 from storage.archive.archive import Archive
 from storage.arrays.class_maps import load_class_map
 from storage.remote.opening import verify_archive

@@ -188,12 +188,12 @@ def test_the_command_writes_the_picture_and_tells_its_figures(
 
 def choose(run: CaptureRun) -> StageRef:
     """The stage's store, made in the run's archive."""
-    return choose_effects.produce(run.archive, choose_effects.needed(run))[0]
+    return choose_effects.produce(run.archive, choose_effects.wants(run))[0]
 
 
 def key_of(run: CaptureRun) -> str:
     """The key that the stage asks for, without making anything."""
-    return choose_effects.key(choose_effects.needed(run))
+    return choose_effects.key(choose_effects.wants(run))
 
 
 def opened(scene_files: Path, out: Path, **flags: Any) -> CaptureRun:

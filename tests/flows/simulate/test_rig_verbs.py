@@ -62,6 +62,7 @@ def test_settings_file_says_where_both_are(command_line: CommandLine, tmp_path: 
         assert ended.code == record["exit_code"] == 0
         assert (record["failed"], record["warned"], record["move"]) == (0, 0, True)
         assert [row["asked"] for row in record["rows"] if row["asked"].startswith("go to")][-1] == "go to 0; 0"
+        assert record["rows"][-1]["came"].startswith("32 edges in 4 frames (/captured/check_")
         assert record["port"] == rig.port
         assert record["camera"] == f"{rig.host}:{rig.camera_port}"
         assert not still(rig)
@@ -169,12 +170,34 @@ def test_rig_in_order(command_line: CommandLine, tmp_path: Path) -> None:
         assert ended.code == 0
         assert "MR-E-2" in ended.out
         assert "nothing to mend" in ended.out
+        assert 'not tried without --move; pulses = "none" is taken on trust' in " ".join(ended.out.split())
         assert still(rig)
     with served() as rig:
         file = tmp_path / "field.toml"
         file.write_text(f'[rig]\nport = "{rig.port}"\npark_at_close = true\n')
         assert command_line("rig", "check", file, "--camera", camera_of(rig)).code == 0
         assert still(rig)
+
+
+def test_what_is_not_tried_is_said(command_line: CommandLine) -> None:
+    """Edges need both devices in order: one alone, one that failed, or a path that plays leave the setting on trust."""
+    with served() as rig:
+        for more, why in (((), "without a camera"), (("--camera", NOWHERE), "as not all of the above is in order")):
+            ended = command_line("rig", "check", "--port", rig.port, *more, "--move", "--json")
+            assert json.loads(ended.out)["rows"][-1]["came"].startswith(f"not tried {why}; pulses")
+        for player in rig.rig.mirror.state.players:
+            player.start, player.end, player.running, player.frequency_hz = 0, 10, True, 0.001
+        ended = command_line("rig", "check", "--port", rig.port, "--camera", camera_of(rig), "--move", "--json")
+        assert json.loads(ended.out)["rows"][-1]["came"].startswith(f"not tried {why}; pulses")
+        assert all(player.running for player in rig.rig.mirror.state.players)
+        assert not rig.rig.camera.captures
+
+
+def test_a_driver_that_cannot_be_imported_is_refused(command_line: CommandLine, tmp_path: Path) -> None:
+    """One message with the setting and its value, exit code 2."""
+    file = tmp_path / "field.toml"
+    file.write_text('[rig]\nmirror_driver = "nowhere:open_it"\n')
+    command_line("rig", "check", file).refused(2, "rig.mirror_driver = 'nowhere:open_it' cannot be imported")
 
 
 def test_emulated_rig_is_checked_by_the_file_that_it_writes(command_line: CommandLine, tmp_path: Path) -> None:

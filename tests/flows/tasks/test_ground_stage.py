@@ -113,7 +113,7 @@ def stores(tmp_path: Path) -> tuple[StageRef, StageRef]:
 
 def draw(run: Run, stores: tuple[StageRef, StageRef]) -> StageRef:
     """Run the stage as an engine would."""
-    return ground.produce(run.archive, ground.needed(run, *stores))[0]
+    return ground.produce(run.archive, ground.wants(run, *stores))[0]
 
 
 def grid_of(run: Run) -> GroundGrid:

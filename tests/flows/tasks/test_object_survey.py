@@ -15,7 +15,7 @@ pytest.importorskip("obstore", reason="obstore is not installed (extra s3)")
 
 import spectralzoom
 from flows.publish.run_folder import Published
-from flows.tasks.survey import STAGES
+from flows.tasks.open_survey import STAGES
 from pipeline.errors import SceneError
 from storage.archive.archive import Archive
 from storage.arrays.class_maps import load_class_map

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,10 +14,7 @@ from rich.console import Console
 from flows.archive.plan_command import plan_content
 from flows.archive.reprocess_command import ReprocessRequest, run_judge, run_reprocess
 from flows.settings.load import load_settings
-from flows.tasks.survey import STAGES
 from pipeline.errors import BudgetError, SettingsError, WeightsError
-from pipeline.geometry.grid import SceneGrid
-from storage.archive.keys import StageRef
 from storage.arrays.tile_work import block_means
 from tests.conftest import Survey, WeightsMaker
 
@@ -160,22 +156,6 @@ def test_a_mirror_off_the_plan_is_put_right_in_a_scan_too(survey_png: Survey, re
     assert states["register_coarse"] == "ran"
     seen = _store(tmp_path, "patches")["valid"].values
     assert seen.mean() > 0.95
-
-
-@pytest.mark.parametrize("plain", [True, False])
-def test_patches_are_of_a_pass_with_its_own_registration(plain: bool) -> None:
-    """Of the scan, or of the fine sweeps; what was found of the other pass's pointing has no part in them."""
-    stores = {name: StageRef(name, name, Path(name)) for name in ("seen", "scan", "fine", "of scan", "of fine")}
-    run: Any = SimpleNamespace(
-        grid=SceneGrid(96, 128, 8, 4),
-        settings=SimpleNamespace(kernel="nearest"),
-        plan=SimpleNamespace(plain=plain),
-        place_key={},
-    )
-    inputs = STAGES["cut_patches"].needed(run, *stores.values()).inputs
-    assert [ref.stage for ref in inputs] == (["seen", "scan", "of scan"] if plain else ["seen", "fine", "of fine"])
-    without = STAGES["cut_patches"].needed(run, *list(stores.values())[:3]).inputs
-    assert [ref.stage for ref in without] == ["seen", "scan" if plain else "fine"]
 
 
 def test_plan_shows_what_seconds_buy(scene_files: Path, recorded: Path, tmp_path: Path) -> None:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import io
-import json
 import shutil
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -20,21 +18,20 @@ import pytest
 
 from flows.cli.main import main
 from flows.publish import run_folder as publish
-from flows.schedule.field_schedule import moment_words
-from flows.schedule.serve_command import load_fields
-from flows.schedule.times import parse_timetable
-from flows.tasks import prefect_engine as engine
+from flows.tasks import prefect_tasks
+from flows.tasks.open_survey import STAGES
 from flows.tasks.stage import Stage, Wanted
-from flows.tasks.survey import STAGES
 from pipeline.errors import ArchiveError, RigError
 from storage.archive.archive import Archive
-from storage.archive.ledger import Ledger
 from storage.arrays.class_maps import load_class_map
 from tests.flows.conftest import Ended, problems
 
 pytestmark = pytest.mark.usefixtures("no_effects")
 
 RECORDED_S = 30.0  # in which a server has heard of a task that ended
+OF_THIS = [
+    name for name in STAGES if name not in ("register_coarse", "register_fine", "ground")
+]  # a survey in two passes
 CAPTURES = ("capture_coarse", "capture_fine")
 NO_REPLY = "no reply from the camera after 2 s; is it on?"
 FULL_DISK = "cannot write to the archive: no space left; make room"
@@ -46,14 +43,12 @@ def refusal(stage: str) -> RigError | ArchiveError:
 
 
 def failing(stage: str, error: Exception, tried: Callable[[], None] = lambda: None) -> Stage:
-    """The stage, failing when its files are written and not yet published; at once where it has nothing to do."""
+    """The stage, failing when its files are written and not yet published."""
     real = STAGES[stage]
 
     def fail(*given: Any) -> Wanted:
         tried()
-        wanted = real(*given)
-        if wanted is None:
-            raise error
+        wanted = real.wants(*given)
 
         def broken(path: Path) -> None:
             wanted.build(path)
@@ -105,9 +100,9 @@ def walk(
     words = ["survey", *scene, "--engine", "plain", "--budget", "0.8", "--no-controls", "--out", found.out]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tempfile, "tempdir", str(folder))
-        for stage in STAGES:
+        for stage in OF_THIS:
             patch.setitem(STAGES, stage, counted(stage, found.builds))
-        for stage in STAGES:
+        for stage in OF_THIS:
             for trials, error in ((found.bugs, KeyError("north")), (found.refusals, refusal(stage))):
                 with pytest.MonkeyPatch.context() as broken:
                     broken.setitem(STAGES, stage, failing(stage, error))
@@ -123,10 +118,8 @@ def counted(stage: str, builds: Counter[str]) -> Stage:
     """The stage, counting how often its store is made."""
     real = STAGES[stage]
 
-    def count(*given: Any) -> Wanted | None:
-        wanted = real(*given)
-        if wanted is None:
-            return None
+    def count(*given: Any) -> Wanted:
+        wanted = real.wants(*given)
 
         def made(path: Path) -> None:
             builds[stage] += 1
@@ -145,10 +138,10 @@ def command(words: list[Any]) -> Ended:
     return Ended(int(exit_.value.code or 0), out.getvalue(), err.getvalue())
 
 
-@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize("stage", OF_THIS)
 def test_a_stage_that_fails_is_one_message(stage: str, walk: Walk) -> None:
     """The words of the error, or of a bug in which file its traceback is; the archive holds the stores before it."""
-    before = list(STAGES)[: list(STAGES).index(stage)]
+    before = list(OF_THIS)[: list(OF_THIS).index(stage)]
     for trial in (walk.refusals[stage], walk.bugs[stage]):
         assert (trial.ended.code, trial.ended.out, len(trial.ended.errors)) == (1, "", 1)
         assert "Traceback" not in trial.ended.err
@@ -157,7 +150,7 @@ def test_a_stage_that_fails_is_one_message(stage: str, walk: Walk) -> None:
     assert walk.refusals[stage].ended.errors == [str(refusal(stage))]
     told, _, file = walk.bugs[stage].ended.errors[0].partition("please report ")
     assert told == "KeyError: 'north'; this is a defect of SpectralZoom: "
-    assert "in broken" in Path(file).read_text() or stage not in walk.keys
+    assert "in broken" in Path(file).read_text()
 
 
 def test_the_survey_goes_on_as_if_nothing_had_been(walk: Walk) -> None:
@@ -187,17 +180,8 @@ def test_a_run_that_cannot_be_drawn_is_not_published(
             survey_png(out)
     assert (Archive.open(out).runs(), problems(out)) == (before, [])
     states = {stage["state"] for stage in survey_png(out).receipt["stages"]}
-    assert states == {"cached", "skipped"}
+    assert states == {"cached"}
     assert (len(Archive.open(out).runs()), problems(out)) == (len(before) + 1, [])
-
-
-@pytest.fixture(scope="module")
-def server(prefect_home: Path) -> Iterator[None]:
-    """Flows run on the server that surveys of this process share, without the heartbeat that costs a second each."""
-    from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
-
-    with temporary_settings(updates={PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}):
-        yield
 
 
 def newest_run(flow: str, count: int) -> tuple[Any, dict[str, Any]]:
@@ -224,88 +208,28 @@ def newest_run(flow: str, count: int) -> tuple[Any, dict[str, Any]]:
 
 @pytest.mark.parametrize(("stage", "after", "tries"), [("capture_fine", "attend", 3), ("draw_map", "cut_patches", 1)])
 def test_a_stage_that_fails_by_prefect(
-    stage: str, after: str, tries: int, server: None, survey_png: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    stage: str, after: str, tries: int, server: str, survey_png: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Task and flow are Failed with the message, the task named by stage and field; a device was asked again.
 
-    Prefect draws an arrow to it, from the stage before that made something.
+    Prefect draws an arrow to it, from what it is made of.
     """
     tried: list[str] = []
     error = refusal(stage)
     monkeypatch.setitem(STAGES, stage, failing(stage, error, lambda: tried.append(stage)))
-    monkeypatch.setattr(engine, "RETRY_DELAY_S", 0.0)
+    monkeypatch.setattr(prefect_tasks, "RETRY_DELAY_S", 0.0)
+    prefect_tasks._task.cache_clear()
     with pytest.raises(type(error), match=str(error)[:20]):
         survey_png(tmp_path, engine="prefect")
-    before = list(STAGES)[: list(STAGES).index(stage)]
-    run, tasks = newest_run("survey", len(before) + 1)
+    before = list(OF_THIS)[: list(OF_THIS).index(stage)]
+    run, tasks = newest_run("survey", len(before) + 2)
     assert (run.name, run.state.type.value) == ("survey-scene", "FAILED")
     assert str(error) in run.state.message
-    assert tasks.keys() == {f"{name}-scene" for name in (*before, stage)}
+    assert tasks.keys() == {f"{name}-scene" for name in ("plan_capture", *before, stage)}
     assert {tasks[f"{name}-scene"].state.type.value for name in before} == {"COMPLETED"}
     failed = tasks[f"{stage}-scene"]
     assert failed.state.type.value == "FAILED"
     assert str(error) in failed.state.message
     assert (len(tried), failed.run_count) == (tries, tries)
-    assert [given.id for given in failed.task_inputs["after"]] == [tasks[f"{after}-scene"].id]
+    assert tasks[f"{after}-scene"].id in [given.id for given in failed.task_inputs["inputs"]]
     assert problems(tmp_path) == []
-
-
-def test_a_due_run_of_which_a_stage_fails(
-    server: None,
-    scene_files: Path,
-    weights: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    served: Callable[..., Path],
-) -> None:
-    """The scheduled flow ends Failed with the stage's words alone, the ledger has them, and no run is published."""
-    from flows.schedule.prefect_flows import survey_scheduled
-
-    out, file = tmp_path / "archive", tmp_path / "north.toml"
-    file.write_text(f'scene = "{scene_files / "scene.png"}"\nweights = "{weights}"\nbudget = 0.8\nout = "{out}"\n')
-    (one,) = load_fields([file])
-    due = datetime.now(UTC).replace(microsecond=0) - timedelta(seconds=1)
-    cron = {"cron": f"{due.minute} {due.hour} {due.day} {due.month} *", "timezone": "UTC"}
-    table, due = parse_timetable(cron["cron"], None, "UTC"), due.replace(second=0)
-    told = {"event": "opened", "at": moment_words(due - timedelta(minutes=1)), "late": 0.5, "pid": 1}
-    one.schedule(table, 0.5).ledger.append({**told, "schedule": table.to_dict()})
-    served(file, late=0.5, cron=cron["cron"])
-    with monkeypatch.context() as broken:
-        broken.setitem(STAGES, "cut_patches", failing("cut_patches", refusal("cut_patches")))
-        state = survey_scheduled("north", moment_words(due), return_state=True)
-    run, tasks = newest_run("survey", list(STAGES).index("cut_patches") + 1)
-    assert (state.is_failed(), state.message, run.name) == (True, FULL_DISK, "survey-north")
-    assert tasks["cut_patches-north"].state.type.value == "FAILED"
-    line = Ledger(one.archive, "north").lines()[-1]
-    assert (line["event"], line["reason"]) == ("failed", FULL_DISK)
-    assert (Archive.open(out).runs(), problems(out)) == ([], [])
-
-
-def test_a_reprocessing_of_which_a_stage_fails(
-    server: None,
-    walk: Walk,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    field_file: Callable[..., Path],
-    served: Callable[..., Path],
-) -> None:
-    """It ends Failed and says where the reason stands; the next one makes what was missing, and completes."""
-    from flows.schedule.prefect_flows import reprocess_archive
-
-    out = Path(shutil.copytree(walk.undisturbed, tmp_path / "archive"))
-    served(field_file(out=str(out)), every="1h")
-    archive = Archive.open(out)
-    (missing,) = archive.refs("segment")
-    archive.discard(missing)
-    with monkeypatch.context() as broken:
-        broken.setitem(STAGES, "draw_map", failing("draw_map", refusal("draw_map")))
-        state = reprocess_archive(archive=str(out), return_state=True)
-    run, _ = newest_run("reprocess", 0)
-    assert (state.is_failed(), run.name, run.state.message) == (True, f"reprocess-{out}", state.message)
-    assert state.message == "no field could be reprocessed; reprocess-TIME.json beside the archive says why"
-    (summary,) = tmp_path.glob("reprocess-*.json")
-    assert [row["message"] for row in json.loads(summary.read_text())["fields"]] == [FULL_DISK]
-    assert archive.find("segment", missing.key) is None
-    state = reprocess_archive(archive=str(out), return_state=True)
-    assert (state.is_completed(), state.message, problems(out)) == (True, "done", [])
-    np.testing.assert_array_equal(class_map(out), class_map(walk.undisturbed))

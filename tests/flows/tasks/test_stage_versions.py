@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[3]
 sys.path[:0] = [str(ROOT)] if __name__ == "__main__" else []
 
 from flows.archive import ingest_command  # noqa: E402
-from flows.tasks.stage import all_stages, versions  # noqa: E402
+from flows.tasks.open_survey import STAGES, versions  # noqa: E402
 from tests.flows.tasks.stage_closure import Sources, Target, read_packages  # noqa: E402
 
 VERSIONS = {**versions(), ingest_command.STAGE: ingest_command.VERSION}
@@ -30,7 +30,7 @@ RECORD = Path(__file__).with_name("stage_digests.json")
 LIGHT = ("farm_scene", "raster_from_values", "make_source")  # who looks at what: runs bring it, no stage names it
 BESIDES = {"effects": LIGHT, "capture": (*LIGHT, "field_source"), "evaluate": ("judged_labels",)}
 ROOTS = {ingest_command.STAGE: ("run_ingest",)}
-for _one in all_stages().values():
+for _one in STAGES.values():
     _function = f"{_one.wants.__module__}.{_one.wants.__name__}"
     ROOTS[_one.product.name] = (*ROOTS.get(_one.product.name, BESIDES.get(_one.product.name, ())), _function)
 OF_RUNS = ("LineCamera", "SceneGrid", "AngularGrid", "CapturePlan")  # roots of every stage that is given a run

@@ -69,7 +69,7 @@ def test_every_policy_scores_the_field(archive: Path, policy: str) -> None:
     """Finite scores for all seats, detail where they ask for it; another seed is another key where they are drawn."""
     run = open_run(load_settings(None, _flags(archive, policy)))
     mosaic = StageRef("rectify", _mosaic(archive).parent.name, _mosaic(archive).parent)
-    ref, _ = attend.produce(run.archive, attend.needed(run, mosaic))
+    ref, _ = attend.produce(run.archive, attend.wants(run, mosaic))
     attention = load_attention(ref.path / "attention.zarr")
     assert attention.policy == policy
     assert np.isfinite(attention.score).all()

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-import flows.tasks.prefect_engine
+import flows.tasks.prefect_tasks
 import flows.tasks.rig_field
 import flows.terminal.progress
 from flows.publish.run_folder import Published
@@ -32,9 +32,11 @@ from pipeline.geometry.scan import Sweep, exposing
 from pipeline.rig.camera.camera_cubes import mean_frame
 from pipeline.rig.capture.capture_paths import REFERENCES
 from pipeline.rig.capture.capture_runner import RigDevices
+from pipeline.rig.device_settings import SurveyRig
 from pipeline.rig.devices import SYSTEM_CLOCK, DeviceGone
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock
 from pipeline.rig.emulator.fault_names import CameraFault, make_fault
+from pipeline.rig.emulator.mirror_device import Mode
 from pipeline.rig.emulator.scene_camera import REFERENCE_FRAMES, SceneView
 from pipeline.rig.mirror.pro_mode import Command
 from pipeline.rig.transports import SerialTransport
@@ -59,6 +61,7 @@ SMALL: dict[str, Any] = {
     "controls": False,
     "budget": 0.8,
     "rig.panel": 0.99,  # of the farm's white panel
+    "rig.pulses": "position",
     "effects": "rotation,slit,smear,vignetting,shot,read-noise",
 }
 
@@ -222,6 +225,23 @@ def test_pulses_of_frames_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert {finding.kind for finding in verify_archive(Archive.open(tmp_path))} == {"whole"}
 
 
+@pytest.mark.usefixtures("no_effects")
+def test_a_rig_as_the_defaults_have_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """No pulses and no CRC: every line lies where the mirror's log measured it, and the map is nearly the simulated."""
+    usual = SurveyRig()
+    told = {"rig.pulses": usual.pulses, "rig.with_crc": usual.with_crc, "effects": "none"}
+    settings = small_settings(tmp_path, source="rig", visit="first", **told)
+    with emulated(settings, {}, monkeypatch) as rig:
+        published = run_survey(settings, QUIET)
+        assert (rig.camera.wired, rig.mirror.mode) == ("none", Mode.PRO)
+    for name in ("raw_coarse", "raw_fine"):
+        record = json.loads((tmp_path / published.receipt["products"][name] / "rig.json").read_text())
+        assert {one["method"] for one in record["captures"]} == {"log"}
+    truth = run_survey(small_settings(tmp_path / "sim", effects="none"), QUIET)
+    alike = class_map_of(published, tmp_path) == class_map_of(truth, tmp_path / "sim")
+    assert alike.mean() > 0.9, alike.mean()
+
+
 def test_log_beside_pulses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Every capture is tied by the edges in the mirror's log: lines are the planned ones, where it measured them."""
     told = {"rig.log_pulses": True, "rig.log_samples": 16000, "effects": "none"}
@@ -324,6 +344,10 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     "axes that are none": ({"rig.mirror_axes": "x,x"}, r"mirror.axes must be one of x,y  x,-y .* -y,-x; got 'x,x'"),
     "clocking as large as a turn": ({"rig.mirror_clocking_deg": 90}, r"clocking.deg must be .* -45 to 45 deg, got 90"),
     "offset in degrees": ({"rig.mirror_offset_x": 2}, r"mirror.offset.x must be a number from -0.5 to 0.5, got 2"),
+    "driver that is not there": (
+        {"source": "rig", "rig.camera_driver": "nowhere:open_it"},
+        r"rig.camera_driver = 'nowhere:open_it' cannot be imported .*No module named 'nowhere'",
+    ),
     "port number": ({"rig.control_port": 0}, r"control.port must be a whole number from 1 to 65535, got 0"),
     "settling in ms": ({"rig.settle_s": 200}, r"settle.s must be a number from 0.01 to 60 s, got 200.*milliseconds"),
     "no such source": ({"source": "rigg"}, r"source must be one of sim, rig; got 'rigg'"),
@@ -399,7 +423,7 @@ def test_default_engine_says_it_once_as_well(
     command_line: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """Through Prefect, which tries again, a port that is not there is one message too, and no traceback."""
-    monkeypatch.setattr(flows.tasks.prefect_engine, "RETRY_DELAY_S", 0.0)
+    monkeypatch.setattr(flows.tasks.prefect_tasks, "RETRY_DELAY_S", 0.0)
     file = tmp_path / "rig.toml"
     file.write_text('source = "rig"\nscene = "farm"\nsize = "96x96"\nbands = [40, 90]\n[rig]\nport = "/dev/ttyNONE"\n')
     ended = command_line("survey", file, "--out", tmp_path / "archive")

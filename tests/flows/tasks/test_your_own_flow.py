@@ -6,7 +6,6 @@ Then run the flow itself once, on a throw-away Prefect server that asks nothing 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -28,16 +27,8 @@ def check_rig(answers: bool) -> None:
         raise RigError("no reply from the rig; is it on?")
 
 
-# (2) A server for the tests: Prefect starts it at the first flow, which takes seconds, and its files are in a folder
-# that goes away. Each flow takes a second more for its heartbeat, which is switched off here: keep such tests few.
-# ``prefect_home`` (conftest.py) comes before anything imports Prefect, which reads its settings only then.
-@pytest.fixture(scope="module")
-def server(prefect_home: Path) -> Iterator[None]:
-    """Flows of this module run on a throw-away server, which surveys of this process share."""
-    from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
-
-    with temporary_settings(updates={PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}):
-        yield
+# (2) A server for the tests: the fixture ``server`` (conftest.py) runs one in this process for all tests of a module,
+# its files in a folder that goes away.
 
 
 # (3) First without a server: a task's function is there as it is.
@@ -49,7 +40,7 @@ def test_the_work_itself(tmp_path: Path) -> None:
 
 
 # (4) Then the flow, once when all is well and once for each stage that may fail: state, message, and what it left.
-def test_the_flow(server: None, tmp_path: Path) -> None:
+def test_the_flow(server: str, tmp_path: Path) -> None:
     """It completes with what the functions give, and a failed stage fails it with that stage's message."""
     from prefect import flow, task
 

@@ -105,15 +105,19 @@ def small_rig(
     mounting: Mounting = STRAIGHT,
     **settings: Any,
 ) -> Iterator[SmallRig]:
-    """An emulated rig before a source's scene, until the context ends; its mirror is mounted as ``mounting`` says."""
+    """An emulated rig before a source's scene, until the context ends; its mirror is mounted as ``mounting`` says.
+
+    Settings and cable have one pulse a held position, and requests to the mirror a CRC, unless ``settings`` differ.
+    """
+    told = {"pulses": "position", "with_crc": True, **settings}
     looked = small_source() if source is None else source
     rig = EmulatedRig(
         looked,
         ManualClock(50.0),
         mirror_faults=mirror_faults,
-        wired=settings.get("pulses", "position"),
+        wired=told["pulses"],
         camera_faults=CameraFaults(dict(faults or {}), 0, passes),
         mounting=mounting,
     )
     with InProcessRig(rig) as line:
-        yield SmallRig(line, SurveyRig(**settings), vector_pairs, looked.wavelength_nm)
+        yield SmallRig(line, SurveyRig(**told), vector_pairs, looked.wavelength_nm)

@@ -15,7 +15,7 @@ import pytest
 import serial
 
 from pipeline.errors import SettingsError
-from pipeline.rig.device_settings import MirrorSettings
+from pipeline.rig.device_settings import MirrorSettings, SurveyRig
 from pipeline.rig.devices import SYSTEM_CLOCK, DeadlinePassed, DeviceGone
 from pipeline.rig.transports import SerialTransport
 from tests.pipeline.rig.in_process import ManualClock
@@ -203,4 +203,5 @@ def test_defaults_are_assumed_and_say_so():
     settings = MirrorSettings()
     assert settings.provenance == "assumed"
     assert (settings.vector_pairs, settings.ends, settings.strict_crc) == (1500, "exclusive", False)
+    assert (settings.with_crc, SurveyRig().pulses) == (False, "none")
     assert settings.patience.deadline_s == settings.deadline_s

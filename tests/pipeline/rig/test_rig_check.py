@@ -2,51 +2,56 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from pipeline.errors import RigError
 from pipeline.rig.camera.camera_files import log_in
+from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.capture.capture_paths import capture_prefix
-from pipeline.rig.device_settings import FileServer, MirrorSettings
-from pipeline.rig.devices import DeviceGone, DeviceRefused
+from pipeline.rig.device_settings import FileServer, MirrorSettings, Pulses
+from pipeline.rig.devices import Clock, DeviceGone, DeviceRefused
 from pipeline.rig.emulator.camera_device import CameraUnit
 from pipeline.rig.emulator.emulated_rig import EmulatedRig
 from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults, make_fault
 from pipeline.rig.emulator.mirror_device import Mode
+from pipeline.rig.emulator.mirror_state import MirrorUnit
 from pipeline.rig.mirror.mirror_controller import MirrorController
 from pipeline.rig.mirror.path_player import MotionLog
 from pipeline.rig.mirror.pro_mode import Command
 from pipeline.rig.mirror.registers import Status
-from pipeline.rig.rig_check import SQUARE, CheckRow, check_camera, check_mirror, failed, works
+from pipeline.rig.rig_check import SQUARE, CheckRow, check_camera, check_mirror, check_triggers, failed, works
 from tests.pipeline.rig.in_process import InProcessRig, ManualClock
-from tests.pipeline.rig.small_rig import FINE, small_source
+from tests.pipeline.rig.small_rig import CAMERA, FINE, small_source
 
+FRAMES = "frames with and without a CRC"
 SETS = {Command.SET_VALUE, Command.SET_VALUES, Command.SET_VECTOR}
 
 
 @contextmanager
-def rig(*faults: str, camera: CameraFaults | None = None) -> Iterator[InProcessRig]:
+def rig(*faults: str, camera: CameraFaults | None = None, **given: Any) -> Iterator[InProcessRig]:
     """An emulated rig whose mirror's faults strike at the first occasion."""
     struck = [make_fault(name, at=0) for name in faults]
-    whole = EmulatedRig(small_source(), ManualClock(), mirror_faults=struck, camera_faults=camera)
+    whole = EmulatedRig(small_source(), ManualClock(), mirror_faults=struck, camera_faults=camera, **given)
     with InProcessRig(whole) as line:
         yield line
 
 
-def mirror_rows(line: InProcessRig, *, move: bool = False, expected_id: str = "") -> list[CheckRow]:
+def mirror_rows(line: InProcessRig, *, move: bool = False, **settings: Any) -> list[CheckRow]:
     """Check the mirror of a rig."""
 
     def connect() -> MirrorController:
-        mirror = MirrorController(line.transport, MirrorSettings(expected_id=expected_id), line.clock)
+        mirror = MirrorController(line.transport, MirrorSettings(**settings), line.clock)
         mirror.connect()
         return mirror
 
-    return check_mirror(connect, move=move)
+    return check_mirror(connect, line.clock, move=move)
 
 
 def told(rows: list[CheckRow], verdict: str) -> list[str]:
@@ -63,7 +68,7 @@ def test_mirror_in_order() -> None:
     """Everything that was asked, in order; nothing was set, and the port is let go of."""
     with rig() as line:
         rows = mirror_rows(line)
-        assert [row.asked for row in rows] == ["identity", "status", "path", "temperature"]
+        assert [row.asked for row in rows] == ["identity", "status", "path", "temperature", FRAMES]
         assert {row.verdict for row in rows} == {"ok"}
         assert rows[0].came == "MR-E-2, version EMULATOR 1.0, serial EMUL0001"
         assert rows[3].came == "25.0 deg C"
@@ -133,7 +138,7 @@ def test_controller_in_pro_mode_is_no_fault() -> None:
     with rig() as line:
         line.rig.mirror.set_mode(Mode.PRO_CRC)
         rows = mirror_rows(line)
-        assert [row.asked for row in rows] == ["identity", "mode", "status", "path", "temperature"]
+        assert [row.asked for row in rows] == ["identity", "mode", "status", "path", "temperature", FRAMES]
         assert {row.verdict for row in rows} == {"ok"}
 
 
@@ -171,7 +176,7 @@ def test_path_that_plays_is_left_alone() -> None:
 def test_camera_in_order() -> None:
     """Whether it captures, what is there, and its files' server; a capture that runs is told and left alone."""
     with rig() as line:
-        rows = check_camera(line.camera(), line.files)
+        rows = check_camera(line.camera)
         assert [row.asked.partition(",")[0] for row in rows] == [
             "whether it captures",
             "list its files",
@@ -179,21 +184,138 @@ def test_camera_in_order() -> None:
         ]
         assert {row.verdict for row in rows} == {"ok"}
         line.camera().capture(5, prefix=capture_prefix(FINE))
-        assert told(check_camera(line.camera(), line.files), "warn") == ["whether it captures"]
+        assert told(check_camera(line.camera), "warn") == ["whether it captures"]
         assert line.rig.camera.is_capturing()
 
 
 def test_camera_out_of_order() -> None:
     """No control, no files, another password, an empty listing: a row each, and the other is asked all the same."""
     with rig(camera=CameraFaults({CameraFault.HANGS_UP: 9})) as line:
-        assert told(check_camera(line.camera(), line.files), "fail") == ["connect"]
+        assert told(check_camera(line.camera), "fail") == ["connect"]
     with rig() as line:
-        gone = FileServer("127.0.0.1", 1)
-        assert told(check_camera(line.camera(), gone), "fail") == ["log in to its files, port 1"]
+        gone = HeadwallCamera(line.camera_line, FileServer("127.0.0.1", 1), clock=line.clock)
+        assert told(check_camera(lambda: gone), "fail") == ["log in to its files, port 1"]
         other = replace(line.files, password="other")
         with pytest.raises(DeviceRefused, match="password"):
             log_in(other)
         assert log_in(line.files) == "emulated camera"
     with rig() as line:
         line.rig.camera.unit = CameraUnit(root="/")
-        assert [row.came for row in check_camera(line.camera(), line.files)][1] == "nothing there"
+        assert [row.came for row in check_camera(line.camera)][1] == "nothing there"
+
+
+@pytest.mark.parametrize(
+    ("crc", "with_crc", "came"),
+    [
+        ("either", False, "both are answered; with_crc = false is set"),
+        ("either", True, "both are answered; with_crc = true is set"),
+        ("required", True, r"frames with a CRC are answered, frames without one are not: .*the CRC is wrong"),
+        ("absent", False, r"frames without a CRC are answered, frames with one are not: .*answered NO to GOPROCRC"),
+    ],
+)
+def test_frames_with_and_without_a_crc_are_tried(crc: Any, with_crc: bool, came: str) -> None:
+    """Both ways of sending frames are tried on each firmware; nothing is set, and no row fails."""
+    with rig(mirror=MirrorUnit(crc=crc)) as line:
+        rows = mirror_rows(line, with_crc=with_crc)
+        assert re.match(came, next(row.came for row in rows if row.asked == FRAMES))
+        assert {row.verdict for row in rows} == {"ok"}
+        assert not set_anything(line)
+
+
+@pytest.mark.parametrize(("crc", "with_crc", "right"), [("required", False, "true"), ("absent", True, "false")])
+def test_a_wrong_crc_setting_fails_with_the_right_one(crc: Any, with_crc: bool, right: str) -> None:
+    """The setting that is answered stands in the row, and the same check passes with it."""
+    with rig(mirror=MirrorUnit(crc=crc)) as line:
+        (row,) = mirror_rows(line, with_crc=with_crc)
+        assert (row.asked, row.verdict, row.mend) == ("connect", "fail", f"set with_crc = {right} in [rig]")
+        assert not set_anything(line)
+    with rig(mirror=MirrorUnit(crc=crc)) as line:
+        assert works(mirror_rows(line, with_crc=not with_crc), "mirror")
+
+
+def trigger_rows(wired: Pulses, pulses: Pulses) -> list[CheckRow]:
+    """Rows of what steps the paths of a rig with such a cable and such a setting."""
+    with rig(wired=wired) as line:
+        rows = check_triggers(lambda: line.devices(MirrorSettings()), line.clock, pulses, CAMERA)
+        assert np.abs(line.rig.mirror.positions(line.clock.now())).max() == 0  # it never left 0; 0
+        return rows
+
+
+@pytest.mark.parametrize(("wired", "edges"), [("none", 0), ("frame", 4), ("position", 32)])
+def test_edges_of_a_capture_say_how_the_cable_is(wired: Pulses, edges: int) -> None:
+    """The own clock steps a path always; edges are counted, and the setting that fits them is no failure."""
+    clockwork, by_edges = trigger_rows(wired, wired)
+    assert clockwork.came == "10 cells in 0.5 s at 20 Hz"
+    assert by_edges.came.startswith(f"{edges} edges in 4 frames (/captured/check_")
+    assert {clockwork.verdict, by_edges.verdict} == {"ok"}
+
+
+@pytest.mark.parametrize(
+    ("wired", "pulses", "verdict", "words"),
+    [
+        ("none", "position", "fail", 'set pulses = "none" in [rig]; it is "position"'),
+        ("frame", "position", "fail", 'set pulses = "frame" in [rig]; it is "position"'),
+        ("position", "frame", "fail", 'set pulses = "position" in [rig]; it is "frame"'),
+        ("frame", "none", "ok", 'pulses = "frame" would step the mirror by them'),
+    ],
+)
+def test_edges_beside_another_setting(wired: Pulses, pulses: Pulses, verdict: str, words: str) -> None:
+    """A setting that expects other edges fails with the right one; one that expects none works all the same."""
+    row = trigger_rows(wired, pulses)[-1]
+    assert row.verdict == verdict
+    assert words in (row.mend if verdict == "fail" else row.came)
+
+
+def test_edges_that_are_lost_fail() -> None:
+    """Two edges of four frames fit no setting: the cable is to be looked at."""
+    with rig(wired="frame") as line:
+        whole, left = line.rig.camera.pulses, [2]
+
+        def fewer(from_s: float, to_s: float) -> Any:
+            found = whole(from_s, to_s)[: left[0]]
+            left[0] -= len(found)
+            return found
+
+        line.rig.mirror.pulses = fewer
+        row = check_triggers(lambda: line.devices(MirrorSettings()), line.clock, "frame", CAMERA)[-1]
+    assert (row.verdict, row.came[:19]) == ("fail", "2 edges in 4 frames")
+    assert "edges are lost: look at the cable" in row.mend
+
+
+def test_a_capture_that_fails_leaves_nothing_running() -> None:
+    """A camera without room: one row, the path is halted, and the devices are let go of."""
+    with rig(camera=CameraFaults({CameraFault.FULL: 1})) as line:
+        (row,) = check_triggers(lambda: line.devices(MirrorSettings()), line.clock, "none", CAMERA)
+        assert (row.verdict, "full" in row.came) == ("fail", True)
+        assert not any(player.running for player in line.rig.mirror.state.players)
+
+
+@dataclass
+class Mock:
+    """A mirror of another make, which is where it was sent at once."""
+
+    clock: Clock
+    place: tuple[float, float] = (0.0, 0.0)
+    closed: bool = False
+
+    def goto(self, x: float, y: float) -> None:
+        self.place = (x, y)
+
+    def start_log(self, rate_hz: float | None = None, *, with_index: bool = False) -> None: ...
+
+    def settle(self, within_s: float) -> None: ...
+
+    def read_log(self) -> MotionLog:
+        return MotionLog(np.full((8, 2), self.place, np.float32), 1000.0, 0.0, 0.0)
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def test_a_mirror_of_another_make_goes_round_the_square() -> None:
+    """It is asked nothing that only the shipped one knows, and let go of."""
+    mirror: Any = Mock(ManualClock())
+    rows = check_mirror(lambda: mirror, mirror.clock, move=True)
+    assert rows[0].came == "Mock is there"
+    assert rows[1].came.startswith("read back 0.0300; 0.0300")
+    assert ([row.verdict for row in rows], mirror.closed) == (["ok"] * 6, True)

@@ -61,7 +61,7 @@ def connected(source: SimulatedSource | None = None, **rig: Any) -> Iterator[tup
     """Drivers of an emulated rig in this process."""
     whole = EmulatedRig(small_source() if source is None else source, ManualClock(), **rig)
     with InProcessRig(whole) as line:
-        mirror = MirrorController(line.transport, MirrorSettings(), line.clock)
+        mirror = MirrorController(line.transport, MirrorSettings(with_crc=True), line.clock)
         mirror.connect()
         yield Pair(mirror, line.camera(), line.clock), whole
 

@@ -85,6 +85,7 @@ START_LOG = pair("7E 00 12 08 00 01 24 10 00 00 00 01 D1 B8 7E", DONE)
 
 def connected(transport: ScriptedTransport, **settings: Any) -> MirrorController:
     """A controller that has been connected; the script begins with CONNECT, and CRCs in it have to fit."""
-    mirror = MirrorController(transport, MirrorSettings(**{"strict_crc": True, **settings}), transport.clock)
+    told = {"with_crc": True, "strict_crc": True, **settings}
+    mirror = MirrorController(transport, MirrorSettings(**told), transport.clock)
     mirror.connect()
     return mirror

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -57,7 +57,8 @@ class Session:
         self.fault = make_fault(self.name, self.seed, self.at)
         self.device = MirrorDevice(self.clock, [self.fault])
         self.transport = InProcessTransport(self.device, self.clock, self.baud)
-        self.driver = MirrorController(self.transport, SETTINGS, self.clock)
+        settings = replace(SETTINGS, with_crc=self.seed % 2 == 1)  # every other session sends CRCs
+        self.driver = MirrorController(self.transport, settings, self.clock)
         self.times()
 
     def times(self) -> None:

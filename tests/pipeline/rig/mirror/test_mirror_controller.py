@@ -233,7 +233,7 @@ def give(monkeypatch: pytest.MonkeyPatch, transport: ScriptedTransport) -> None:
     monkeypatch.setattr(mirror_controller, "SerialTransport", opened)
 
 
-SETTINGS = MirrorSettings(port="/dev/mirror", baud=256000, strict_crc=True)
+SETTINGS = MirrorSettings(port="/dev/mirror", baud=256000, with_crc=True, strict_crc=True)
 
 
 def test_opening_connects_or_lets_go_of_the_port(monkeypatch: pytest.MonkeyPatch):

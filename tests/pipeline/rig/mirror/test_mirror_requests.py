@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from contextlib import nullcontext
 
 import pytest
@@ -23,7 +24,7 @@ from pipeline.rig.mirror.mirror_requests import (
 )
 from pipeline.rig.mirror.pro_mode import cell_int, get_value
 from pipeline.rig.transports import Wire
-from tests.pipeline.rig.mirror.mirror_bytes import CONNECT, ENTER, GREET, LEAVE, WELL, WHO, connected, set_value
+from tests.pipeline.rig.mirror.mirror_bytes import CONNECT, ENTER, GREET, LEAVE, WELL, WHO, connected, pair, set_value
 from tests.pipeline.rig.scripted import Pair, Reply, ScriptedTransport, scripted
 
 OTHER = bytes.fromhex("7E 00 13 0A 00 02 3F 00 00 00 BE 80 00 00 9B D7 7E")
@@ -47,7 +48,7 @@ def wire(transport: ScriptedTransport) -> Wire:
 
 def pro(transport: ScriptedTransport, **settings: bool) -> ProLink:
     """Pro mode over the transport; CRCs in the script have to fit."""
-    return ProLink(wire(transport), **{"strict_crc": True, **settings})
+    return ProLink(wire(transport), **{"with_crc": True, "strict_crc": True, **settings})
 
 
 def test_every_kind_of_request_in_pro_mode():
@@ -266,14 +267,68 @@ def test_nobody_there_is_said_within_the_deadlines():
         assert transport.clock.now() < 4
 
 
-def test_firmware_without_crc_says_which_setting_to_turn():
-    """GOPROCRC is unknown: the message names the setting, and the setting sends GOPRO."""
-    words = r"Firmware without GOPROCRC\? Turn mirror.with_crc over"
-    with scripted([GREET, *WHO, (ENTER[0], b"NO\r\n")]) as transport, pytest.raises(DeviceRefused, match=words):
-        connected(transport)
-    status = (bytes.fromhex("7E 00 02 02 00 00 00 00 7E"), bytes.fromhex("7E 00 02 04 00 00 00 00 00 00 7E"))
-    with scripted([GREET, *WHO, (b"GOPRO\r\n", b"OK\r\n"), status]) as transport:
+PLAIN: Pair = (b"GOPRO\r\n", b"OK\r\n")
+PLAIN_WELL = pair("7E 00 02 02 00 00 00 00 7E", "7E 00 02 04 00 00 00 00 00 00 7E")
+PLAIN_LEAVE = pair("7E 00 06 02 00 00 00 00 7E", "7E 00 06 00 00 00 7E")
+CRC_WRONG = bytes.fromhex("7E 00 82 04 00 00 00 04 00 00 7E")
+KNOWN_CRC = [ENTER, WELL, LEAVE]
+UNCHECKED: list[Pair] = [(PLAIN_WELL[0], CRC_WRONG)] * 3  # a read is asked again twice
+STUCK = [SILENT] * 3
+NO_ENTER, NO_PLAIN = (ENTER[0], b"NO\r\n"), (PLAIN[0], b"NO\r\n")
+CHECKED_LEAVE = (PLAIN_LEAVE[0], bytes.fromhex("7E 00 86 04 00 00 00 04 00 00 7E"))
+FIRMWARES: dict[str, tuple[bool, list[Pair], str]] = {
+    "no GOPROCRC": (True, [NO_ENTER, GREET, PLAIN, PLAIN_WELL, PLAIN_LEAVE, GREET], "with_crc = false"),
+    "no GOPRO": (False, [NO_PLAIN, GREET, *KNOWN_CRC, GREET], "with_crc = true"),
+    "GOPRO that checks": (
+        False,
+        [PLAIN, *UNCHECKED, *STUCK, CHECKED_LEAVE, LEAVE, GREET, *KNOWN_CRC, GREET],
+        "with_crc = true",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FIRMWARES)
+def test_a_firmware_that_wants_frames_the_other_way_says_which_setting(name: str):
+    """The other way is tried and left again before the message names its setting; it moves nothing."""
+    with_crc, script, setting = FIRMWARES[name]
+    with (
+        scripted([GREET, *WHO, *script]) as transport,
+        pytest.raises(DeviceRefused, match=rf"It answers frames .*; set {setting} in \[rig\]"),
+    ):
+        connected(transport, with_crc=with_crc, strict_crc=False)
+
+
+def test_a_firmware_that_answers_frames_neither_way_says_what_it_said():
+    """Nothing is advised where nothing would help."""
+    script = [GREET, *WHO, NO_PLAIN, GREET, NO_ENTER, GREET]
+    with scripted(script) as transport, pytest.raises(DeviceRefused, match=r"NO to GOPRO: it does not know.*now$"):
         connected(transport, with_crc=False)
+
+
+def test_frames_without_a_crc_connect_by_these_bytes():
+    """00 00 stands in the CRC's place, in requests and replies."""
+    with scripted([GREET, *WHO, PLAIN, PLAIN_WELL]) as transport:
+        connected(transport, with_crc=False)
+
+
+def test_a_controller_left_with_requests_checked_is_left_by_a_checked_request():
+    """An earlier session sent CRCs and this one does not: the change of mode is asked for again with one."""
+    script = [*STUCK, CHECKED_LEAVE, LEAVE, GREET, *WHO, PLAIN, PLAIN_WELL]
+    with scripted(script) as transport:
+        assert connected(transport, with_crc=False).found_in_pro
+
+
+IDLE_PLAIN = pair("7E 00 13 06 00 02 68 01 69 01 00 00 7E", "7E 00 13 0A 00 02 00 00 00 00 00 00 00 00 00 00 7E")
+BOTH: dict[str, tuple[list[Pair], str]] = {"both": (KNOWN_CRC, "^$"), "none with a CRC": ([NO_ENTER], "NO to GOPROCRC")}
+
+
+@pytest.mark.parametrize("name", BOTH)
+def test_the_other_way_is_tried_and_given_up_again(name: str):
+    """Simple mode, the other way and back, byte by byte; the session goes on as its settings say."""
+    other, words = BOTH[name]
+    script = [GREET, *WHO, PLAIN, PLAIN_WELL, IDLE_PLAIN, PLAIN_LEAVE, GREET, *other, GREET, PLAIN, PLAIN_WELL]
+    with scripted(script) as transport:
+        assert re.search(words, connected(transport, with_crc=False).why_unanswered(with_crc=True))
 
 
 def test_another_device_is_refused():

@@ -1,0 +1,412 @@
+"""A recording as a source of lines: sweeps that were taken once serve every later request for lines of that field.
+
+A request for a sweep of the recording itself gives that sweep as it is. A request for any other sweep gives, for each
+planned line, the recorded line that lies nearest; its samples are summed where the recording has finer ones. A line
+keeps the position, time and exposure that were recorded, which the rectification goes by: half a pixel beside the plan
+costs nothing.
+
+A coarse line of the simulator or the rig holds ``step`` mirror positions during one exposure. A recorded full scan has
+``step`` single lines in its place, and to sum them all would read the whole scan. One of them stands for the coarse
+line: it sees one position instead of ``step``, so detail between the lines is not averaged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import NotRecordedError, SceneError, ShapeError
+from pipeline.geometry.camera import LineCamera, bin_samples
+from pipeline.geometry.mirror import direction_to_scene, position_to_direction
+from pipeline.geometry.scan import Sweep
+from pipeline.source import Line, References, SweepLines
+
+Floats = NDArray[np.float64]
+Numbers = NDArray[np.intp]
+ReadLines = Callable[[Numbers], NDArray[np.uint16]]
+
+BLOCK_LINES = 64  # read at a time
+STRIP_PX = 1.0  # a planned strip may lie so far beside the recorded one
+REACH_STEPS = 0.75  # and a planned line from the nearest recorded one: half their distance, more where that varies,
+PLANNED_REACH = 0.5  # or so much of the planned distance of lines, where that is more
+FINE_ENOUGH = 1.5  # recorded lines may lie so many times farther apart than planned ones
+SAME_PX = 1e-6  # distances that differ by less are equal: of two lines the first counts
+
+
+@dataclass(frozen=True)
+class RecordedSweep:
+    """One sweep of a recording: lines in the order in which they were taken, and how single lines are read.
+
+    It is a `pipeline.source.SweepLines`. ``sweep`` describes it: the planned one where the recording holds that, else
+    one that `pipeline.capture.straight_scans.fit_sweep` derived from the positions.
+    """
+
+    sweep: Sweep
+    references: References
+    position: Floats  # (line, 2) mirror X and Y at mid exposure
+    time_s: Floats  # (line,) of mid exposure, since the start of the sweep
+    exposure_ms: Floats  # (line,)
+    valid_line: NDArray[np.bool_]  # (line,)
+    read_lines: ReadLines  # numbers of lines, ascending -> (line, sample, band) uint16
+
+    def __post_init__(self) -> None:
+        lines = self.sweep.lines
+        for name in ("position", "time_s", "exposure_ms", "valid_line"):
+            if len(getattr(self, name)) != lines:
+                raise ShapeError(f"sweep {self.sweep.name}: {name} is of {len(getattr(self, name))} lines, not {lines}")
+
+    @classmethod
+    def of(cls, lines: SweepLines, exposure_ms: Floats) -> RecordedSweep:
+        """Record any sweep: its lines with their exposures (line,) [ms]; lines that follow each other are one read."""
+
+        def read_lines(numbers: Numbers) -> NDArray[np.uint16]:
+            return np.concatenate([lines.read(first, stop) for first, stop in line_runs(numbers)])
+
+        return cls(
+            lines.sweep, lines.references, lines.position, lines.time_s, exposure_ms, lines.valid_line, read_lines
+        )
+
+    def read(self, start: int, stop: int) -> NDArray[np.uint16]:
+        """Raw numbers of the lines ``start`` to ``stop``, (line, sample, band)."""
+        return self.read_lines(np.arange(start, min(stop, self.sweep.lines)))
+
+    @cached_property
+    def tangents(self) -> Floats:
+        """(line, 2) where the line centres lie, along the line and along the scan, as scene tangents, or NaN."""
+        known = np.isfinite(self.position).all(axis=1)
+        found = np.full(self.position.shape, np.nan)
+        found[known] = direction_to_scene(position_to_direction(self.position[known]))
+        return found
+
+    @cached_property
+    def line_distance(self) -> float:
+        """Median distance of lines that follow each other along the scan, as a scene tangent."""
+        valid = np.flatnonzero(self.valid_line & np.isfinite(self.tangents[:, 1]))
+        if len(valid) < 2:
+            return 0.0
+        return float(np.median(np.abs(np.diff(self.tangents[valid, 1])) / np.diff(valid)))
+
+
+@dataclass(frozen=True)
+class PickedLines:
+    """The recorded lines that serve a planned sweep, in the order in which they were recorded.
+
+    Where the recording went the other way this is the plan backwards: times rise, and positions say where lines lie.
+    """
+
+    place: Numbers  # (line,) number of the recorded sweep
+    line: Numbers  # (line,) number of the line there
+    again: NDArray[np.bool_]  # (line,) the planned line before is served by the same recorded line
+
+
+class RecordedSource:
+    """A :class:`pipeline.source.Source` over recorded sweeps.
+
+    Parameters
+    ----------
+    sweeps
+        What was recorded, in the order in which it was taken.
+    camera
+        The camera that took it, with the samples of a line that is not binned.
+    wavelength_nm, field_shape
+        (band,) centres [nm] and (y, x) size of the field [px].
+    name
+        What the receipt calls it.
+    notes
+        What was assumed of the recording.
+
+    Raises
+    ------
+    SceneError
+        There is no sweep, or a sweep's lines have other samples or bands than the camera and the wavelengths say.
+    """
+
+    def __init__(
+        self,
+        sweeps: Sequence[RecordedSweep],
+        camera: LineCamera,
+        wavelength_nm: NDArray[np.float64],
+        field_shape: tuple[int, int],
+        *,
+        name: str = "recorded",
+        notes: Sequence[str] = (),
+    ) -> None:
+        if not sweeps:
+            raise SceneError("the recording holds no sweep; name a folder or file with raw cubes in it")
+        self.sweeps, self.camera, self.wavelength_nm, self.field_shape = (
+            tuple(sweeps),
+            camera,
+            wavelength_nm,
+            field_shape,
+        )
+        self.name, self.notes = name, tuple(notes)
+        self._read = [np.zeros(one.sweep.lines, np.bool_) for one in self.sweeps]
+        for one in self.sweeps:
+            wanted = (camera.samples // one.sweep.binning, len(wavelength_nm))
+            if one.references.dark.shape != wanted:
+                raise SceneError(
+                    f"sweep {one.sweep.name} has lines of {one.references.dark.shape} (sample, band), and a camera of "
+                    f"{camera.samples} samples and {len(wavelength_nm)} wavelengths gives {wanted} with binning "
+                    f"{one.sweep.binning}; set camera.samples and the wavelengths to what was recorded"
+                )
+
+    @property
+    def lines_read(self) -> int:
+        """Recorded lines that were read so far, each counted once."""
+        return sum(int(np.count_nonzero(read)) for read in self._read)
+
+    @property
+    def lines_recorded(self) -> int:
+        """Lines that the recording holds."""
+        return sum(one.sweep.lines for one in self.sweeps)
+
+    @property
+    def record(self) -> Mapping[str, Any]:
+        """What the recording consists of and what was assumed of it."""
+        sweeps = [{"name": one.sweep.name, "lines": one.sweep.lines} for one in self.sweeps]
+        return {"recording": {"sweeps": sweeps, "notes": list(self.notes)}}
+
+    def lines(self, sweep: Sweep, first: int = 0) -> Iterator[Line]:
+        """Give the lines that serve a sweep one by one, from line ``first`` on, in the order of `PickedLines`.
+
+        A recorded line that serves two planned lines is valid once. Raises NotRecordedError: a planned line was never
+        taken; ShapeError: sums of samples do not fit uint16.
+        """
+        picked = self.pick(sweep)
+        for start in range(first, sweep.lines, BLOCK_LINES):
+            yield from self._lines_of(sweep, picked, np.arange(start, min(start + BLOCK_LINES, sweep.lines)))
+
+    def lines_again(self, sweep: Sweep, numbers: Sequence[int]) -> Iterator[Line]:
+        """Give single lines that were given before: the same, bit for bit; raises as `lines`."""
+        picked = self.pick(sweep)
+        for number in numbers:
+            yield from self._lines_of(sweep, picked, np.array([number]))
+
+    def references(self, sweep: Sweep) -> References:
+        """Dark and white frames of the recorded lines that serve a sweep, summed to its binning; raises as `lines`."""
+        served = self.sweeps[int(self.pick(sweep).place[0])] if sweep.lines else self.sweeps[0]
+        return sum_references(served.references, sweep.binning // served.sweep.binning)
+
+    def cut_to_recorded(self, sweep: Sweep) -> Sweep | None:
+        """Give a sweep without the lines at either end that were never taken; None where none of its lines was.
+
+        Plans begin and end a few lines beyond the field, where a recording may have none. A line that is missing in
+        between stays, for `lines` to name it.
+        """
+        if self._own(sweep) is not None:
+            return sweep
+        served = max((self._nearest(sweep, group)[0] >= 0 for group in self._groups), key=np.count_nonzero)
+        taken = np.flatnonzero(served)
+        if not len(taken):
+            return None
+        first, last = int(taken[0]), int(taken[-1])
+        return replace(sweep, start_px=sweep.start_px + first * sweep.step, lines=last + 1 - first)
+
+    def pick(self, sweep: Sweep) -> PickedLines:
+        """Choose the recorded lines that serve a sweep; nothing is read.
+
+        All of them have the same references. Of sweeps with equal references those win whose lines lie nearest, and of
+        equally near ones those that have the planned binning.
+
+        Raises NotRecordedError: a planned line was never taken.
+        """
+        own = self._own(sweep)
+        if own is not None:
+            count = np.arange(sweep.lines)
+            return PickedLines(np.full(sweep.lines, own), count, np.zeros(sweep.lines, np.bool_))
+        found = [(group, *self._nearest(sweep, group)) for group in self._groups]
+        whole = [one for one in found if (one[1] >= 0).all()]
+        if not whole:
+            self._refuse(
+                sweep, max((place for _, place, _, _ in found), key=lambda place: np.count_nonzero(place >= 0))
+            )
+
+        def rank(one: tuple[list[int], Numbers, Numbers, Floats]) -> tuple[int, bool]:
+            distance = float(one[3].mean()) if len(one[3]) else 0.0
+            return round(distance / SAME_PX), self.sweeps[one[0][0]].sweep.binning != sweep.binning
+
+        _, place, line, _ = min(whole, key=rank)
+        order = np.lexsort((line, place))
+        place, line = place[order], line[order]
+        again = np.zeros(len(line), np.bool_)
+        again[1:] = (np.diff(place) == 0) & (np.diff(line) == 0)
+        return PickedLines(place, line, again)
+
+    def _own(self, sweep: Sweep) -> int | None:
+        """Number of the recorded sweep that is the one asked for, by its lines; its exposure decides among several."""
+        alike = [number for number, one in enumerate(self.sweeps) if _same_lines(one.sweep, sweep)]
+        exposed = [number for number in alike if self.sweeps[number].sweep.exposure_ms == sweep.exposure_ms]
+        return next(iter(exposed or alike), None)
+
+    @cached_property
+    def _groups(self) -> list[list[int]]:
+        """Numbers of the sweeps that may serve one request together: of one axis, one binning and equal references."""
+        groups: list[list[int]] = []
+        for number, one in enumerate(self.sweeps):
+            for group in groups:
+                other = self.sweeps[group[0]]
+                if (one.sweep.along, one.sweep.binning) == (other.sweep.along, other.sweep.binning) and _equal(
+                    one.references, other.references
+                ):
+                    group.append(number)
+                    break
+            else:
+                groups.append([number])
+        return groups
+
+    def _nearest(self, sweep: Sweep, group: Sequence[int]) -> tuple[Numbers, Numbers, Floats]:
+        """Recorded sweep, line and distance [px] for each planned line; -1 where none of the group is near enough.
+
+        A line that is not valid serves only where no valid one does.
+        """
+        place, line = np.full((2, sweep.lines), -1)
+        best = np.full(sweep.lines, np.inf)
+        able = [number for number in group if self._can_serve(sweep, self.sweeps[number])]
+        for usable in (True, False):
+            open_lines = place < 0
+            for number in able:
+                one = self.sweeps[number]
+                candidates = np.flatnonzero((one.valid_line == usable) & np.isfinite(one.tangents[:, 1]))
+                if not len(candidates):
+                    continue
+                apart = one.line_distance / self.camera.ifov_rad
+                reach = max(REACH_STEPS * apart, PLANNED_REACH * sweep.step)
+                scan_px = one.tangents[candidates, 1] / self.camera.ifov_rad
+                near, distance = nearest_line(scan_px, sweep.line_px())
+                better = open_lines & (distance <= reach) & (distance < best - SAME_PX)
+                place[better], line[better], best[better] = number, candidates[near[better]], distance[better]
+        return place, line, best
+
+    def _can_serve(self, sweep: Sweep, one: RecordedSweep) -> bool:
+        """Whether a recorded sweep lies on the strip of a planned one, with samples and lines that are fine enough."""
+        recorded = one.sweep
+        return (
+            recorded.along == sweep.along
+            and sweep.binning % recorded.binning == 0
+            and abs(recorded.strip_px - sweep.strip_px) <= STRIP_PX
+            and one.line_distance / self.camera.ifov_rad <= FINE_ENOUGH * sweep.step
+        )
+
+    def _refuse(self, sweep: Sweep, place: Numbers) -> NoReturn:
+        """Raise NotRecordedError for the first planned line that nothing serves; ``place`` is -1 there."""
+        alike = [one for one in self.sweeps if one.sweep.along == sweep.along and np.isfinite(one.tangents).any()]
+        if not alike:
+            axes = ", ".join(sorted({one.sweep.along for one in self.sweeps}))
+            raise NotRecordedError(
+                f"the lines of sweep {sweep.name} lie along {sweep.along}, those of the recording along {axes}; plan "
+                f"sweeps along {axes}"
+            )
+        missing = int(np.argmax(place < 0))
+        planned = np.array([sweep.strip_px, sweep.line_px()[missing]])
+        apart = [np.hypot(*(one.tangents / self.camera.ifov_rad - planned).T) for one in alike]
+        which = int(np.argmin([np.nanmin(distance) for distance in apart]))
+        number = int(np.nanargmin(apart[which]))
+        recorded = alike[which].sweep
+        strip_px, scan_px = alike[which].tangents[number] / self.camera.ifov_rad
+        raise NotRecordedError(
+            f"line {missing} of sweep {sweep.name} was never taken: it lies at {planned[1]:g} px of the scan on the "
+            f"strip at {planned[0]:g} px (binning {sweep.binning}, step {sweep.step}), the nearest recorded line, "
+            f"{number} of {recorded.name}, at {scan_px:.6g} px on {strip_px:.6g} px (binning {recorded.binning}, step "
+            f"{recorded.step}). Ask for lines on the recording's own strips, no finer than they were recorded"
+        )
+
+    def _lines_of(self, sweep: Sweep, picked: PickedLines, numbers: Numbers) -> Iterator[Line]:
+        """Read some of the picked lines, one read for each recorded sweep among them, and give them in order."""
+        data: dict[int, NDArray[np.uint16]] = {}
+        for place in np.unique(picked.place[numbers]):
+            here = numbers[picked.place[numbers] == place]
+            wanted, back = np.unique(picked.line[here], return_inverse=True)
+            one = self.sweeps[place]
+            self._read[place][wanted] = True
+            block = bin_samples(one.read_lines(wanted), sweep.binning // one.sweep.binning)
+            data |= {int(number): block[at] for number, at in zip(here, back, strict=True)}
+        for number in numbers.tolist():
+            place, line = int(picked.place[number]), int(picked.line[number])
+            one = self.sweeps[place]
+            yield Line(
+                number=number,
+                data=data[number],
+                mirror_x=float(one.position[line, 0]),
+                mirror_y=float(one.position[line, 1]),
+                time_s=float(one.time_s[line]) + (self._begins_s[place] - self._begins_s[int(picked.place[0])]),
+                exposure_ms=float(one.exposure_ms[line]),
+                valid=bool(one.valid_line[line]) and not bool(picked.again[number]),
+            )
+
+    @cached_property
+    def _begins_s(self) -> list[float]:
+        """When each sweep begins, had all been taken one after the other without a break [s]."""
+        begins, after_s = [], 0.0
+        for one in self.sweeps:
+            begins.append(after_s)
+            last = one.time_s[np.isfinite(one.time_s)]
+            after_s += (float(last[-1]) if len(last) else 0.0) + self.camera.frame_ms * 1e-3
+        return begins
+
+
+def line_runs(numbers: Numbers) -> list[tuple[int, int]]:
+    """Give (start, stop) of the runs of ascending line numbers that follow each other."""
+    edges = np.flatnonzero(np.diff(numbers, prepend=-2, append=-2) != 1)
+    return [(int(numbers[first]), int(numbers[stop - 1]) + 1) for first, stop in pairwise(edges)]
+
+
+def nearest_line(scan_px: Floats, wanted_px: Floats) -> tuple[Numbers, Floats]:
+    """Find the line nearest to each wanted place: its number, and how far it lies [px].
+
+    ``scan_px`` (line,) are the lines in any order, at least one. Of two that lie equally far, up to SAME_PX, the one at
+    the smaller coordinate counts.
+    """
+    order = np.argsort(scan_px, kind="stable")
+    places = scan_px[order]
+    after = np.clip(np.searchsorted(places, wanted_px), 0, len(places) - 1)
+    before = np.maximum(after - 1, 0)
+    below, above = np.abs(wanted_px - places[before]), np.abs(places[after] - wanted_px)
+    chosen = np.where(above < below - SAME_PX, after, before)
+    return order[chosen], np.abs(places[chosen] - wanted_px)
+
+
+def sum_references(references: References, samples: int) -> References:
+    """Give references whose frames are summed over ``samples`` neighbours, as the lines are.
+
+    A sum is bad where one of its elements is; the relative response is the mean. A remainder is dropped.
+    """
+    if samples == 1:
+        return references
+
+    def grouped(frame: NDArray[Any]) -> NDArray[Any]:
+        count = len(frame) // samples
+        return frame[: count * samples].reshape(count, samples, -1)
+
+    return replace(
+        references,
+        dark=grouped(references.dark).sum(axis=1, dtype=np.float32),
+        white=grouped(references.white).sum(axis=1, dtype=np.float32),
+        bad=None if references.bad is None else np.asarray(grouped(references.bad).any(axis=1), np.bool_),
+        flat=None if references.flat is None else grouped(references.flat).mean(axis=1, dtype=np.float32),
+    )
+
+
+def _same_lines(one: Sweep, other: Sweep) -> bool:
+    """Whether two sweeps have the same lines and samples; places are compared as derived sweeps state them."""
+    apart = max(abs(one.strip_px - other.strip_px), abs(one.start_px - other.start_px))
+    return apart <= SAME_PX and (one.along, one.lines, one.step, one.binning) == (
+        other.along,
+        other.lines,
+        other.step,
+        other.binning,
+    )
+
+
+def _equal(one: References, other: References) -> bool:
+    """Whether all frames of two references are the same, bit for bit."""
+    frames = ("dark", "white", "panel", "bad", "flat")
+    pairs = [(getattr(one, name), getattr(other, name)) for name in frames]
+    return one.by_mirror == other.by_mirror and all(
+        (left is None) == (right is None) and (left is None or np.array_equal(left, right)) for left, right in pairs
+    )

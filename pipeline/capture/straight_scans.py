@@ -1,0 +1,176 @@
+"""Straight scans: the `Sweep` that describes recorded positions, the field they cover, and scans without a mirror.
+
+The rectification places lines by their positions alone. Of a `Sweep` it takes ``along`` (which axis of the scene a line
+lies along), ``binning`` (pixels a sample), ``step`` (the distance of lines, for gaps, turns and the pitch of
+registration) and ``name``. ``strip_px``, ``start_px`` and ``lines`` matter to whoever plans, and to the choice of
+recorded lines.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import SceneError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.mirror import (
+    direction_to_position,
+    direction_to_scene,
+    position_to_direction,
+    scene_to_direction,
+)
+from pipeline.geometry.scan import Axis, Sweep, points_of_scan
+
+Floats = NDArray[np.float64]
+
+MOST_BEND = 1 / 16  # of a line's length that line centres may lie off their strip
+MOST_BACK = 8.0  # line distances that a scan may go back before it counts as turned
+STANDING_PX = 1e-3  # a scan that moves less from line to line stands still
+STATED_DIGITS = 6  # of derived coordinates [px], so that a planned sweep comes back as it was
+FLAT_PX = 0.01  # by which lines of a scan without a mirror may be stretched or shifted at their ends
+
+
+@dataclass(frozen=True)
+class StraightScan:
+    """A sweep derived from positions, and what of the scan it does not tell."""
+
+    sweep: Sweep
+    distance_px: float  # of lines that follow each other; ``sweep.step`` is the nearest whole number from 1
+    backward: bool  # lines were taken against the scan axis
+    bend_px: float  # by which line centres lie off the strip at most
+
+
+def fit_sweep(
+    position: Floats,
+    camera: LineCamera,
+    *,
+    name: str,
+    samples: int,
+    along: Axis = "x",
+    valid: NDArray[np.bool_] | None = None,
+) -> StraightScan:
+    """Derive the sweep that positions (line, 2) describe: strip, start and step by medians, which spikes do not move.
+
+    The distance of lines is the median over pairs that lie half the scan apart, the start the median of what is left.
+    ``samples`` of a recorded line say the binning, ``camera.samples`` those of one that is not binned. Coordinates are
+    rounded to 1e-6 px. A backward scan gets the sweep that covers the same lines forward.
+
+    Raises SceneError: fewer than two valid lines, samples that are no whole part of the camera's, a scan that stands
+    still or turns back, or line centres that lie too far off a straight line for a sweep; PoseError: a valid position
+    is beyond the mirror.
+    """
+    binning = camera.samples // max(samples, 1)
+    if camera.samples // max(binning, 1) != samples:
+        raise SceneError(
+            f"sweep {name} has lines of {samples} samples, no whole part of the camera's {camera.samples}; set "
+            "camera.samples to those of a line that is not binned"
+        )
+    lines = np.arange(len(position)) if valid is None else np.flatnonzero(valid)
+    if len(lines) < 2:
+        raise SceneError(f"sweep {name} has {len(lines)} valid lines, and a scan takes at least 2; leave it out")
+    across, scan = (direction_to_scene(position_to_direction(position[lines])) / camera.ifov_rad).T
+    half = len(lines) // 2
+    distance = float(np.median((scan[half:] - scan[:-half]) / (lines[half:] - lines[:-half])))
+    if abs(distance) < STANDING_PX:
+        raise SceneError(
+            f"sweep {name} stands still: its lines move by {abs(distance):.2g} px from one to the next; give the "
+            "positions of a scan, with one sweep for each way that it goes"
+        )
+    way = scan if distance > 0 else -scan
+    back = np.maximum.accumulate(way) - way
+    if (turned := back > MOST_BACK * abs(distance)).any():
+        raise SceneError(
+            f"sweep {name} turns back at line {lines[np.argmax(turned)]}; give each way of the scan a sweep of its "
+            "own, by a column 'sweep' in the pointing table"
+        )
+    strip, bend = float(np.median(across)), np.abs(across - np.median(across))
+    most = MOST_BEND * camera.samples
+    if bend.max() > most:
+        worst = int(np.argmax(bend))
+        raise SceneError(
+            f"sweep {name} is not straight: line {lines[worst]} lies {bend[worst]:.4g} px beside the strip at "
+            f"{strip:.4g} px, and at most {most:g} px are allowed; cut the scan into straighter parts by a column "
+            "'sweep', or mark single wrong lines with valid = 0"
+        )
+    step = max(round(abs(distance)), 1)
+    first = float(np.median(scan - distance * lines))
+    lowest = min(first, first + distance * (len(position) - 1))
+    sweep = Sweep(
+        name,
+        "fine" if step == binning == 1 else "coarse",
+        along,
+        strip_px=_stated(strip),
+        start_px=_stated(lowest - (step - 1) / 2),
+        lines=len(position),
+        step=step,
+        binning=binning,
+    )
+    return StraightScan(sweep, abs(distance), distance < 0, float(bend.max()))
+
+
+def _stated(value: float) -> float:
+    return round(value, STATED_DIGITS) + 0.0  # no -0.0
+
+
+@dataclass(frozen=True)
+class CoveredField:
+    """The rectangle that scans cover: (y, x) size, and (y, x) of its centre from the undeflected direction [px]."""
+
+    shape: tuple[int, int]
+    centre_px: tuple[float, float]
+
+
+def covered_field(sweeps: Sequence[Sweep], tangents: Sequence[Floats], camera: LineCamera) -> CoveredField:
+    """Give the largest rectangle in whole pixels that the scans together cover, turned lines allowed for.
+
+    ``tangents`` are the line centres of each sweep, (line, 2) along the line and the scan. Strips that lie side by side
+    add up along the line; along the scan counts what all strips have. Strips further apart than a line leave gaps,
+    which are not looked for.
+
+    Raises SceneError: the strips have no part of the scan in common, or lines lie along both axes.
+    """
+    axes = {sweep.along for sweep in sweeps}
+    if len(axes) != 1:
+        raise SceneError("the recording has lines along x and along y; state the field's size in px")
+    ends = np.array([-0.5, 0.5]) * camera.samples
+    parts: dict[float, list[tuple[float, float]]] = {}
+    for sweep, centres in zip(sweeps, tangents, strict=True):
+        known = centres[np.isfinite(centres).all(axis=1)] / camera.ifov_rad
+        outer = np.array([known[:, 1].min(), known[:, 1].max()])[:, None]
+        _, seen = points_of_scan(sweep.strip_px, camera, outer, ends * camera.ifov_rad)
+        parts.setdefault(round(sweep.strip_px), []).append((float(seen[0].max()), float(seen[1].min())))
+    begin = max(min(low for low, _ in part) for part in parts.values()) - 0.5
+    end = min(max(high for _, high in part) for part in parts.values()) + 0.5
+    if end - begin < 1:
+        raise SceneError("the strips of the recording have no part of the scan in common; state the field's size in px")
+    low, high = min(parts) + ends[0], max(parts) + ends[1]
+    size = (int(end - begin + 1e-6), int(high - low + 1e-6))
+    centre = ((begin + end) / 2, (low + high) / 2)
+    if axes == {"y"}:
+        size, centre = size[::-1], centre[::-1]
+    return CoveredField(size, centre)
+
+
+def flat_camera(camera: LineCamera, extent_px: float) -> LineCamera:
+    """Give the camera whose lines stay parallel over ``extent_px`` from the centre: for scans without a mirror.
+
+    A stage, a conveyor or a drone moves the camera or the target along a straight line, and all lines are parallel and
+    of one length. That is the limit of a long lens: with the focal length that this chooses, the ends of lines lie
+    within 0.01 px of there. Angles of such a camera are not those of a real one; pixels are.
+    """
+    half = camera.samples / 2
+    tangent = np.sqrt(2 * FLAT_PX / half)  # a line at the tangent e is sqrt(1 + e^2) times as long
+    ifov_rad = min(camera.ifov_rad, float(tangent) / max(extent_px, half))
+    return replace(camera, focal_length_mm=camera.pitch_um * 1e-3 / ifov_rad)
+
+
+def flat_positions(scan_px: Floats, camera: LineCamera) -> Floats:
+    """Give the mirror positions (line, 2) that stand for lines of a scan without a mirror, at ``scan_px`` (line,).
+
+    ``camera`` is that of :func:`flat_camera`.
+    """
+    tangents = np.stack([np.zeros_like(scan_px), scan_px], axis=-1) * camera.ifov_rad
+    return direction_to_position(scene_to_direction(tangents))

@@ -1,0 +1,368 @@
+"""Where recorded lines looked, out of files: a table with a row a line, or a vector that the mirror played.
+
+A table is CSV (commas, semicolons or tabs) or Parquet. Its columns are, beside ``line`` (from 0), ``sweep``, ``time``
+(of mid exposure, since the sweep's start) [s], ``exposure_ms`` and ``valid`` (0 or 1), exactly one of these kinds:
+
+::
+
+    mirror_x, mirror_y         mirror position, -1..1, as the device counts it
+    angle_x_deg, angle_y_deg   viewing angle along the line and along the scan
+    angle_deg                  viewing angle along the scan, of a scan through the undeflected direction
+    position_px                place along a straight scan without a mirror: stage, conveyor, drone
+    position_m                 the same in metres
+
+A vector is a TOML file, for a path that the mirror played by its own clock::
+
+    vector = "positions.csv"   # CSV or .npy: two columns X and Y, or all X before all Y in one
+    rate_hz = 14.5             # cells a second
+    start_s = 0.0              # the path began so long before the first line's exposure; 0 where it is not said
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.capture.pointing import PlayedVector, angles_to_positions, split_vector
+from pipeline.errors import PoseError, SceneError
+from pipeline.geometry.mirror import RIM_SLACK, STRAIGHT, Mounting, check_reach
+from pipeline.lazy import deferred
+
+if TYPE_CHECKING:
+    from pyarrow import parquet  # type: ignore[import-untyped]
+else:
+    parquet = deferred("pyarrow.parquet")
+
+Floats = NDArray[np.float64]
+Kind = Literal["mirror", "angles", "angle", "px", "m"]
+KINDS: Mapping[Kind, tuple[str, ...]] = {
+    "mirror": ("mirror_x", "mirror_y"),
+    "angles": ("angle_x_deg", "angle_y_deg"),
+    "angle": ("angle_deg",),
+    "px": ("position_px",),
+    "m": ("position_m",),
+}
+WITHOUT_MIRROR: tuple[Kind, ...] = ("px", "m")
+BESIDE = ("line", "sweep", "time", "exposure_ms", "valid")
+ACCEPTED = (*BESIDE, *(name for names in KINDS.values() for name in names))
+TABLE_ENDINGS = (".csv", ".tsv", ".txt", ".parquet")
+ENDINGS = (*TABLE_ENDINGS, ".toml")
+WORDS = {"": math.nan, "none": math.nan, "true": 1.0, "false": 0.0}
+LARGEST_TABLE = 1 << 28  # bytes; a row has about 60
+
+
+@dataclass(frozen=True)
+class LinePointing:
+    """Where the lines of one sweep looked; ``position`` of lines that are not valid may be made up."""
+
+    kind: Kind
+    position: Floats  # (line, 2) mirror X and Y of the model, or (line, 1) place along a scan without a mirror
+    valid: NDArray[np.bool_]  # (line,)
+    time_s: Floats | None = None  # (line,) of mid exposure
+    exposure_ms: Floats | None = None  # (line,)
+    part: tuple[str, ...] | None = None  # (line,) names of the sweeps that a table of one cube cuts it into
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class PointingTable:
+    """The rows of one table as they stand in its file; ``rows`` are their numbers for messages."""
+
+    path: Path
+    kind: Kind
+    columns: Mapping[str, Floats]  # (row,) each
+    sweep: tuple[str, ...] | None  # (row,)
+    first_row: int  # number of the first row in the file, as an editor counts them
+
+    @property
+    def sweeps(self) -> tuple[str, ...]:
+        """Names in the column ``sweep``, in the order of the file; none without it."""
+        return tuple(dict.fromkeys(self.sweep or ()))
+
+    def of_cube(self, name: str, lines: int, mounting: Mounting = STRAIGHT, *, alone: bool = False) -> LinePointing:
+        """Give the pointing of a cube's ``lines`` lines: rows whose ``sweep`` is its name, or all without that column.
+
+        Where the cube is ``alone``, and no row has its name, the column cuts it into sweeps. ``mounting`` leads from
+        the device's positions to the model's. Raises SceneError: the table has no row or another number of rows for the
+        cube, a value that is no number, out of range or beyond the mirror, times that do not rise, or no valid row.
+        """
+        rows = np.arange(len(self.columns[KINDS[self.kind][0]]))
+        cut = self.sweep is not None and alone and name not in self.sweeps
+        if self.sweep is not None and not cut:
+            rows = np.array([row for row in rows if self.sweep[row] == name], np.intp)
+            if not len(rows):
+                raise SceneError(
+                    f"{self.path} has no row for the cube {name!r}; its column 'sweep' names "
+                    f"{', '.join(self.sweeps[:8])}"
+                )
+        if len(rows) != lines:
+            way = "fewer" if len(rows) < lines else "more"
+            raise SceneError(
+                f"{self.path} has {len(rows)} rows for {name}, {way} than its {lines} lines; give one row for each "
+                "line, with valid = 0 for those to be left out"
+            )
+        rows = self._in_order(rows, lines)
+        valid = self._flags(rows)
+        if not valid.any():
+            raise SceneError(f"{self.path} calls no line of {name} valid; set valid = 1 for lines that can be used")
+        for column in (*KINDS[self.kind], "time", "exposure_ms"):
+            self._check_known(column, rows, valid)
+        time_s = self._times(rows)
+        exposure_ms = None
+        if "exposure_ms" in self.columns:
+            exposure_ms = _filled(self.columns["exposure_ms"][rows], valid)
+            self._refuse(rows, exposure_ms <= 0, "exposure_ms", "expected a time above 0 ms")
+        part = tuple(self.sweep[row] for row in rows) if self.sweep is not None and cut else None
+        return LinePointing(self.kind, self._positions(rows, valid, mounting), valid, time_s, exposure_ms, part)
+
+    def _in_order(self, rows: NDArray[np.intp], lines: int) -> NDArray[np.intp]:
+        """The rows by their line numbers, where the table has them (SceneError: they are not 0 to lines - 1)."""
+        if "line" not in self.columns:
+            return rows
+        numbers = self.columns["line"][rows]
+        order = np.argsort(numbers, kind="stable")
+        self._refuse(rows[order], numbers[order] != np.arange(lines), "line", f"expected each of 0 to {lines - 1} once")
+        return rows[order]
+
+    def _flags(self, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
+        if "valid" not in self.columns:
+            return np.ones(len(rows), np.bool_)
+        values = self.columns["valid"][rows]
+        self._refuse(rows, ~np.isin(values, (0, 1)), "valid", "expected 0 or 1")
+        flags: NDArray[np.bool_] = values == 1
+        return flags
+
+    def _check_known(self, column: str, rows: NDArray[np.intp], valid: NDArray[np.bool_]) -> None:
+        if column in self.columns:
+            values = self.columns[column][rows]
+            self._refuse(
+                rows, valid & ~np.isfinite(values), column, "expected a number; set valid = 0 where it is not known"
+            )
+
+    def _times(self, rows: NDArray[np.intp]) -> Floats | None:
+        """(line,) times, NaN where a line is not valid and has none (SceneError: they do not rise)."""
+        if "time" not in self.columns:
+            return None
+        times = self.columns["time"][rows]
+        known = np.flatnonzero(np.isfinite(times))
+        stuck = np.zeros(len(rows), np.bool_)
+        stuck[known[1:]] = np.diff(times[known]) <= 0
+        self._refuse(rows, stuck, "time", "expected a time after that of the line before [s]")
+        return times
+
+    def _positions(self, rows: NDArray[np.intp], valid: NDArray[np.bool_], mounting: Mounting) -> Floats:
+        """(line, 2) positions of the model, or (line, 1) places; made up between valid lines for those that are not."""
+        values = np.stack([self.columns[name][rows] for name in KINDS[self.kind]], axis=-1)
+        values = np.stack([_filled(column, valid) for column in values.T], axis=-1)
+        if self.kind in WITHOUT_MIRROR:
+            return values
+        if self.kind == "mirror":
+            position = mounting.to_model(values)
+            beyond = ~(np.hypot(*position.T) <= 1 + RIM_SLACK["float64"])
+            reach = "beyond the mirror, which reaches X^2 + Y^2 <= 1"
+        else:
+            angles = values if self.kind == "angles" else np.concatenate([np.zeros_like(values), values], axis=1)
+            position, reached = angles_to_positions(angles)
+            beyond = ~reached
+            reach = "beyond the mirror, which turns the view by up to 50 deg along the scan and 35.6 deg across it"
+        self._refuse(rows, beyond, KINDS[self.kind], reach)
+        return position
+
+    def _refuse(
+        self, rows: NDArray[np.intp], wrong: NDArray[np.bool_], columns: str | Sequence[str], expected: str
+    ) -> None:
+        """Raise SceneError for the first row that is wrong, by its number in the file, with the range of the column."""
+        if not wrong.any():
+            return
+        names = (columns,) if isinstance(columns, str) else tuple(columns)
+        first = rows[np.argmax(wrong)]
+        came = ", ".join(f"{name} = {self.columns[name][first]:.10g}" for name in names)
+        count = int(np.count_nonzero(wrong))
+        more = "" if count == 1 else f" (the first of {count} such rows)"
+        spans = "; ".join(f"{name} goes from {low:.6g} to {high:.6g}" for name, low, high in self._spans(names))
+        raise SceneError(
+            f"{self.path}, row {first + self.first_row}: {came}{more}, {expected}. {spans}; correct the table"
+        )
+
+    def _spans(self, names: Sequence[str]) -> Iterator[tuple[str, float, float]]:
+        for name in names:
+            known = self.columns[name][np.isfinite(self.columns[name])]
+            yield name, *((float(known.min()), float(known.max())) if len(known) else (math.nan, math.nan))
+
+
+def _filled(values: Floats, valid: NDArray[np.bool_]) -> Floats:
+    """The values, with those of lines that are not valid and not known interpolated between valid ones."""
+    known = valid | np.isfinite(values)
+    at = np.arange(len(values))
+    return values if known.all() else np.interp(at, at[known], values[known])
+
+
+def load_pointing_table(path: Path) -> PointingTable:
+    """Read a table with a row a line.
+
+    Raises SceneError: it cannot be read, has no row, a column that is not known, a cell that is no number, or not
+    exactly one kind of pointing.
+    """
+    header: list[str]
+    cells: Sequence[Sequence[object]]
+    if path.suffix.lower() == ".parquet":
+        header, cells, first_row = *_parquet_cells(path), 1
+    else:
+        header, cells, first_row = *_csv_cells(path), 2  # the header is row 1
+    unknown = [name for name in header if name not in ACCEPTED]
+    if unknown or len(set(header)) < len(header):
+        twice = next((name for name in header if header.count(name) > 1), None)
+        what = f"the column {unknown[0]!r}, which is not known" if unknown else f"the column {twice!r} twice"
+        raise SceneError(f"{path} has {what}; accepted are {', '.join(ACCEPTED)}")
+    kinds = [kind for kind, names in KINDS.items() if set(names) & set(header)]
+    missing = [name for kind in kinds for name in KINDS[kind] if name not in header]
+    if len(kinds) != 1 or missing:
+        came = (
+            f"{missing[0]} is missing" if missing else f"{len(kinds)} of them are there" if kinds else "none is there"
+        )
+        wanted = "; or ".join(", ".join(names) for names in KINDS.values())
+        raise SceneError(f"{path} must have one kind of pointing, and {came}; give {wanted}")
+    if not cells:
+        raise SceneError(f"{path} has no row below its header; give a row for each line")
+    columns = {
+        name: _numbers(path, name, [row[at] for row in cells], first_row)
+        for at, name in enumerate(header)
+        if name != "sweep"
+    }
+    sweep = tuple(str(row[header.index("sweep")]).strip() for row in cells) if "sweep" in header else None
+    return PointingTable(path, kinds[0], columns, sweep, first_row)
+
+
+def _numbers(path: Path, name: str, cells: Sequence[object], first_row: int) -> Floats:
+    """The cells of a column as numbers; empty ones and None are NaN, True is 1."""
+    values = np.empty(len(cells))
+    for number, cell in enumerate(cells):
+        text = str(cell).strip().lower()
+        try:
+            values[number] = WORDS[text] if text in WORDS else float(text)
+        except ValueError:
+            raise SceneError(
+                f"{path}, row {number + first_row}: {name} = {str(cell)[:40]!r} is no number; write numbers with a "
+                "decimal point"
+            ) from None
+    return values
+
+
+def _csv_cells(path: Path) -> tuple[list[str], list[list[str]]]:
+    """Names of the columns and the cells of all rows; the delimiter is the one that the header has."""
+    text = _text(path)
+    lines = text.splitlines()
+    header = lines[0] if lines else ""
+    delimiter = max((",", ";", "\t"), key=header.count)
+    rows = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=delimiter)]
+    if not rows:
+        raise SceneError(f"{path} is empty; give a header and a row for each line")
+    names = [name.lower() for name in rows[0]]
+    cells = [row for row in rows[1:] if any(row)]
+    for number, row in enumerate(rows[1:], 2):
+        if any(row) and len(row) != len(names):
+            raise SceneError(
+                f"{path}, row {number} has {len(row)} cells, its header {len(names)}; give each row one cell a column"
+            )
+    return names, cells
+
+
+def _text(path: Path) -> str:
+    try:
+        if path.stat().st_size > LARGEST_TABLE:
+            raise SceneError(
+                f"{path} has {path.stat().st_size} bytes, too many for a pointing table; name another file"
+            )
+        return path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SceneError(f"{path} cannot be read as a pointing table: {error}; name a text file (CSV)") from error
+
+
+def _parquet_cells(path: Path) -> tuple[list[str], list[list[object]]]:
+    try:
+        table = parquet.read_table(path)
+    except ImportError as error:
+        raise SceneError(
+            f"{path} is Parquet, and pyarrow, which reads it, is not installed; install spectralzoom[parquet], or "
+            "write the table as CSV"
+        ) from error
+    except (OSError, ValueError) as error:  # pyarrow's errors are of these
+        raise SceneError(f"{path} cannot be read as Parquet: {error}; write the table anew, or as CSV") from error
+    columns = table.to_pydict()
+    return [name.lower() for name in columns], [list(row) for row in zip(*columns.values(), strict=True)]
+
+
+def load_played_vector(path: Path, mounting: Mounting = STRAIGHT) -> PlayedVector:
+    """Read the TOML file of a vector that the mirror played, with the file of positions that it names.
+
+    Raises SceneError: either cannot be read, says something else than vector, rate_hz and start_s, or a position is
+    beyond the mirror.
+    """
+    try:
+        stated = tomllib.loads(_text(path))
+    except tomllib.TOMLDecodeError as error:
+        raise SceneError(f"{path} cannot be read as TOML: {error}; write vector, rate_hz and start_s") from error
+    if unknown := sorted(set(stated) - {"vector", "rate_hz", "start_s"}):
+        raise SceneError(f"{path} has the entry {unknown[0]!r}; accepted are vector, rate_hz, start_s")
+    if not isinstance(stated.get("vector"), str):
+        raise SceneError(f'{path} names no vector; add the line vector = "positions.csv"')
+    rate_hz, start_s = stated.get("rate_hz"), stated.get("start_s", 0.0)
+    for name, value, least in (("rate_hz", rate_hz, 0.0), ("start_s", start_s, -math.inf)):
+        if isinstance(value, bool) or not isinstance(value, int | float) or not least < value < math.inf:
+            above = " above 0" if least == 0 else ""
+            raise SceneError(f"{path}: {name} = {value!r}, expected a number{above}; correct it")
+    file = path.parent / stated["vector"]
+    try:
+        values = np.load(file, allow_pickle=False) if file.suffix == ".npy" else _csv_numbers(file)
+        if values.dtype.kind not in "iuf":
+            raise ValueError(f"it holds {values.dtype}")
+        positions = mounting.to_model(split_vector(values.astype(np.float64), str(file)))
+        check_reach(positions)
+    except SceneError:
+        raise
+    except PoseError as error:
+        raise SceneError(f"{file}: {error}") from error
+    except (OSError, ValueError, EOFError) as error:
+        raise SceneError(f"{file} cannot be read as a vector: {error}; give CSV or .npy with numbers") from error
+    return PlayedVector(positions, float(rate_hz), float(start_s))  # type: ignore[arg-type]
+
+
+def _csv_numbers(path: Path) -> Floats:
+    """Numbers of a text file without a header, (row, column)."""
+    return np.loadtxt(_text(path).replace(";", ",").replace("\t", ",").splitlines(), delimiter=",", ndmin=2)
+
+
+def follow_vector(vector: PlayedVector, middle_s: Floats, where: str) -> LinePointing:
+    """Give the pointing of lines by a played vector and the times of their mid exposures (line,) [s].
+
+    Times count from when the first line's exposure began; lines without a time, or outside of the path's time, are not
+    valid. Raises SceneError: no line lies within the path's time.
+    """
+    known = np.isfinite(middle_s)
+    position, played = vector.at(np.where(known, middle_s, 0.0))
+    valid = known & played
+    if not valid.any():
+        seconds = len(vector.position) / vector.rate_hz
+        raise SceneError(
+            f"{where}: no line was taken while the path of {seconds:g} s was played; correct start_s or rate_hz"
+        )
+    note = (
+        "positions are those of the played vector, by the clocks of camera and mirror; an error of start_s shifts all"
+    )
+    lost = int(np.count_nonzero(~valid))
+    outside = (f"{lost} lines lie outside of the path's time and are not valid",) if lost else ()
+    return LinePointing("mirror", position, valid, middle_s, notes=(note, *outside))
+
+
+def find_pointing(folder: Path, stem: str) -> Path | None:
+    """The pointing file of a cube in a folder, by its name: ``STEM.pointing.csv``, ``.parquet`` or ``.toml``."""
+    names = [f"{stem}.pointing{ending}" for ending in ENDINGS]
+    return next((folder / name for name in names if (folder / name).is_file()), None)

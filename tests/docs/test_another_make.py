@@ -1,0 +1,182 @@
+"""The camera that architecture.md builds takes a sweep beside the emulated mirror, and implements its protocol."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mypy import api as mypy
+from spectral.io import envi
+
+from pipeline.errors import RigError, SettingsError
+from pipeline.geometry.scan import line_positions
+from pipeline.rig.camera.camera_files import KeptInMemory
+from pipeline.rig.capture.capture_paths import REFERENCES, capture_prefix
+from pipeline.rig.capture.capture_runner import RigDevices
+from pipeline.rig.capture.rig_source import RigSource
+from pipeline.rig.device_settings import CameraLimits, SurveyRig
+from pipeline.rig.devices import StateUnknown
+from pipeline.rig.drivers import CameraDriver
+from pipeline.rig.emulator.emulated_rig import EmulatedRig
+from pipeline.rig.opening import open_camera_driver, open_mirror_driver
+from pipeline.rig.rig_check import check_camera
+from tests.docs.pages import DOCS, ROOT, blocks_of
+from tests.pipeline.rig.in_process import InProcessRig, ManualClock
+from tests.pipeline.rig.small_rig import CAMERA, FINE, small_source
+
+MODULE = "folder_camera"
+PX = 11275  # about as many as a unit of the disk has
+
+
+class SharedClock(ManualClock):
+    """A clock whose waiting lets another program work."""
+
+    program: Program | None = None
+
+    def sleep(self, seconds: float) -> None:
+        super().sleep(seconds)
+        if self.program is not None:
+            self.program.work()
+
+
+@dataclass
+class Program:
+    """The camera's own program, as the page describes it: it sees by the emulated camera, and writes ENVI by SPy."""
+
+    folder: Path
+    line: InProcessRig
+    busy: bool = False
+    runs: dict[str, str] = field(default_factory=dict)  # folders of the emulated camera, by names of captures
+
+    def work(self) -> None:
+        """Take requests, and drop what is captured."""
+        if self.busy:
+            return
+        self.busy = True
+        for request in self.folder.glob("*.request"):
+            self._begin(request)
+        if self.runs and not self.line.rig.camera.is_capturing():
+            self._drop()
+        self.busy = False
+
+    def _begin(self, request: Path) -> None:
+        frames, *times = request.read_text().split()
+        camera = self.line.camera()
+        camera.configure(*map(float, times))
+        self.runs[request.stem] = camera.capture(int(frames), prefix=request.stem.rpartition("-")[0]).folder
+        (self.folder / f"{request.stem}.raw").touch()
+        request.unlink()
+
+    def _drop(self) -> None:
+        seen = self.line.rig.camera
+        for name, folder in self.runs.items():
+            self._save(name, self.line.camera().fetch(folder, KeptInMemory()).values)
+            if name.startswith(REFERENCES):
+                both = seen.view.references((seen.exposure_ms, seen.period_ms), 32)
+                for kind, frames in both.items():
+                    self._save(f"{name}_{kind.removesuffix('Reference')}", frames)
+        self.runs.clear()
+
+    def _save(self, name: str, values: np.ndarray[Any, Any]) -> None:
+        fps = 1000 / self.line.rig.camera.period_ms
+        path = str(self.folder / f"{name}.hdr")
+        envi.save_image(path, values, dtype=np.uint16, interleave="bil", ext="raw", force=True, metadata={"fps": fps})
+
+
+@pytest.fixture
+def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The page's code as a file that can be imported."""
+    (block,) = (block for block in blocks_of(DOCS / "architecture.md") if block.file == f"{MODULE}.py")
+    path = tmp_path / "code" / f"{MODULE}.py"
+    path.parent.mkdir()
+    path.write_text(block.text)
+    monkeypatch.syspath_prepend(path.parent)
+    yield path
+    sys.modules.pop(MODULE, None)
+
+
+@contextmanager
+def folder_rig(folder: Path) -> Iterator[tuple[RigSource, CameraDriver, Program]]:
+    """The emulated mirror beside the page's camera, whose program watches ``folder``."""
+    folder.mkdir()
+    clock = SharedClock(50.0)
+    settings = SurveyRig(camera_driver=f"{MODULE}:open_camera", host=str(folder), log_samples=16_000)
+    with InProcessRig(EmulatedRig(small_source(), clock, wired="none")) as line:
+        clock.program = Program(folder, line)
+        camera = open_camera_driver(settings, CameraLimits(), clock)
+
+        def devices() -> RigDevices:
+            return RigDevices(line.devices(settings.mirror(1500)).steering, camera, clock)
+
+        seen = small_source()
+        source = RigSource(
+            CAMERA, seen.wavelength_nm, seen.field_shape, devices, KeptInMemory(), rig=settings, vector_pairs=1500
+        )
+        yield source, camera, clock.program
+
+
+@pytest.mark.usefixtures("module")
+def test_the_pages_camera_takes_a_sweep(tmp_path: Path) -> None:
+    """Every line comes, placed by the mirror's log, with the numbers of its file and the references beside it."""
+    with folder_rig(tmp_path / "incoming") as (source, _, _):
+        found = list(source.lines(FINE))
+        references = source.references(FINE)
+        (told,) = source.record["captures"]
+    assert [line.number for line in found] == list(range(FINE.lines))
+    assert all(line.valid for line in found)
+    assert (told["method"], told["folder"]) == ("log", f"{capture_prefix(FINE)}-0")
+    header = tmp_path / "incoming" / f"{capture_prefix(FINE)}-0.hdr"
+    stored = envi.open(str(header)).open_memmap(interleave="bip")
+    np.testing.assert_array_equal([line.data for line in found], stored)
+    np.testing.assert_allclose([line.time_s for line in found], CAMERA.mid_exposure_s(np.arange(FINE.lines)), atol=1e-6)
+    off = np.array([(line.mirror_x, line.mirror_y) for line in found]) - line_positions(FINE, CAMERA)
+    assert np.hypot(*off.T).max() * PX < 3
+    expected = small_source().references(FINE)
+    np.testing.assert_allclose(references.dark, expected.dark, atol=0.5)
+    np.testing.assert_allclose(references.white, expected.white, atol=0.5)
+
+
+@pytest.mark.usefixtures("module")
+def test_a_program_that_does_not_run_is_one_message(tmp_path: Path) -> None:
+    """Its request is withdrawn, so that nothing is captured later; a capture that is not there is named."""
+    with folder_rig(tmp_path / "incoming") as (_, camera, program):
+        program.busy = True
+        camera.configure(100.0, 110.0)
+        with pytest.raises(StateUnknown, match=r"lines-0.request was not taken in 10 s; does the camera's program run"):
+            camera.capture(5, prefix="lines")
+        with pytest.raises(RigError, match="cannot read capture lines-0"):
+            camera.fetch("lines-0", KeptInMemory())
+        assert list(program.folder.iterdir()) == []
+        assert [row.came for row in check_camera(lambda: camera)] == ["no capture runs"]
+
+
+def test_the_pages_camera_implements_the_protocol(module: Path) -> None:
+    """By mypy, as strict as it is for the source."""
+    words = ["--config-file", str(ROOT / "pyproject.toml"), "--follow-imports=silent", str(module)]
+    out, errors, code = mypy.run(words)
+    assert (out.strip(), errors, code) == ("Success: no issues found in 1 source file", "", 0)
+
+
+BROKEN = {
+    "no module": ("nowhere:open_it", r"cannot be imported \(ModuleNotFoundError: No module named 'nowhere'\)"),
+    "no function": (f"{MODULE}:open_it", r"cannot be imported \(AttributeError: .*open_it"),
+    "no name": ("a name?", r"cannot be imported \(ValueError"),
+    "no function of rig and clock": (f"{MODULE}:POLL_S", r"does not open a driver .* the table \[rig\] and a clock"),
+    "of other things": (f"{MODULE}:LineTimes", r"does not open a driver \(missing a required argument"),
+    "no driver": (f"{MODULE}:FolderCamera", r"gives a FolderCamera without goto, .*method of MirrorDriver in"),
+}
+
+
+@pytest.mark.usefixtures("module")
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_driver_that_is_none_is_refused_in_one_message(name: str) -> None:
+    """The setting, its value, why, and what is expected."""
+    value, words = BROKEN[name]
+    with pytest.raises(SettingsError, match=rf"rig.mirror_driver = '{value.replace('?', '.')}' {words}"):
+        open_mirror_driver(SurveyRig(mirror_driver=value), 1500)

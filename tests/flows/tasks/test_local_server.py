@@ -1,0 +1,83 @@
+"""Prefect's server in this process: whom it answers, and the database that it begins with.
+
+`python tests/flows/tasks/test_local_server.py` writes the database's schema anew, for another version of Prefect.
+"""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+import subprocess
+import sys
+import tempfile
+import urllib.error
+import urllib.request
+from importlib import metadata
+from pathlib import Path
+
+SCHEMA = Path(__file__).parents[3] / "flows" / "tasks" / "prefect_schema.sql"
+HEAD = "-- The empty database of Prefect {}\n-- python tests/flows/tasks/test_local_server.py writes this file.\n"
+
+
+MIGRATE = """
+import asyncio
+from prefect.server.database.dependencies import provide_database_interface
+asyncio.run(provide_database_interface().create_db())
+"""
+
+
+def migrated_schema(folder: Path) -> str:
+    """The schema that Prefect's own migrations leave, as SQL; in a process of its own settings."""
+    file = folder / "migrated.db"
+    settings = {"PREFECT_API_DATABASE_CONNECTION_URL": f"sqlite+aiosqlite:///{file}", "PREFECT_HOME": str(folder)}
+    subprocess.run([sys.executable, "-c", MIGRATE], env={**os.environ, **settings}, check=True)
+    with sqlite3.connect(file) as made:
+        text = "\n".join(made.iterdump())
+    made.close()
+    return HEAD.format(metadata.version("prefect")) + text + "\n"
+
+
+def answer(url: str, **headers: str) -> int:
+    """The status of an answer."""
+    try:
+        with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=30) as found:
+            return int(found.status)
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+def test_the_schema_is_of_the_pinned_version() -> None:
+    """A newer Prefect migrates it; the file is to be written anew with it."""
+    assert SCHEMA.read_text().startswith(HEAD.format(metadata.version("prefect")))
+
+
+def test_the_schema_is_what_migrations_leave(tmp_path: Path) -> None:
+    """Statement by statement, in any order: migrations leave constraints and indices in another one each time."""
+
+    def statements(text: str) -> list[list[str]]:
+        return sorted(sorted(line.strip(" ,") for line in one.splitlines()) for one in text.strip().split(";\n"))
+
+    assert statements(migrated_schema(tmp_path)) == statements(SCHEMA.read_text())
+
+
+def test_the_server_wants_a_password(server: str) -> None:
+    """A request without one is refused; health alone is for everybody."""
+    assert answer(f"{server}/admin/version") == 401
+    assert answer(f"{server}/health") == 200
+
+
+def test_pages_of_another_origin_are_refused(server: str) -> None:
+    """A browser sends the origin of the page that asks."""
+    assert answer(f"{server}/health", Origin="http://elsewhere.example") == 403
+    assert answer(f"{server}/health", Origin=server.removesuffix("/api")) == 200
+
+
+def test_another_host_is_refused(server: str) -> None:
+    """The DNS of somebody else may point at this machine."""
+    assert answer(f"{server}/health", Host="elsewhere.example") == 400
+
+
+if __name__ == "__main__":
+    os.environ["DO_NOT_TRACK"] = "1"
+    with tempfile.TemporaryDirectory() as folder:
+        SCHEMA.write_text(migrated_schema(Path(folder)))

@@ -1,0 +1,307 @@
+"""The flow of a survey: the order of its steps, its parameters, and what Prefect's pages show of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from flows import survey as survey_flow
+from flows.publish import survey_command
+from flows.settings.load import load_settings
+from flows.settings.parameters import SurveySettings
+from flows.survey import draw_class_map
+from flows.tasks import prefect_tasks
+from flows.tasks.local_server import ServerUnavailable
+from flows.tasks.open_survey import STAGES
+from flows.tasks.stages import accuracy as evaluation
+from pipeline.errors import RigError, SettingsError
+from storage.archive.archive import Archive
+from storage.archive.keys import StageRef
+from tests.flows.conftest import CommandLine, act_instead, problems
+from tests.remembered_work import with_effects
+
+pytestmark = pytest.mark.usefixtures("no_effects")
+
+
+class Noted:
+    """An opened survey that notes which stage is asked for with which inputs."""
+
+    capture_deployment = None
+
+    def __init__(self, **facts: bool) -> None:
+        self.uniform = self.registers = self.on_the_ground = False
+        self.__dict__ |= facts
+        self.steps: dict[str, list[str]] = {}
+
+    def __call__(self, stage: str, *inputs: StageRef) -> StageRef:
+        """Note the names of the stages that left the inputs."""
+        self.steps[stage] = [ref.stage for ref in inputs]
+        return StageRef(stage, "key", Path())
+
+
+def steps(**facts: bool) -> dict[str, list[str]]:
+    """Stages of a survey in their order, each with those that it is made of."""
+    noted: Any = Noted(**facts)
+    draw_class_map(noted)
+    return dict(noted.steps)
+
+
+def test_a_survey_in_two_passes_captures_again() -> None:
+    """The fine sweeps follow from the plan, and patches are cut from them."""
+    found = steps()
+    assert list(found) == [
+        *("choose_effects", "capture_coarse", "locate", "rectify", "attend", "capture_fine", "cut_patches"),
+        *("draw_map", "compare_turned"),
+    ]
+    assert found["capture_fine"] == ["attend", "choose_effects"]
+    assert found["cut_patches"] == ["attend", "capture_fine"]
+
+
+def test_a_uniform_scan_has_no_second_pass() -> None:
+    """Patches are cut from the one scan."""
+    found = steps(uniform=True)
+    assert "capture_fine" not in found
+    assert found["cut_patches"] == ["attend", "capture_coarse"]
+
+
+@pytest.mark.parametrize(("uniform", "passes"), [(True, ["coarse"]), (False, ["coarse", "fine"])])
+def test_patches_are_placed_by_the_registration_of_their_own_pass(uniform: bool, passes: list[str]) -> None:
+    """What was found of the other pass's pointing has no part in them."""
+    found = steps(registers=True, uniform=uniform)
+    assert found["locate"] == ["capture_coarse", "register_coarse"]
+    assert [name for name in found if name.startswith("register")] == [f"register_{one}" for one in passes]
+    assert found["cut_patches"] == ["attend", f"capture_{passes[-1]}", f"register_{passes[-1]}"]
+
+
+def test_a_posed_survey_is_drawn_on_the_ground() -> None:
+    """The map on the ground is made of the class map and the mosaic."""
+    assert steps(on_the_ground=True)["ground"] == ["draw_map", "rectify"]
+
+
+SETTINGS = [
+    {"scene": "farm", "seconds": "25", "camera.exposure_ms": "50", "size": "64x96", "tol": "0.5dn"},
+    {
+        "scene": "field.png",
+        "weights": "w.safetensors",
+        "bands": "0-3",
+        "wavelengths": "500,600,700,800",
+        "budget": "0.8",
+    },
+    {"scene": "farm", "sky.started": "2026-06-01T12:00:00Z", "memory": "2GiB", "zones.plots": "plots.gpkg"},
+]
+
+
+@pytest.mark.parametrize("given", SETTINGS)
+def test_parameters_are_the_settings(given: dict[str, object]) -> None:
+    """What a server keeps of a run's parameters asks for the same settings, with absolute paths."""
+    settings = load_settings(None, given)
+    parameters = SurveySettings.of(settings)
+    assert parameters.settings() is settings
+    kept = json.loads(parameters.model_dump_json(exclude_none=True))
+    again = SurveySettings(**kept).settings()
+    changed = {name for name, value in settings.to_dict().items() if again.to_dict()[name] != value}
+    assert changed <= {"out", "scene", "weights", "zones"}
+    assert Path(again.out) == Path.cwd() / settings.out
+
+
+def test_a_password_is_no_parameter() -> None:
+    """A server keeps the parameters of its runs."""
+    settings = load_settings(None, {"source": "rig", "rig.password": "secret-4711"})
+    assert "secret-4711" not in SurveySettings.of(settings).model_dump_json()
+    with pytest.raises(ValidationError, match=r"rig\.password"):
+        SurveySettings(rig={"password": "secret-4711"})
+
+
+def test_a_wrong_parameter_is_refused_with_the_message_of_the_command_line() -> None:
+    """Before a run is begun."""
+    with pytest.raises(ValidationError, match="share of the full scan's seconds, above 0 and at most 1, got 3"):
+        SurveySettings(budget=3)
+    with pytest.raises(ValidationError, match="extra_forbidden"):
+        SurveySettings(bugdet=0.5)
+
+
+def test_every_setting_is_a_described_field_of_the_form() -> None:
+    """Prefect makes its form of the flow's parameters."""
+    from flows.settings.load import SURVEY
+
+    schema = survey_flow.survey.parameters.definitions["SurveySettings"]["properties"]
+    assert set(schema) == {*SURVEY, "settings_file"}
+    assert all(one.get("description") or "$ref" in json.dumps(one) for one in schema.values())
+
+
+def of_run(api: str) -> tuple[Any, dict[str, Any], list[str], dict[str, Any]]:
+    """The newest run of the flow `survey`, its task runs by name, its log, and its artifacts by type."""
+    from prefect.client.orchestration import get_client
+    from prefect.client.schemas.filters import (
+        ArtifactFilter,
+        ArtifactFilterFlowRunId,
+        FlowFilter,
+        FlowFilterName,
+        FlowRunFilter,
+        FlowRunFilterId,
+        LogFilter,
+        LogFilterFlowRunId,
+    )
+    from prefect.client.schemas.sorting import FlowRunSort
+
+    with get_client(sync_client=True) as client:
+        named = FlowFilter(name=FlowFilterName(any_=["survey"]))
+        (run,) = client.read_flow_runs(flow_filter=named, sort=FlowRunSort.START_TIME_DESC, limit=1)
+        tasks = client.read_task_runs(flow_run_filter=FlowRunFilter(id=FlowRunFilterId(any_=[run.id])))
+        logs = client.read_logs(LogFilter(flow_run_id=LogFilterFlowRunId(any_=[run.id])))
+        mine = ArtifactFilter(flow_run_id=ArtifactFilterFlowRunId(any_=[run.id]))
+        artifacts = client.read_artifacts(artifact_filter=mine)
+    return run, {one.name: one for one in tasks}, [one.message for one in logs], {one.key: one for one in artifacts}
+
+
+def test_prefect_makes_the_stores_that_plain_makes(
+    survey_png: Any, surveyed_png: Any, tmp_path: Path, server: str
+) -> None:
+    """Keys, savings and accuracy are those of plain; tasks have the edges, logs and artifacts of the mission."""
+    with with_effects():  # as the other has them
+        flow = survey_png(tmp_path / "flow", engine="prefect").receipt
+    plain = surveyed_png(tmp_path / "plain").receipt
+    assert [stage["key"] for stage in flow["stages"]] == [stage["key"] for stage in plain["stages"]]
+    assert flow["savings"] == plain["savings"]
+    assert flow["accuracy"] == plain["accuracy"]
+
+    run, tasks, log, artifacts = of_run(server)
+    assert run.name == "survey-scene"
+    assert run.parameters["settings"]["budget"] == 0.8
+    assert sorted(tasks) == sorted(
+        [*(f"{stage['name']}-scene" for stage in flow["stages"]), *(f"{one}-scene" for one in STEPS)]
+    )
+    assert {one.state.type.value for one in tasks.values()} == {"COMPLETED"}
+    assert edges(tasks, "rectify") == {"plan_capture", "capture_coarse", "locate"}
+    assert edges(tasks, "cut_patches") == {"plan_capture", "attend", "capture_fine"}
+    assert edges(tasks, "add_accuracy") == {"plan_capture", "publish", "evaluate"}
+    assert any(words.startswith("mosaic: ") and "stages/rectify/" in words for words in log)
+    assert set(artifacts) == {None, "survey-scene", "savings-scene", "report-scene"}
+    assert artifacts[None].data == 100.0
+    assert "data:image/jpeg;base64," in artifacts["survey-scene"].data
+    assert "report.html" in artifacts["report-scene"].data
+    assert len(json.loads(artifacts["savings-scene"].data)) > 4
+
+
+STEPS = ("plan_capture", "publish", "add_accuracy")
+
+
+def edges(tasks: dict[str, Any], name: str) -> set[str]:
+    """Names of the tasks that a task got something from."""
+    by_id = {one.id: key.removesuffix("-scene") for key, one in tasks.items()}
+    return {
+        by_id[given.id]
+        for some in tasks[f"{name}-scene"].task_inputs.values()
+        for given in some
+        if hasattr(given, "id")
+    }
+
+
+def test_a_survey_has_a_server_of_its_own(survey_png: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its files lie in the archive, and nothing of it is left in the environment."""
+    monkeypatch.delenv("PREFECT_API_URL", raising=False)
+    before = dict(os.environ)
+    survey_png(tmp_path, engine="prefect")
+    assert (tmp_path / ".prefect" / "prefect.db").exists()
+    assert dict(os.environ) == before
+
+
+def test_a_device_that_answers_the_second_time_is_asked_again(
+    survey_png: Any, tmp_path: Path, server: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A capture that failed for its device is tried again, and the survey ends well."""
+    real, tries = STAGES["capture_coarse"], []
+
+    def shaky(*given: Any) -> Any:
+        tries.append("capture")
+        if len(tries) == 1:
+            raise RigError("no reply from the camera after 2 s; is it on?")
+        return real.wants(*given)
+
+    act_instead(monkeypatch, "capture_coarse", shaky)
+    monkeypatch.setattr(prefect_tasks, "RETRY_DELAY_S", 0.0)
+    prefect_tasks._task.cache_clear()
+    states = {stage["name"]: stage["state"] for stage in survey_png(tmp_path, engine="prefect").receipt["stages"]}
+    assert tries == ["capture", "capture"]
+    assert set(states.values()) == {"ran"}
+
+
+def test_without_a_server_the_survey_runs_plain(
+    survey_png: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One line says that a server cannot start, and the survey runs without it."""
+
+    def refuse(*given: Any) -> None:
+        raise ServerUnavailable("the Prefect server did not start (no port)")
+
+    monkeypatch.setattr(survey_command, "_prefect_server", refuse)
+    found = survey_png(tmp_path, engine="prefect").receipt
+    assert {stage["state"] for stage in found["stages"]} == {"ran"}
+
+
+def test_a_named_server_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is named, with its address."""
+    monkeypatch.setenv("PREFECT_API_URL", "http://127.0.0.1:9/api")
+    with pytest.raises(ServerUnavailable, match="no Prefect server answers at http://127.0.0.1:9/api"):  # noqa: SIM117
+        with survey_command._prefect_server(SimpleNamespace(out="x")):  # type: ignore[arg-type]
+            pytest.fail("it was taken for one that answers")
+
+
+def test_the_run_is_published_before_its_map_is_judged(
+    survey_png: Any, tmp_path: Path, server: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the same flow; a stop while it is judged leaves the run, and the same command adds its accuracy to it."""
+
+    def interrupt(*given: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(evaluation, "load_class_map", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            survey_png(tmp_path, engine="prefect")
+    (run,) = Archive.open(tmp_path).runs()
+    assert json.loads((run / "receipt.json").read_text())["accuracy_is"] == "pending"
+    published = survey_png(tmp_path, engine="prefect")
+    assert published.folder == run
+    assert published.receipt["accuracy_is"] == "judged"
+    assert problems(tmp_path) == []
+
+
+def test_sigterm_in_a_stage(
+    scene_files: Path,
+    weights: Path,
+    tmp_path: Path,
+    server: str,
+    monkeypatch: pytest.MonkeyPatch,
+    command_line: CommandLine,
+) -> None:
+    """143 and one sentence, whatever Prefect makes of it; the same command continues."""
+    real = STAGES["rectify"]
+
+    def terminated(*given: Any) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        pytest.fail("SIGTERM was not heard")
+
+    words = ("survey", "--scene", scene_files / "scene.png", "--weights", weights, "--out", tmp_path / "archive")
+    act_instead(monkeypatch, "rectify", terminated)
+    ended = command_line(*words)
+    assert (ended.code, ended.out, ended.errors) == (143, "", [])
+    assert ended.err.splitlines()[-1] == "terminated; the same command goes on from here"
+    monkeypatch.setitem(STAGES, "rectify", real)
+    assert command_line(*words).code == 0
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_a_pass_that_is_none() -> None:
+    """The flow `capture` takes coarse or fine sweeps."""
+    from flows.tasks.captures import capture_pass
+
+    with pytest.raises(SettingsError, match="no pass 'medium': expected coarse or fine"):
+        capture_pass(Noted(), "medium")  # type: ignore[arg-type]

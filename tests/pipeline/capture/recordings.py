@@ -1,0 +1,52 @@
+"""Recordings of small simulated fields, for tests: what the simulated rig saw, kept as sweeps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.capture.recorded import RecordedSource, RecordedSweep
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Sweep
+from pipeline.simulator.rig_model import Rig
+from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
+from tests.pipeline.simulator.small_scenes import image_scene
+
+CAMERA = replace(LineCamera(), samples=64)
+FULL = Sweep("scan-0", "fine", "x", strip_px=0.0, start_px=-39.5, lines=80)
+
+
+def simulated(camera: LineCamera = CAMERA) -> SimulatedSource:
+    """The simulated rig before a small field of noise, (80, 64, 3)."""
+    values = np.random.default_rng(5).random((80, 64, 3))
+    return SimulatedSource(image_scene(values, camera, np.linspace(450, 850, 3)), Rig(camera), seed=3)
+
+
+@dataclass
+class Counted:
+    """Reads of a recorded sweep, line by line."""
+
+    numbers: list[int] = field(default_factory=list)
+
+
+def record(source: SimulatedSource, sweep: Sweep, counted: Counted | None = None) -> RecordedSweep:
+    """Record one sweep of the simulated rig; the numbers of the lines that are read later go to ``counted``."""
+    lines = SimulatedSweep(source, sweep)
+    exposure_ms = source.camera.exposure_ms if sweep.exposure_ms is None else sweep.exposure_ms
+    recorded = RecordedSweep.of(lines, np.full(sweep.lines, exposure_ms))
+    if counted is None:
+        return recorded
+
+    def read_lines(numbers: NDArray[np.intp]) -> NDArray[np.uint16]:
+        counted.numbers += numbers.tolist()
+        return recorded.read_lines(numbers)
+
+    return replace(recorded, read_lines=read_lines)
+
+
+def recorded_source(source: SimulatedSource, sweeps: Sequence[RecordedSweep]) -> RecordedSource:
+    """A source over recorded sweeps of the simulated rig's field."""
+    return RecordedSource(sweeps, source.camera, source.wavelength_nm, source.field_shape)

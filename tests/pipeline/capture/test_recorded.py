@@ -1,0 +1,258 @@
+"""A recording gives its own sweeps as they are, planned ones by their nearest lines, and reads nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.capture.recorded import RecordedSource, RecordedSweep, line_runs, nearest_line, sum_references
+from pipeline.errors import NotRecordedError, SceneError, ShapeError
+from pipeline.geometry.camera import bin_samples
+from pipeline.geometry.scan import Sweep, line_positions
+from pipeline.source import Line, References
+from tests.pipeline.capture.recordings import CAMERA, FULL, Counted, record, recorded_source, simulated
+
+
+def assert_same_lines(found: list[Line], expected: list[Line]) -> None:
+    """Lines are equal bit for bit, with number, position, time, exposure and whether they are valid."""
+    assert len(found) == len(expected)
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one.data, other.data)
+        assert replace(one, data=other.data) == other
+
+
+def assert_same_references(found: References, expected: References) -> None:
+    for name, value in asdict(expected).items():
+        np.testing.assert_array_equal(getattr(found, name), value)
+
+
+@pytest.mark.parametrize(
+    "sweep", [FULL, Sweep("c", "coarse", "x", 0.0, -39.5, 20, step=4, binning=4, exposure_ms=25.0)]
+)
+def test_a_recorded_copy_of_a_sweep_gives_its_lines(sweep: Sweep) -> None:
+    """Lines, references and single lines again are those of the source that was recorded, bit for bit."""
+    source = simulated()
+    recorded = recorded_source(source, [record(source, sweep)])
+    lines = list(source.lines(sweep))
+    assert_same_lines(list(recorded.lines(sweep)), lines)
+    assert_same_lines(list(recorded.lines(sweep, 17)), lines[17:])
+    assert_same_lines(list(recorded.lines_again(sweep, [3, 11])), [lines[3], lines[11]])
+    assert_same_references(recorded.references(sweep), source.references(sweep))
+    assert recorded.lines_read == recorded.lines_recorded == sweep.lines
+
+
+def test_a_coarse_pass_over_a_full_scan_reads_one_line_in_four() -> None:
+    """Each coarse line is the recorded line just before its middle, its samples summed; the others are not read."""
+    source, counted = simulated(), Counted()
+    recorded = recorded_source(source, [record(source, FULL, counted)])
+    coarse = Sweep("coarse-0", "coarse", "x", 0.0, -39.5, 20, step=4, binning=4)
+    found, full = list(recorded.lines(coarse)), list(source.lines(FULL))
+    for number, line in enumerate(found):
+        of = full[4 * number + 1]  # the middle, 1.5 px after the first held position, lies between lines 1 and 2
+        np.testing.assert_array_equal(line.data, bin_samples(of.data, 4))
+        assert (line.number, line.mirror_x, line.mirror_y, line.time_s) == (number, of.mirror_x, of.mirror_y, of.time_s)
+    assert counted.numbers == list(range(1, 80, 4))
+    assert recorded.lines_read == 20
+    assert_same_references(recorded.references(coarse), source.references(coarse))
+
+
+def test_fine_lines_of_a_full_scan_are_found_by_their_place() -> None:
+    """A planned run of lines reads those and no other, and gives them as they were recorded."""
+    source, counted = simulated(), Counted()
+    recorded = recorded_source(source, [record(source, FULL, counted)])
+    found = list(recorded.lines(Sweep("fine-0", "fine", "x", 0.0, -9.5, 12)))
+    expected = list(source.lines(FULL))[30:42]
+    assert_same_lines([replace(line, number=line.number + 30) for line in found], expected)
+    assert counted.numbers == list(range(30, 42))
+    list(recorded.lines(Sweep("fine-1", "fine", "x", 0.0, -1.5, 8)))
+    assert recorded.lines_read == 16  # lines 38 to 41 were read before
+
+
+def test_a_recorded_coarse_sweep_wins_over_the_full_scan() -> None:
+    """Of two sweeps that can serve a request, the one with its very lines and binning does."""
+    source = simulated()
+    coarse = Sweep("recorded coarse", "coarse", "x", 0.0, -39.5, 20, step=4, binning=4)
+    recorded = recorded_source(source, [record(source, FULL), record(source, coarse)])
+    part = Sweep("planned", "coarse", "x", 0.0, -31.5, 10, step=4, binning=4)
+    expected = [replace(line, number=line.number - 2) for line in source.lines(coarse)][2:12]
+    assert_same_lines(list(recorded.lines(part)), expected)
+
+
+def test_a_backward_scan_gives_rising_times() -> None:
+    """A plan that the recording took the other way comes in the order of its times, each line at its own position."""
+    source = simulated()
+    whole = record(source, FULL)
+    backward = replace(
+        whole, position=whole.position[::-1], read_lines=lambda numbers: whole.read_lines(79 - numbers[::-1])[::-1]
+    )
+    found = list(recorded_source(source, [backward]).lines(Sweep("fine-0", "fine", "x", 0.0, -9.5, 12)))
+    times = [line.time_s for line in found]
+    assert times == sorted(times)
+    planned = line_positions(Sweep("fine-0", "fine", "x", 0.0, -9.5, 12), CAMERA)
+    np.testing.assert_allclose([[line.mirror_x, line.mirror_y] for line in found], planned[::-1], atol=1e-12)
+    for line, same in zip(found, list(source.lines(FULL))[30:42][::-1], strict=True):
+        np.testing.assert_array_equal(line.data, same.data)
+
+
+def test_two_sweeps_of_one_strip_serve_a_run_across_both() -> None:
+    """Where one recorded sweep ends and the next begins, lines of both serve, and times go on rising."""
+    source = simulated()
+    lower, upper = replace(FULL, lines=40), replace(FULL, name="scan-1", start_px=0.5, lines=40)
+    recorded = recorded_source(source, [record(source, lower), record(source, upper)])
+    found = list(recorded.lines(Sweep("fine-0", "fine", "x", 0.0, -4.5, 10)))
+    expected = [*list(source.lines(lower))[35:], *list(source.lines(upper))[:5]]
+    for line, same in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(line.data, same.data)
+        assert (line.mirror_x, line.mirror_y) == (same.mirror_x, same.mirror_y)
+    assert np.all(np.diff([line.time_s for line in found]) > 0)
+
+
+def test_a_lost_line_serves_only_where_no_other_does() -> None:
+    """The valid neighbour of a lost line stands for it in a coarse pass; in a fine one the lost line is not valid."""
+    source = simulated()
+    whole = record(source, FULL)
+    lost = replace(whole, valid_line=np.arange(80) != 5)
+    recorded = recorded_source(source, [lost])
+    coarse = recorded.pick(Sweep("coarse-0", "coarse", "x", 0.0, -39.5, 20, step=4, binning=4))
+    assert coarse.line[:3].tolist() == [1, 6, 9]
+    fine = list(recorded.lines(Sweep("fine-0", "fine", "x", 0.0, -35.5, 3)))
+    assert [line.valid for line in fine] == [True, False, True]
+
+
+def test_a_line_that_serves_twice_is_valid_once() -> None:
+    """Recorded lines 1.25 px apart serve a plan of 1 px; where two planned lines share one, it counts once."""
+    source = simulated()
+    wide = _lines_apart(1.25)
+    found = list(recorded_source(source, [wide]).lines(Sweep("fine-0", "fine", "x", 0.0, -10.0, 10)))
+    places = [line.mirror_x for line in found]
+    assert len(set(places)) == sum(line.valid for line in found) < 10
+
+
+def _lines_apart(distance_px: float) -> RecordedSweep:
+    """A recording of 40 lines that are ``distance_px`` apart, centred, with numbers that do not matter."""
+    sweep = Sweep("uneven", "fine", "x", 0.0, -19.5, 40)
+    scan = distance_px * (np.arange(40) - 19.5)
+    position = np.concatenate([line_positions(Sweep("one", "fine", "x", 0.0, at, 1), CAMERA) for at in scan.tolist()])
+    frame = np.zeros((64, 3), np.float32)
+    return RecordedSweep(
+        sweep,
+        References(frame, frame + 1, np.ones(3, np.float32)),
+        position,
+        np.arange(40.0),
+        np.full(40, 100.0),
+        np.ones(40, bool),
+        lambda numbers: np.zeros((len(numbers), 64, 3), np.uint16),
+    )
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        (
+            Sweep("fine-0", "fine", "x", 0.0, 35.5, 8),
+            r"line 5 of sweep fine-0 was never taken: it lies at 40.5 px of the scan on the strip at 0 px \(binning 1, "
+            r"step 1\), the nearest recorded line, 79 of scan-0, at 39.5 px on 0 px",
+        ),
+        (Sweep("fine-0", "fine", "x", 20.0, -9.5, 4), r"line 0 of sweep fine-0 was never taken: .* strip at 20 px"),
+        (
+            Sweep("fine-0", "fine", "y", 0.0, -9.5, 4),
+            "lie along y, those of the recording along x; plan sweeps along x",
+        ),
+    ],
+)
+def test_a_line_that_was_never_taken_is_named(asked: Sweep, message: str) -> None:
+    """Beyond the recording's end, beside its strip, or along the other axis: refused before any line is given."""
+    source, counted = simulated(), Counted()
+    recorded = recorded_source(source, [record(source, FULL, counted)])
+    with pytest.raises(NotRecordedError, match=message):
+        next(recorded.lines(asked))
+    assert counted.numbers == []
+
+
+def test_a_plan_is_cut_to_what_was_recorded() -> None:
+    """Lines beyond either end go, those of a gap stay, and of a plan elsewhere nothing is left."""
+    source = simulated()
+    lower, upper = replace(FULL, lines=30), replace(FULL, name="scan-1", start_px=10.5, lines=30)
+    recorded = recorded_source(source, [record(source, lower), record(source, upper)])
+    beyond = Sweep("coarse-0", "coarse", "x", 0.0, -49.5, 30, step=4, binning=4)
+    assert recorded.cut_to_recorded(beyond) == replace(beyond, start_px=-41.5, lines=21)
+    inside = replace(lower, name="fine", lines=10)
+    assert recorded.cut_to_recorded(inside) == inside
+    assert recorded.cut_to_recorded(replace(inside, strip_px=64.0)) is None
+    with pytest.raises(NotRecordedError, match="line 8 of sweep coarse-0 was never taken: it lies at -8 px"):
+        next(recorded.lines(replace(beyond, start_px=-41.5, lines=21)))
+
+
+def test_a_coarse_line_beside_a_gap_takes_what_lies_within_its_own_lines() -> None:
+    """Where lines 1 to 3 were lost, line 0 serves the coarse line in whose four lines it lies."""
+    source = simulated()
+    whole = record(source, FULL)
+    lost = replace(whole, valid_line=~np.isin(np.arange(80), [1, 2, 3]))
+    picked = recorded_source(source, [lost]).pick(Sweep("c", "coarse", "x", 0.0, -39.5, 20, step=4, binning=4))
+    assert picked.line[:2].tolist() == [0, 5]
+
+
+def test_a_plan_that_differs_by_rounding_is_the_recorded_sweep() -> None:
+    """Measured positions that stray keep their lines where the plan is the recording's own but for its last digits."""
+    source = simulated()
+    whole = record(source, FULL)
+    strayed = replace(whole, position=whole.position + np.random.default_rng(0).normal(0, 3e-4, (80, 2)))
+    recorded = recorded_source(source, [strayed])
+    picked = recorded.pick(replace(FULL, name="planned", strip_px=3e-7, start_px=FULL.start_px - 2e-7))
+    assert picked.line.tolist() == list(range(80))
+
+
+def test_finer_lines_than_were_recorded_are_refused() -> None:
+    """A coarse recording serves no fine request, neither by its binning nor by its distance of lines."""
+    source = simulated()
+    coarse = Sweep("coarse-0", "coarse", "x", 0.0, -39.5, 20, step=4, binning=4)
+    stepped = Sweep("stepped", "coarse", "x", 0.0, -39.5, 20, step=4)
+    for one in (coarse, stepped):
+        with pytest.raises(NotRecordedError, match="no finer than they were recorded"):
+            recorded_source(source, [record(source, one)]).pick(Sweep("fine-0", "fine", "x", 0.0, -9.5, 4))
+
+
+def test_sizes_that_do_not_fit_are_refused() -> None:
+    """No sweep, lines of other samples than the camera's, and columns of other lengths than the sweep."""
+    source = simulated()
+    one = record(source, FULL)
+    with pytest.raises(SceneError, match="holds no sweep"):
+        recorded_source(source, [])
+    with pytest.raises(SceneError, match=r"lines of \(64, 3\) \(sample, band\), and a camera of 640 samples"):
+        RecordedSource([one], replace(CAMERA, samples=640), source.wavelength_nm, (80, 64))
+    with pytest.raises(ShapeError, match="time_s is of 79 lines, not 80"):
+        replace(one, time_s=one.time_s[:-1])
+
+
+@given(st.lists(st.integers(-300, 300), min_size=1, unique=True), st.floats(-40, 40))
+def test_nearest_line_is_nearest(tenths: list[int], wanted: float) -> None:
+    """No other line lies nearer, whatever the order of the lines."""
+    scan = np.array(tenths) / 10
+    near, distance = nearest_line(scan, np.array([wanted]))
+    assert distance[0] == abs(scan[near[0]] - wanted)
+    assert distance[0] <= np.abs(scan - wanted).min() + 1e-6
+
+
+def test_of_two_equally_near_lines_the_lower_counts() -> None:
+    """Rounding does not decide: a distance that differs by 1e-9 px is equal."""
+    scan = np.array([1.0, 2.0 - 1e-9, 0.0])
+    assert nearest_line(scan, np.array([1.5, 0.5]))[0].tolist() == [0, 2]
+
+
+def test_line_runs_are_what_follows_each_other() -> None:
+    """Hand-worked runs, half open."""
+    assert line_runs(np.array([0, 1, 2, 5, 7, 8])) == [(0, 3), (5, 6), (7, 9)]
+
+
+def test_sums_of_references() -> None:
+    """Dark and white are summed, bad elements spread to their sum, the relative response is averaged."""
+    frame = np.arange(10, dtype=np.float32).reshape(5, 2)
+    summed = sum_references(References(frame, frame * 2, np.ones(2, np.float32), frame == 3, frame), 2)
+    np.testing.assert_array_equal(summed.dark, [[2, 4], [10, 12]])
+    np.testing.assert_array_equal(summed.white, [[4, 8], [20, 24]])
+    np.testing.assert_array_equal(summed.bad, [[False, True], [False, False]])
+    np.testing.assert_array_equal(summed.flat, [[1, 2], [5, 6]])

@@ -1,0 +1,127 @@
+"""Sweeps out of positions come back as they were planned; what is not straight is refused; scans without a mirror."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.capture.straight_scans import covered_field, fit_sweep, flat_camera, flat_positions
+from pipeline.errors import SceneError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.mirror import direction_to_scene, position_to_direction
+from pipeline.geometry.scan import CostModel, Sweep, line_positions, points_of_scan, shifted_position
+from pipeline.planning.coverage import cheapest_full
+
+CAMERA = LineCamera()
+
+
+@given(
+    st.integers(-2000, 2000),
+    st.integers(-3000, 2000),
+    st.integers(2, 400),
+    st.sampled_from([(1, 1), (4, 4), (8, 2), (1, 4)]),
+)
+def test_a_planned_sweep_comes_back(strip: int, start: int, lines: int, shape: tuple[int, int]) -> None:
+    """Positions of any sweep give that sweep again, exactly; turned round, the same, and backward."""
+    step, binning = shape
+    sweep = Sweep("s", "fine" if step == binning == 1 else "coarse", "x", strip / 2, start / 2, lines, step, binning)
+    position = line_positions(sweep, CAMERA)
+    forward = fit_sweep(position, CAMERA, name="s", samples=640 // binning)
+    back = fit_sweep(position[::-1], CAMERA, name="s", samples=640 // binning)
+    assert (forward.sweep, forward.backward) == (sweep, False)
+    assert (back.sweep, back.backward) == (sweep, True)
+
+
+def test_noise_and_spikes_do_not_move_the_sweep() -> None:
+    """With 0.7 px of noise and a tenth of the lines lost the sweep is found to a fifth of a pixel."""
+    sweep = Sweep("s", "fine", "x", 320.0, -400.0, 800)
+    rng = np.random.default_rng(2)
+    position = shifted_position(line_positions(sweep, CAMERA), rng.normal(0, 0.7, (800, 2)), CAMERA)
+    valid = rng.random(800) > 0.1
+    position[~valid] = 0.0
+    found = fit_sweep(position, CAMERA, name="s", samples=640, valid=valid)
+    assert (found.sweep.step, found.sweep.lines) == (1, 800)
+    assert abs(found.sweep.strip_px - 320) < 0.2
+    assert abs(found.sweep.start_px + 400) < 0.2
+    assert abs(found.distance_px - 1) < 1e-3
+
+
+def _moved(along_px: np.ndarray, scan_px: np.ndarray) -> np.ndarray:
+    """Mirror positions of line centres."""
+    rest = np.zeros((len(scan_px), 2))
+    return shifted_position(rest, np.stack([along_px, scan_px], axis=-1), CAMERA)
+
+
+@pytest.mark.parametrize(
+    ("along", "scan", "message"),
+    [
+        (np.linspace(0, 200, 50), np.arange(50.0), r"line 0 lies 100 px beside the strip at 100 px, and at most 40 px"),
+        (np.zeros(50), np.full(50, 3.0), "stands still"),
+        (np.zeros(50), np.concatenate([np.arange(35.0), np.arange(34.0, 19, -1)]), "turns back at line 4[23]"),
+    ],
+)
+def test_what_is_no_straight_scan_is_refused(along: np.ndarray, scan: np.ndarray, message: str) -> None:
+    """A bend, a mirror at rest, and a scan that goes back: each says what to do."""
+    with pytest.raises(SceneError, match=message):
+        fit_sweep(_moved(along, scan), CAMERA, name="s", samples=640)
+
+
+def test_too_few_lines_and_odd_samples_are_refused() -> None:
+    """One valid line is no scan, and 500 samples are no part of 640."""
+    position = line_positions(Sweep("s", "fine", "x", 0.0, 0.0, 4), CAMERA)
+    with pytest.raises(SceneError, match="has 1 valid lines"):
+        fit_sweep(position, CAMERA, name="s", samples=640, valid=np.arange(4) == 2)
+    with pytest.raises(SceneError, match=r"lines of 500 samples, no whole part of the camera's 640"):
+        fit_sweep(position, CAMERA, name="s", samples=500)
+
+
+def test_the_covered_field_of_a_full_scan_is_the_field() -> None:
+    """Sweeps laid out for a field cover it along the scan to 4 px, and along the line at least as far as it reaches."""
+    grid = SceneGrid(700, 1500, 64, 4)
+    along, sweeps, _ = cheapest_full(grid, CAMERA, CostModel(), overlap_px=0.0)
+    tangents = [direction_to_scene(position_to_direction(line_positions(sweep, CAMERA))) for sweep in sweeps]
+    found = covered_field(sweeps, tangents, CAMERA)
+    scan, line = (0, 1) if along == "x" else (1, 0)
+    wanted = (700, 1500)
+    assert abs(found.shape[scan] - wanted[scan]) <= 8
+    assert abs(found.centre_px[scan]) <= 4
+    assert abs(found.centre_px[line]) + wanted[line] / 2 <= found.shape[line] / 2
+
+
+def test_the_covered_field_of_one_straight_scan_is_its_size() -> None:
+    """100 lines of 640 samples through rest: (100, 640), centred where the lines are."""
+    sweep = Sweep("s", "fine", "x", 0.0, 10.0, 100)
+    tangents = direction_to_scene(position_to_direction(line_positions(sweep, CAMERA)))
+    found = covered_field([sweep], [tangents], CAMERA)
+    assert found.shape == (100, 640)
+    np.testing.assert_allclose(found.centre_px, (59.5, 0.0), atol=1e-6)
+    turned = covered_field([replace(sweep, along="y")], [tangents], CAMERA)
+    assert turned.shape == (640, 100)
+
+
+def test_strips_without_a_common_part_are_refused() -> None:
+    """Two strips whose scans do not meet, and lines along both axes."""
+    sweeps = [Sweep("a", "fine", "x", 0.0, 0.0, 50), Sweep("b", "fine", "x", 640.0, 900.0, 50)]
+    tangents = [direction_to_scene(position_to_direction(line_positions(sweep, CAMERA))) for sweep in sweeps]
+    with pytest.raises(SceneError, match="no part of the scan in common"):
+        covered_field(sweeps, tangents, CAMERA)
+    with pytest.raises(SceneError, match="along x and along y"):
+        covered_field([sweeps[0], replace(sweeps[1], along="y")], tangents, CAMERA)
+
+
+@pytest.mark.parametrize("extent_px", [100.0, 5000.0, 40000.0])
+def test_lines_of_a_scan_without_a_mirror_are_parallel(extent_px: float) -> None:
+    """Every sample lies within 0.011 px of where a parallel line has it, and the scan is as long as it was."""
+    flat = flat_camera(CAMERA, extent_px)
+    scan = np.linspace(-extent_px, extent_px, 9)
+    tangents = direction_to_scene(position_to_direction(flat_positions(scan, flat))) / flat.ifov_rad
+    np.testing.assert_allclose(tangents, np.stack([np.zeros(9), scan], axis=-1), atol=1e-6)
+    along, across = points_of_scan(0.0, flat, scan[:, None], flat.pixel_slopes())
+    np.testing.assert_allclose(along, np.broadcast_to(np.arange(640) - 319.5, along.shape), atol=0.011)
+    np.testing.assert_allclose(across, np.broadcast_to(scan[:, None], across.shape), atol=1e-6)
+    assert flat.slit_px == CAMERA.slit_px

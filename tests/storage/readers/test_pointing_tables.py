@@ -1,0 +1,213 @@
+"""Pointing tables of every kind give positions; each fault of a table has one message that names it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.errors import SceneError
+from pipeline.geometry.mirror import REST_TANGENT, Mounting, direction_to_scene, position_to_direction
+from storage.readers.pointing_tables import (
+    ACCEPTED,
+    find_pointing,
+    follow_vector,
+    load_played_vector,
+    load_pointing_table,
+)
+
+MIRROR = "line,time,mirror_x,mirror_y\n0,0.05,0.1,0\n1,0.15,0.2,0\n2,0.25,0.3,0\n"
+
+
+def _table(folder: Path, text: str, name: str = "table.csv") -> Path:
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_mirror_positions_are_read_as_they_stand(tmp_path: Path) -> None:
+    """Positions and times are the file's, whatever delimiter, capitals, byte order mark, blank or swapped rows."""
+    rows = MIRROR.splitlines()
+    swapped = "\ufeff" + "\n".join([rows[0].upper(), rows[3], "", rows[1], rows[2]]).replace(",", ";")
+    for text in (MIRROR, swapped, MIRROR.replace(",", "\t")):
+        found = load_pointing_table(_table(tmp_path, text)).of_cube("c", 3)
+        np.testing.assert_array_equal(found.position, [[0.1, 0], [0.2, 0], [0.3, 0]])
+        np.testing.assert_array_equal(found.time_s, [0.05, 0.15, 0.25])
+        assert (found.valid.all(), found.exposure_ms, found.part) == (True, None, None)
+
+
+def test_numbers_come_back_bit_for_bit(tmp_path: Path) -> None:
+    """A float64 written by repr is read as the same float64."""
+    values = np.random.default_rng(1).uniform(-0.5, 0.5, (200, 2))
+    text = "mirror_x,mirror_y\n" + "".join(f"{x!r},{y!r}\n" for x, y in values.tolist())
+    np.testing.assert_array_equal(load_pointing_table(_table(tmp_path, text)).of_cube("c", 200).position, values)
+
+
+def test_angles_become_positions(tmp_path: Path) -> None:
+    """Two angles look where they say; one angle is that along the scan."""
+    two = load_pointing_table(_table(tmp_path, "angle_x_deg,angle_y_deg\n5,-10\n5,10\n")).of_cube("c", 2)
+    seen = np.rad2deg(np.arctan(direction_to_scene(position_to_direction(two.position))))
+    np.testing.assert_allclose(seen, [[5, -10], [5, 10]], atol=1e-10)
+    one = load_pointing_table(_table(tmp_path, "angle_deg\n-10\n20\n")).of_cube("c", 2)
+    expected = -np.tan(np.deg2rad([-10, 20])) / REST_TANGENT
+    np.testing.assert_allclose(one.position, np.stack([expected, [0, 0]], axis=-1), atol=1e-12)
+
+
+def test_a_mounting_leads_to_the_models_positions(tmp_path: Path) -> None:
+    """The table has the device's X and Y, which are the model's Y and -X here."""
+    found = load_pointing_table(_table(tmp_path, MIRROR)).of_cube("c", 3, Mounting("y,-x"))
+    np.testing.assert_allclose(found.position, [[0, 0.1], [0, 0.2], [0, 0.3]], atol=1e-15)
+
+
+def test_lines_that_are_not_valid_need_no_numbers(tmp_path: Path) -> None:
+    """Their positions are made up between their neighbours, their times stay unknown."""
+    text = "mirror_x,mirror_y,time,valid,exposure_ms\n0.1,0,0.1,1,5\n,,,0,\n0.3,0.2,0.3,true,7\n"
+    found = load_pointing_table(_table(tmp_path, text)).of_cube("c", 3)
+    np.testing.assert_allclose(found.position, [[0.1, 0], [0.2, 0.1], [0.3, 0.2]])
+    assert found.valid.tolist() == [True, False, True]
+    np.testing.assert_array_equal(found.time_s, [0.1, np.nan, 0.3])
+    np.testing.assert_array_equal(found.exposure_ms, [5, 6, 7])
+
+
+def test_one_table_for_several_cubes_and_for_parts_of_one(tmp_path: Path) -> None:
+    """Rows belong to the cube that they name; of a lone cube of another name they tell the sweeps."""
+    text = "sweep,position_px\na,0\na,1\nb,5\nb,4\nb,3\n"
+    table = load_pointing_table(_table(tmp_path, text))
+    assert table.of_cube("a", 2).position[:, 0].tolist() == [0, 1]
+    assert table.of_cube("b", 3).position[:, 0].tolist() == [5, 4, 3]
+    assert table.of_cube("whole", 5, alone=True).part == ("a", "a", "b", "b", "b")
+    assert table.of_cube("a", 2, alone=True).part is None
+    with pytest.raises(SceneError, match="has no row for the cube 'c'; its column 'sweep' names a, b"):
+        table.of_cube("c", 2)
+
+
+def test_parquet_is_read_as_csv_is(tmp_path: Path) -> None:
+    """The same columns as Parquet give the same pointing, with names of sweeps and missing numbers."""
+    arrow = pytest.importorskip("pyarrow")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    columns = {"sweep": ["a", "a"], "mirror_x": [0.1, None], "mirror_y": [0.0, None], "valid": [True, False]}
+    parquet.write_table(arrow.table(columns), tmp_path / "table.parquet")
+    found = load_pointing_table(tmp_path / "table.parquet").of_cube("a", 2)
+    np.testing.assert_array_equal(found.position, [[0.1, 0], [0.1, 0]])
+    (tmp_path / "table.parquet").write_bytes(b"PAR1 and no more")
+    with pytest.raises(SceneError, match="cannot be read as Parquet"):
+        load_pointing_table(tmp_path / "table.parquet")
+
+
+def test_parquet_without_its_reader_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without pyarrow the message names the extra, and CSV."""
+
+    class Missing:
+        def __getattr__(self, name: str) -> object:
+            raise ModuleNotFoundError("No module named 'pyarrow'")
+
+    monkeypatch.setattr("storage.readers.pointing_tables.parquet", Missing())
+    with pytest.raises(SceneError, match=r"install spectralzoom\[parquet\], or write the table as CSV"):
+        load_pointing_table(_table(tmp_path, "", "table.parquet"))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is empty; give a header and a row for each line"),
+        ("mirror_x,mirror_y\n", "has no row below its header"),
+        (
+            "mirror_x,mirror_y,roll\n0,0,0\n",
+            f"the column 'roll', which is not known; accepted are {', '.join(ACCEPTED)}",
+        ),
+        ("mirror_x,mirror_x\n0,0\n", "has the column 'mirror_x' twice"),
+        ("mirror_x\n0\n", "one kind of pointing, and mirror_y is missing"),
+        ("time\n0\n", "one kind of pointing, and none is there"),
+        ("angle_deg,position_m\n0,0\n", "one kind of pointing, and 2 of them are there"),
+        ("angle_deg\nten\n", "row 2: angle_deg = 'ten' is no number"),
+        ("angle_deg;time\n1,5;0\n", r"row 2: angle_deg = '1,5' is no number; write numbers with a decimal point"),
+        ("angle_deg,time\n1\n", "row 2 has 1 cells, its header 2"),
+    ],
+)
+def test_a_table_that_cannot_be_read_says_why(tmp_path: Path, text: str, message: str) -> None:
+    """Columns and cells: each fault has its own message."""
+    with pytest.raises(SceneError) as caught:
+        load_pointing_table(_table(tmp_path, text))
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("angle_deg\n0\n1\n", "has 2 rows for cube, fewer than its 3 lines"),
+        ("angle_deg\n0\n1\n2\n3\n", "has 4 rows for cube, more than its 3 lines"),
+        (
+            "mirror_x,mirror_y\n0,0\n0.9,0.9\n1,1\n",
+            "row 3: mirror_x = 0.9, mirror_y = 0.9 (the first of 2 such rows), beyond the mirror, which reaches "
+            "X^2 + Y^2 <= 1. mirror_x goes from 0 to 1; mirror_y goes from 0 to 1; correct the table",
+        ),
+        (
+            "angle_deg\n0\n20\n51\n",
+            "row 4: angle_deg = 51, beyond the mirror, which turns the view by up to 50 deg along the scan",
+        ),
+        (
+            "angle_deg,time\n0,0\n1,0.2\n2,0.2\n",
+            "row 4: time = 0.2, expected a time after that of the line before [s]. time goes from 0 to 0.2",
+        ),
+        ("angle_deg\n0\nnan\n2\n", "row 3: angle_deg = nan, expected a number; set valid = 0 where it is not known"),
+        ("angle_deg,time\n0,0\n1,\n2,1\n", "row 3: time = nan, expected a number"),
+        ("angle_deg,exposure_ms\n0,1\n1,0\n2,1\n", "row 3: exposure_ms = 0, expected a time above 0 ms"),
+        ("angle_deg,valid\n0,1\n1,2\n2,1\n", "row 3: valid = 2, expected 0 or 1"),
+        ("angle_deg,valid\n0,0\n1,0\n2,0\n", "calls no line of cube valid"),
+        ("angle_deg,line\n0,0\n1,2\n2,2\n", "row 3: line = 2, expected each of 0 to 2 once"),
+    ],
+)
+def test_rows_that_do_not_fit_the_lines_say_why(tmp_path: Path, text: str, message: str) -> None:
+    """Numbers of rows, range, order and unknown values: the first wrong row is named, with the column's range."""
+    with pytest.raises(SceneError) as caught:
+        load_pointing_table(_table(tmp_path, text)).of_cube("cube", 3)
+    assert message in str(caught.value)
+
+
+def test_a_played_vector_places_lines_by_its_clock(tmp_path: Path) -> None:
+    """X cells before Y cells at 10 Hz, begun 0.1 s before the first exposure: mid exposures fall in cells 1, 2, 3."""
+    np.save(tmp_path / "path.npy", np.array([0.0, 0.1, 0.2, 0.3, 0.5, 0.6, 0.7, 0.8]))
+    recipe = _table(tmp_path, 'vector = "path.npy"\nrate_hz = 10\nstart_s = 0.1\n', "c.toml")
+    found = follow_vector(load_played_vector(recipe), np.array([0.05, 0.15, 0.25, 0.35]), "c.toml")
+    np.testing.assert_array_equal(found.position[:3], [[0.1, 0.6], [0.2, 0.7], [0.3, 0.8]])
+    assert found.valid.tolist() == [True, True, True, False]
+    assert "1 lines lie outside of the path's time and are not valid" in found.notes
+    _table(tmp_path, "0,0.5\n0.1,0.6\n0.2,0.7\n0.3,0.8\n", "path.csv")
+    recipe = _table(tmp_path, 'vector = "path.csv"\nrate_hz = 10\nstart_s = 0.1\n', "c.toml")
+    again = follow_vector(load_played_vector(recipe), np.array([0.05, 0.15, 0.25, 0.35]), "c.toml")
+    np.testing.assert_array_equal(again.position, found.position)
+    with pytest.raises(SceneError, match=r"no line was taken while the path of 0.4 s was played; correct start_s"):
+        follow_vector(load_played_vector(recipe), np.array([5.0, 6.0]), "c.toml")
+
+
+@pytest.mark.parametrize(
+    ("recipe", "message"),
+    [
+        ("rate_hz = 10\n", 'names no vector; add the line vector = "positions.csv"'),
+        ('vector = "path.csv"\n', "rate_hz = None, expected a number above 0"),
+        ('vector = "path.csv"\nrate_hz = 0\n', "rate_hz = 0, expected a number above 0"),
+        ('vector = "path.csv"\nrate_hz = 1\nstart_s = "x"\n', "start_s = 'x', expected a number; correct it"),
+        ('vector = "path.csv"\nrate = 1\n', "has the entry 'rate'; accepted are vector, rate_hz, start_s"),
+        ('vector = "none.csv"\nrate_hz = 1\n', "none.csv"),
+        ('vector = "far.csv"\nrate_hz = 1\n', "lies outside the unit disk that the mirror reaches"),
+        ('vector = "words.csv"\nrate_hz = 1\n', "cannot be read as a vector"),
+        ("vector = \n", "cannot be read as TOML"),
+    ],
+)
+def test_a_recipe_that_cannot_be_used_says_why(tmp_path: Path, recipe: str, message: str) -> None:
+    """Entries that are missing, unknown or no numbers, and files that are not there or beyond the mirror."""
+    _table(tmp_path, "0,0\n0.1,0\n", "path.csv")
+    _table(tmp_path, "0,0\n0.8,0.8\n", "far.csv")
+    _table(tmp_path, "one,two\n", "words.csv")
+    with pytest.raises(SceneError) as caught:
+        load_played_vector(_table(tmp_path, recipe, "recipe.toml"))
+    assert message in str(caught.value)
+
+
+def test_pointing_is_found_by_the_cubes_name(tmp_path: Path) -> None:
+    """Only ``NAME.pointing`` with one of the endings is taken; a table of something else is left alone."""
+    _table(tmp_path, "soil,wet\n1,2\n", "cube.csv")
+    assert find_pointing(tmp_path, "cube") is None
+    path = _table(tmp_path, MIRROR, "cube.pointing.csv")
+    assert find_pointing(tmp_path, "cube") == path

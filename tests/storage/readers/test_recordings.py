@@ -1,0 +1,383 @@
+"""Recordings out of archives and files: what is read, found beside the cubes, assumed, and refused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zarr
+from numpy.typing import NDArray
+
+from pipeline.errors import (
+    ArchiveError,
+    IncompleteStoreError,
+    PipelineError,
+    SceneError,
+    SettingsError,
+    WavelengthError,
+)
+from pipeline.geometry.mirror import direction_to_scene, position_to_direction
+from pipeline.geometry.scan import Sweep
+from pipeline.simulator.simulated import SimulatedSource
+from storage.archive.archive import Archive
+from storage.arrays.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_cube
+from storage.export.recorded_files import write_recorded_files
+from storage.readers.recordings import RecordedWith, open_recording
+from tests.pipeline.capture.recordings import CAMERA, FULL, simulated
+
+COARSE = Sweep("coarse-0", "coarse", "x", 0.0, -39.5, 20, step=4, binning=4)
+
+
+def write_raw(folder: Path, source: SimulatedSource, sweep: Sweep) -> RawCube:
+    """A sweep of the simulated rig as a raw cube; its fifth line is lost."""
+    header = SweepHeader(sweep, source.references(sweep), source.wavelength_nm, np.full(3, 5.0), "sim")
+    with RawCubeWriter(folder / f"{sweep.name}.zarr", header) as cube:
+        cube.write([replace(line, valid=line.number != 4) for line in source.lines(sweep)])
+    return open_raw_cube(folder / f"{sweep.name}.zarr")
+
+
+def assert_is_recording_of(found: Any, cube: RawCube) -> None:
+    """A recorded sweep has a raw cube's numbers, positions, times, exposures, flags and references, bit for bit."""
+    assert replace(found.sweep, name=cube.sweep.name) == cube.sweep
+    np.testing.assert_array_equal(found.read(0, cube.shape[0]), cube.read())
+    for name in ("position", "time_s", "exposure_ms", "valid_line"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(cube, name))
+    for name, value in asdict(cube.references).items():
+        np.testing.assert_array_equal(getattr(found.references, name), value, err_msg=name)
+
+
+@pytest.mark.parametrize("interleave", ["bil", "bip", "bsq"])
+@pytest.mark.parametrize("big_endian", [False, True])
+def test_a_raw_cube_as_files_reads_back_bit_for_bit(tmp_path: Path, interleave: Any, big_endian: bool) -> None:
+    """Numbers, pointing and references of two sweeps come back from ENVI and CSV in any order of bands and bytes."""
+    source = simulated()
+    cubes = [write_raw(tmp_path / "raw", source, sweep) for sweep in (COARSE, FULL)]
+    for cube in cubes:
+        write_recorded_files(cube, tmp_path / "files", interleave=interleave, big_endian=big_endian)
+    recording = open_recording(tmp_path / "files", CAMERA)
+    assert [one.sweep.name for one in recording.sweeps] == ["coarse-0", "scan-0"]
+    for found, cube in zip(recording.sweeps, cubes, strict=True):
+        assert_is_recording_of(found, cube)
+    np.testing.assert_array_equal(recording.wavelength_nm, source.wavelength_nm)
+    np.testing.assert_array_equal(recording.fwhm_nm, np.full(3, 5.0))
+    assert (recording.camera, recording.has_mirror) == (CAMERA, True)
+
+
+@pytest.mark.parametrize("interleave", ["bil", "bip", "bsq"])
+@pytest.mark.parametrize("big_endian", [False, True])
+def test_written_files_are_what_another_reader_takes_them_for(
+    tmp_path: Path, interleave: Any, big_endian: bool
+) -> None:
+    """SPy reads the numbers, the dark frame and the wavelengths of an exported cube."""
+    envi = pytest.importorskip("spectral.io.envi")
+    cube = write_raw(tmp_path / "raw", simulated(), FULL)
+    header = write_recorded_files(cube, tmp_path / "files", interleave=interleave, big_endian=big_endian)
+    found = envi.open(str(header))
+    np.testing.assert_array_equal(found.open_memmap(interleave="bip"), cube.read())
+    np.testing.assert_array_equal(found.bands.centers, cube.wavelength_nm)
+    dark = envi.open(str(tmp_path / "files" / "scan-0.dark.hdr"))
+    np.testing.assert_array_equal(dark.open_memmap(interleave="bip")[0], cube.references.dark)
+
+
+def test_raw_cubes_of_a_folder_a_store_and_an_archive(tmp_path: Path, archive: Archive) -> None:
+    """Raw cubes are found in a capture's folder, singly, and by the newest or a named run; lines read singly too."""
+    source = simulated()
+    runs, cubes = [], []
+    for number, sweep in enumerate((FULL, COARSE)):
+        build = partial(write_raw, source=source, sweep=sweep)
+        ref, _ = archive.produce("capture", build, version=1, params={"n": number})
+        with archive.new_run("field") as draft:
+            draft.write_file("receipt.json", json.dumps({"products": {"raw_coarse": ref.uri}}))
+        runs.append(draft.published)
+        cubes.append(open_raw_cube(ref.path / f"{sweep.name}.zarr"))
+    full, coarse = cubes
+    store = Path(str(full.group.store_path).removeprefix("file://")).parent
+    for address, cube in (
+        (store, full),
+        (store / "scan-0.zarr", full),
+        (runs[0], full),
+        (runs[1], coarse),
+        (archive.root, coarse),
+    ):
+        recording = open_recording(address, CAMERA)
+        assert_is_recording_of(recording.sweeps[0], cube)
+        numbers = np.array([0, 3, 17])
+        np.testing.assert_array_equal(recording.sweeps[0].read_lines(numbers), cube.read()[numbers])
+    with pytest.raises(SettingsError, match=r"--dark is for files, and .* holds raw cubes"):
+        open_recording(store, CAMERA, RecordedWith(dark=store))
+    with pytest.raises(ArchiveError, match=f"has no run 'x'; its latest are {runs[0].name}, {runs[1].name}"):
+        open_recording(archive.root / "runs" / "x", CAMERA)
+    archive.clear(archive.ref("capture", store.name))
+    with pytest.raises(IncompleteStoreError, match="were cleared away"):
+        open_recording(runs[0], CAMERA)
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> Path:
+    """A folder with one cube of 80 lines as ENVI, with pointing and frames."""
+    write_recorded_files(write_raw(tmp_path / "raw", simulated(), FULL), tmp_path / "files")
+    return tmp_path / "files"
+
+
+def test_frames_that_are_not_there_are_assumed_and_said(files: Path) -> None:
+    """Without dark and white frames a dark level of 0 and full scale are taken, and notes say so."""
+    for kind in ("dark", "white", "bad"):
+        (files / f"scan-0.{kind}.hdr").unlink()
+    recording = open_recording(files, CAMERA)
+    known = recording.sweeps[0].references
+    assert (known.dark.max(), known.white.min(), known.white.max(), known.panel.tolist()) == (0, 4095, 4095, [1, 1, 1])
+    assert any("has no dark frame: a dark level of 0 is assumed" in note for note in recording.notes)
+    assert any(
+        "full scale (4095 DN) is assumed to be white, and values are relative" in note for note in recording.notes
+    )
+
+
+def test_frames_that_are_given_win(files: Path, tmp_path: Path) -> None:
+    """A frame by flag is taken instead of the one beside the cube; one of other samples is refused."""
+    np.save(tmp_path / "dark.npy", np.full((64, 3), 7.0))
+    recording = open_recording(files, CAMERA, RecordedWith(dark=tmp_path / "dark.npy"))
+    assert recording.sweeps[0].references.dark.tolist() == np.full((64, 3), 7.0).tolist()
+    np.save(tmp_path / "small.npy", np.zeros((50, 3)))
+    with pytest.raises(SceneError, match=r"small.npy is \(50, 3\) \(sample, band\), the cube \(64, 3\)"):
+        open_recording(files, CAMERA, RecordedWith(white=tmp_path / "small.npy"))
+
+
+def test_a_cube_without_pointing_is_an_even_straight_scan(files: Path) -> None:
+    """Lines lie one pixel apart through the centre, parallel, and the notes say what was assumed."""
+    (files / "scan-0.pointing.csv").unlink()
+    recording = open_recording(files, CAMERA)
+    sweep = recording.sweeps[0]
+    assert replace(sweep.sweep, name="") == Sweep("", "fine", "x", 0.0, -39.5, 80)
+    seen = direction_to_scene(position_to_direction(sweep.position)) / recording.camera.ifov_rad
+    np.testing.assert_allclose(seen, np.stack([np.zeros(80), np.arange(80) - 39.5], axis=-1), atol=1e-6)
+    assert "scan-0 has no pointing: taken as an even straight scan along y with one pixel a line" in recording.notes
+    assert any("nothing says when lines were taken: one every 100 ms is assumed" in note for note in recording.notes)
+    assert (recording.has_mirror, recording.source().field_shape) == (False, (80, 64))
+
+
+@pytest.mark.parametrize(
+    ("column", "values", "pixel_m", "distance"),
+    [
+        ("position_px", np.arange(80) * 2.0 + 7, None, 2.0),
+        ("position_m", np.arange(80) * -0.05, None, 1.0),
+        ("position_m", np.arange(80) * 0.05, 0.1, 0.5),
+    ],
+)
+def test_a_scan_without_a_mirror_by_its_positions(
+    files: Path, tmp_path: Path, column: str, values: NDArray[np.float64], pixel_m: float | None, distance: float
+) -> None:
+    """Stage, conveyor or drone: places in px as they are, in metres by the pixel's size, or by the lines' distance."""
+    table = tmp_path / "stage.csv"
+    table.write_text(column + "\n" + "".join(f"{value!r}\n" for value in values.tolist()))
+    recording = open_recording(files, CAMERA, RecordedWith(pointing=table, pixel_m=pixel_m))
+    sweep = recording.sweeps[0]
+    seen = direction_to_scene(position_to_direction(sweep.position)) / recording.camera.ifov_rad
+    expected = (np.arange(80) - 39.5) * distance * (1 if values[1] > values[0] else -1)
+    np.testing.assert_allclose(seen[:, 1], expected, atol=1e-6)
+    assert sweep.sweep.step == max(round(distance), 1)
+    said = any("a pixel is taken to be as long as lines are apart, 0.05 m" in note for note in recording.notes)
+    assert said == (column == "position_m" and pixel_m is None)
+
+
+def test_a_table_cuts_one_cube_into_sweeps(files: Path, tmp_path: Path) -> None:
+    """Forward and backward ways of one cube become two sweeps; lines of neither are left out."""
+    cube = open_raw_cube(tmp_path / "raw" / "scan-0.zarr")
+    rows = ["mirror_x,mirror_y,sweep"]
+    for number in range(80):
+        x, y = cube.position[number if number < 42 else 80 - number].tolist()
+        rows.append(f"{x!r},{y!r},{'there' if number < 40 else '' if number < 42 else 'back'}")
+    (tmp_path / "turns.csv").write_text("\n".join(rows))
+    there, back = open_recording(files, CAMERA, RecordedWith(pointing=tmp_path / "turns.csv")).sweeps
+    assert (there.sweep.name, there.sweep.lines, there.sweep.start_px) == ("there", 40, -39.5)
+    assert (back.sweep.name, back.sweep.lines, back.sweep.start_px) == ("back", 38, -38.5)
+    np.testing.assert_array_equal(back.read(0, 38), cube.read(42, 80))
+
+
+def test_a_played_vector_beside_a_cube(files: Path) -> None:
+    """80 cells at the camera's rate place each line in its own cell."""
+    table = (files / "scan-0.pointing.csv").read_text().splitlines()[1:]
+    cells = [[float(word) for word in row.split(",")[2:4]] for row in table]
+    (files / "scan-0.pointing.csv").unlink()
+    np.savetxt(files / "path.csv", np.array(cells), delimiter=",", fmt="%.17g")
+    (files / "scan-0.pointing.toml").write_text('vector = "path.csv"\nrate_hz = 10\n')
+    recording = open_recording(files, CAMERA)
+    np.testing.assert_array_equal(recording.sweeps[0].position, cells)
+    assert recording.sweeps[0].valid_line.all()
+
+
+def test_the_widest_cube_says_the_samples_and_the_numbers_the_bits(tmp_path: Path) -> None:
+    """A cube of 64 samples up to 40000 DN gives a camera of 64 samples and 16 bits, whatever the default says."""
+    write_envi_cube(tmp_path / "a", np.full((6, 64, 3), 40000, "<u2"))
+    recording = open_recording(tmp_path / "a.hdr")
+    assert (recording.camera.samples, recording.camera.bits) == (64, 16)
+    assert any("numbers reach 40000, so 16 bits are taken" in note for note in recording.notes)
+
+
+def write_envi_cube(stem: Path, values: NDArray[Any], ending: str = "", **fields: object) -> None:
+    """An ENVI cube in BIL with a header of given fields."""
+    lines, samples, bands = values.shape
+    code = {"u2": 12, "u1": 1, "i2": 2, "f4": 4}[values.dtype.str[1:]]
+    said: dict[str, object] = {
+        "samples": samples,
+        "lines": lines,
+        "bands": bands,
+        "data type": code,
+        "interleave": "bil",
+        "byte order": 0,
+        "wavelength units": "nm",
+        "wavelength": "{" + ", ".join(str(500 + 100 * band) for band in range(bands)) + "}",
+    }
+    said |= {key.replace("_", " "): one for key, one in fields.items()}
+    text = "".join(f"{key} = {value}\n" for key, value in said.items() if value is not None)
+    stem.with_name(stem.name + ".hdr").write_text("ENVI\n" + text)
+    stem.with_name(stem.name + ending).write_bytes(values.transpose(0, 2, 1).tobytes())
+
+
+VALUES = np.random.default_rng(0).integers(100, 4000, (6, 16, 3)).astype("<u2")
+
+
+@pytest.mark.parametrize(
+    ("write", "error", "message"),
+    [
+        (lambda stem: write_envi_cube(stem, VALUES, interleave=None), SceneError, "no interleave, expected one of bil"),
+        (lambda stem: write_envi_cube(stem, VALUES, interleave="bpl"), SceneError, "interleave = 'bpl', expected one"),
+        (
+            lambda stem: write_envi_cube(stem, VALUES, ".bip"),
+            SceneError,
+            "says interleave = bil, and the name of cube.bip says bip; correct the header, or rename the file",
+        ),
+        (lambda stem: write_envi_cube(stem, VALUES, byte_order=1), SceneError, "has the wrong byte order: 9"),
+        (
+            lambda stem: write_envi_cube(stem, VALUES, wavelength=None),
+            WavelengthError,
+            "has 3 bands and nothing says their wavelengths; give --wavelengths in nm",
+        ),
+        (
+            lambda stem: write_envi_cube(stem, VALUES.astype("<f4")),
+            SceneError,
+            "holds float32, expected a camera's own numbers",
+        ),
+        (
+            lambda stem: write_envi_cube(stem, VALUES.astype("<i2") - np.int16(2000)),
+            SceneError,
+            "expected a camera's own numbers from 0",
+        ),
+    ],
+)
+def test_a_cube_that_cannot_be_used_says_why(
+    tmp_path: Path, write: Callable[[Path], None], error: type[PipelineError], message: str
+) -> None:
+    """Interleave, byte order, wavelengths and types: each fault has its own message."""
+    write(tmp_path / "cube")
+    with pytest.raises(error) as caught:
+        open_recording(tmp_path / "cube.hdr")
+    assert message in str(caught.value)
+
+
+def test_a_cube_that_is_cut_off_keeps_its_whole_lines(tmp_path: Path) -> None:
+    """Lines that the header promises and the file lacks are not valid, and a note counts them."""
+    write_envi_cube(tmp_path / "cube", VALUES)
+    content = (tmp_path / "cube").read_bytes()
+    (tmp_path / "cube").write_bytes(content[: len(content) * 2 // 3 - 1])
+    recording = open_recording(tmp_path / "cube")
+    assert recording.sweeps[0].valid_line.tolist() == [True, True, True, False, False, False]
+    assert "cube is cut off: 3 of 6 lines are whole" in recording.notes
+    np.testing.assert_array_equal(recording.sweeps[0].read(0, 3), VALUES[:3])
+
+
+def test_wavelengths_can_be_stated(tmp_path: Path) -> None:
+    """Those of a flag are taken where the header has none."""
+    write_envi_cube(tmp_path / "cube", VALUES, wavelength=None)
+    recording = open_recording(tmp_path / "cube", given=RecordedWith(wavelengths=[500, 600, 700]))
+    assert recording.wavelength_nm.tolist() == [500, 600, 700]
+
+
+def test_several_cubes_need_pointing_and_the_same_bands(tmp_path: Path) -> None:
+    """How cubes without pointing lie beside each other is not known, and cubes of other bands are not one recording."""
+    write_envi_cube(tmp_path / "a", VALUES)
+    write_envi_cube(tmp_path / "b", VALUES)
+    with pytest.raises(SceneError, match=r"a\.hdr has no pointing, and how 2 cubes lie beside each other is not known"):
+        open_recording(tmp_path)
+    write_envi_cube(tmp_path / "b", VALUES, wavelength="{400, 500, 600}")
+    with pytest.raises(SceneError, match=r"b\.hdr has other wavelengths than .*a\.hdr"):
+        open_recording(tmp_path)
+    write_envi_cube(tmp_path / "b", VALUES)
+    (tmp_path / "tables").mkdir()
+    with pytest.raises(SceneError, match=r"has no pointing for a; add a\.csv, or name one table for all"):
+        open_recording(tmp_path, given=RecordedWith(pointing=tmp_path / "tables"))
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_a_zarr_cube_of_anyones_is_a_recording(tmp_path: Path, version: Any) -> None:
+    """An array with wavelengths beside it is read line by line, of either version of the format."""
+    group = zarr.create_group(tmp_path / "cube.zarr", zarr_format=version)
+    group.create_array("counts", shape=VALUES.shape, dtype="uint16")[...] = VALUES
+    group.create_array("wavelength", shape=(3,), dtype="float64", attributes={"units": "nm"})[...] = [500, 600, 700]
+    recording = open_recording(tmp_path / "cube.zarr")
+    assert recording.wavelength_nm.tolist() == [500, 600, 700]
+    np.testing.assert_array_equal(recording.sweeps[0].read_lines(np.array([1, 4])), VALUES[[1, 4]])
+
+
+def test_a_zarr_array_alone_is_a_recording_with_stated_wavelengths(tmp_path: Path) -> None:
+    """A store that is no group has no wavelengths of its own."""
+    zarr.create_array(tmp_path / "cube.zarr", shape=VALUES.shape, dtype="uint16")[...] = VALUES
+    recording = open_recording(tmp_path / "cube.zarr", given=RecordedWith(wavelengths=[500, 600, 700]))
+    np.testing.assert_array_equal(recording.sweeps[0].read(0, 6), VALUES)
+
+
+def test_addresses_without_a_recording_say_so(tmp_path: Path, archive: Archive) -> None:
+    """Nothing there, an empty folder, and an archive without runs."""
+    with pytest.raises(SceneError, match="there is no recording"):
+        open_recording(tmp_path / "none")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(SceneError, match="holds no cube; expected ENVI headers"):
+        open_recording(tmp_path / "empty")
+    (tmp_path / "stages").mkdir(exist_ok=True)
+    with pytest.raises(ArchiveError, match="no run has raw cubes; survey into the archive first"):
+        open_recording(tmp_path)
+
+
+def test_a_headwall_folder_is_a_recording(tmp_path: Path) -> None:
+    """Parts follow each other; stamps, exposures and references of the folder are taken."""
+    for first, last in ((0, 4), (4, 6)):
+        write_envi_cube(tmp_path / f"raw_{first}", VALUES[first:last])
+        text = (tmp_path / f"raw_{first}.hdr").read_text().replace("ENVI\n", "ENVI\n;Exposure (ms) = 4.0\n")
+        (tmp_path / f"raw_{first}.hdr").write_text(text)
+        rows = [f"{frame}\t{5000 + 10000 * frame}" for frame in range(first, last)]
+        (tmp_path / f"frameIndex_{first}.txt").write_text("\n".join(["Frame#\tTimestamp", *rows]))
+    write_envi_cube(tmp_path / "darkReference", np.full((2, 16, 3), 60, "<u2"))
+    write_envi_cube(tmp_path / "whiteReference", np.full((2, 16, 3), 3000, "<u2"))
+    recording = open_recording(tmp_path)
+    (sweep,) = recording.sweeps
+    np.testing.assert_array_equal(sweep.read(2, 6), VALUES[2:])
+    np.testing.assert_allclose(sweep.time_s, 0.002 + 0.01 * np.arange(6), atol=1e-12)
+    assert (sweep.exposure_ms.tolist(), recording.camera.exposure_ms) == ([4.0] * 6, 4.0)
+    assert recording.camera.frame_ms == pytest.approx(10.0)
+    assert (sweep.references.dark.min(), sweep.references.white.max()) == (60, 3000)
+    assert "frames are taken to be stamped as their exposure begins" in recording.notes
+
+
+def test_the_key_of_a_recording_is_its_content(files: Path, tmp_path: Path) -> None:
+    """It is the same under another address, and another for other numbers, pointing or frames."""
+    key = open_recording(files, CAMERA).key()
+    moved = files.rename(tmp_path / "moved")
+    assert open_recording(moved, CAMERA).key() == open_recording(moved / "scan-0.hdr", CAMERA).key() == key
+    np.save(tmp_path / "dark.npy", np.full((64, 3), 7.0))
+    keys = [key, open_recording(moved, CAMERA, RecordedWith(dark=tmp_path / "dark.npy")).key()]
+    text = (moved / "scan-0.pointing.csv").read_text()
+    (moved / "scan-0.pointing.csv").write_text(text.replace("0.05,", "0.06,", 1))
+    keys.append(open_recording(moved, CAMERA).key())
+    (moved / "scan-0.pointing.csv").write_text(text)
+    content = bytearray((moved / "scan-0.bil").read_bytes())
+    content[100] ^= 1
+    (moved / "scan-0.bil").write_bytes(content)
+    keys.append(open_recording(moved, CAMERA).key())
+    assert all(one != other for at, one in enumerate(keys) for other in keys[:at])
+    stored = [open_recording(path, CAMERA).key() for path in (tmp_path / "raw", tmp_path / "raw" / "scan-0.zarr")]
+    assert stored[0] == stored[1]
