@@ -28,10 +28,10 @@ from flows.settings.survey_settings import (
     REPLACED,
     RIG,
     RIG_FIELD,
-    SIM,
     SPARING,
     MapChoice,
     Settings,
+    source_of,
 )
 from flows.settings.values import LOOK_PART, LOOK_WHOLE, parse_moment, parse_text, to_whole, unit_guess
 from models.network.sizes import TRAINED_VGG_FROM, VGG_FROM
@@ -176,20 +176,13 @@ def _given(table: Mapping[str, object]) -> set[str]:
     return {key for key, value in table.items() if value is not None}
 
 
-def _source_of(table: Mapping[str, object]) -> object:
-    """Return where pixels come from; what is not said follows from the scene."""
-    asked, scene = table.get("source"), table.get("scene")
-    if asked not in (None, SURVEY["source"].item.default):
-        return asked
-    return SIM if scene is None or scene in (*BUILT_IN_SCENES, REMOVED_LAW) else RIG if scene == RIG_FIELD else RASTER
-
-
 def _camera_of_a_map(table: Mapping[str, object], origin: Mapping[str, str]) -> Iterator[str]:
     """Settings that only a camera has, beside a scene whose pixels are taken as they are.
 
     Those of a file that say what is the default anyway, as those of the example do, ask for nothing.
     """
-    if _source_of(table) != RASTER:
+    scene = table.get("scene") or SURVEY["scene"].item.default
+    if (table.get("source") or source_of(str(scene))) != RASTER:
         return
     view = OF_A_VIEW if table.get("pose") is not None else ()
     for name in OF_A_CAMERA:
@@ -200,7 +193,7 @@ def _camera_of_a_map(table: Mapping[str, object], origin: Mapping[str, str]) -> 
             full = key if key == name else head + key
             if one is not None and full not in view and not _is_usual(one, declared.get(key), origin.get(full)):
                 yield (
-                    f"{place_of(full, origin.get(full))} is of a camera, and the scene {table.get('scene')} is a raster"
+                    f"{place_of(full, origin.get(full))} is of a camera, and the scene {scene} is a raster"
                     " whose pixels are taken as they are: leave it out, or give --source sim to have the simulated rig"
                     " photograph the file"
                 )
@@ -215,11 +208,10 @@ def _usual_policy(table: Mapping[str, object]) -> dict[str, object]:
 def parse_settings(table: Mapping[str, object], origin: Mapping[str, str] | None = None) -> Settings:
     """Check a table of settings, with tables in it as in the file, and fill in the defaults; None means not given.
 
-    ``origin`` says where each (dotted) key came from, for the messages: a file's name or ``flag``. The source ``auto``
-    becomes what it stands for, so that receipts hold it.
+    ``origin`` says where each (dotted) key came from, for the messages: a file's name or ``flag``.
     """
     origin = origin or {}
-    settings = Settings(**_check_table({**table, "source": _source_of(table)}, SURVEY, "", origin))
+    settings = Settings(**_check_table(table, SURVEY, "", origin))
     for wrong in _wrongs(settings, origin):
         raise SettingsError(wrong)
     return settings

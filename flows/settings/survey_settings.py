@@ -58,7 +58,7 @@ SPARING = ("compute", "bytes_kept", "least_gain")  # by which a plain scan is ke
 OF_TWO_PASSES = ("budget", "coarse_exposure_ms", "policy", "threshold", "mask", "vgg")  # and of which none may
 OF_CHOOSING = ("policy", "mask", "vgg")  # but for these where a part of the scan is chosen
 PATHS = ("scene", "labels", "out", "mask", "vgg", "weights", "zones.area", "zones.no_go", "zones.plots")
-SIM, RIG, RASTER = "sim", "rig", "raster"  # where pixels come from
+AUTO, SIM, RIG, RASTER = "auto", "sim", "rig", "raster"  # where pixels come from
 # of a camera alone: tables, and settings beside them
 OF_A_CAMERA = (
     *("camera", "optics", "mirror", "detector", "air", "sky", "cost", "rig", *PLAIN, "scan_exposure_ms"),
@@ -108,6 +108,13 @@ class ZoneChoice:
     )
 
 
+def source_of(scene: str) -> str:
+    """Return where the pixels of a scene come from unless somebody says otherwise; see the setting ``source``."""
+    if scene == RIG_FIELD:
+        return RIG
+    return SIM if scene in BUILT_IN_SCENES else RASTER
+
+
 def table(about: str, make: type[Any] | None) -> Any:
     """A table of settings that stand for a part of the rig or of the map; None where there is none by default."""
     metadata = {"description": about}
@@ -116,7 +123,10 @@ def table(about: str, make: type[Any] | None) -> Any:
 
 @dataclass(frozen=True)
 class Settings:
-    """All that one survey needs to know. Made by `load_settings` or `parse_settings`: they check; this does not."""
+    """All that one survey needs to know. Made by `load_settings` or `parse_settings`: they check; this does not.
+
+    The source ``auto`` becomes what it stands for, so that receipts hold that.
+    """
 
     name: Name | None = stated(None, "What the field is called; as its scene by default", example="north")
     visit: str | None = stated(
@@ -308,6 +318,10 @@ class Settings:
         "Polygons on the field, in any CRS where the survey has a [pose] or a georeferenced scene, else in pixels.",
         ZoneChoice,
     )
+
+    def __post_init__(self) -> None:
+        if self.source == AUTO:
+            object.__setattr__(self, "source", source_of(self.scene))
 
     @property
     def plain(self) -> bool:
