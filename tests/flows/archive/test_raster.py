@@ -28,6 +28,7 @@ from pipeline.errors import PipelineError, SceneError, SettingsError
 from storage.archive.archive import Archive
 from storage.arrays.layout import KEPT_BITS
 from storage.arrays.mosaics import load_mosaic, open_patches
+from storage.readers.raster_fields import open_raster
 from storage.remote.opening import verify_archive
 from tests.conftest import RGB_NM, Survey, WeightsMaker, patchy_scene
 
@@ -335,7 +336,6 @@ def _other_crs(folder: Path, values: NDArray[Any]) -> None:
         (lambda at, v: write_tif(at / "b.tif", v, CORNER * Affine.scale(2)), r"have pixels of 0.5 x 0.5 and 1 x 1"),
         (lambda at, v: write_tif(at / "b.tif", v, CORNER * Affine.translation(8.4, 0)), r"lie 0.40 and 0.00 px"),
         (lambda at, v: write_tif(at / "b.tif", v, None), r"has no place on the earth: survey them one by one"),
-        (lambda at, v: write_tif(at / "b.tif", v[..., :2]), r"3 wavelengths? .*2|2 bands"),
     ],
 )
 def test_tiles_that_are_no_field_are_refused(
@@ -348,6 +348,15 @@ def test_tiles_that_are_no_field_are_refused(
     spoil(tmp_path / "tiles", values)
     with pytest.raises(PipelineError, match=match):
         surveyed(tmp_path / "tiles", wavelengths="640,550,460")
+
+
+def test_tiles_of_other_bands_are_refused(tmp_path: Path) -> None:
+    """A colour picture and a grey one are no field; the message names both."""
+    values = patchy_scene((16, 16), 3, seed=1)[0].astype(np.uint8)
+    write_tif(tmp_path / "a.tif", values, photometric="RGB")
+    write_tif(tmp_path / "b.tif", values[..., :1])
+    with pytest.raises(SceneError, match=r"a.tif and .*b.tif have other bands, 3 from 640.0 nm on and 1 from 550.0 nm"):
+        open_raster(tmp_path)
 
 
 def test_a_glob_without_a_file_is_refused(surveyed: Raster, tmp_path: Path) -> None:
