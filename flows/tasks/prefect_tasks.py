@@ -33,8 +33,8 @@ def inside_flow() -> bool:
 def as_task(function: Function, name: str, *, retries: int = 0) -> Function:
     """Return the function as a Prefect task where a flow runs, else as it is.
 
-    An OSError is tried again ``retries`` times, 2 s apart: a device or a disk may answer then. Other errors stand. A
-    task run is called by task and field, ``rectify-north``: by ``name`` and ``name_of_run`` of the function's first argument.
+    An OSError is tried again ``retries`` times, 2 s apart: a device or a disk may answer then. Other errors stand.
+    A task run is called by task and field, ``rectify-north``: by the ``name_of_run`` of its first argument.
     """
     return _task(function, name, retries) if inside_flow() else function
 

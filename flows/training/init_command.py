@@ -20,7 +20,8 @@ from flows.terminal.progress import StageProgress, put_out
 from pipeline.errors import SettingsError
 from pipeline.readings import MOST_VALUE
 from storage.archive.whole_files import write_whole
-from storage.readers.label_files import listed_names
+from storage.readers.label_files import is_store, listed_names
+from storage.readers.polygon_labels import is_polygon_file
 from storage.readers.raster_files import split_variable
 from storage.readers.scene_drafts import FoundClass, SceneDraft, draft_scene
 from storage.readers.scene_toml import SETTINGS_NAME
@@ -52,7 +53,7 @@ def run_init(source: str, console: Console, *, force: bool = False) -> dict[str,
     to; else as `draft_scene`.
     """
     place, _ = split_variable(source)
-    path = (place if place.is_dir() and place.suffix.lower() != ".zarr" else place.parent) / SETTINGS_NAME
+    path = (place if place.is_dir() and not is_store(place) else place.parent) / SETTINGS_NAME
     if path.exists() and not force:
         raise SettingsError(f"there is a {path} already; change it by hand, or write a new one with --force")
     with writing(path.parent, "folder"), _set_aside(path):
@@ -87,7 +88,7 @@ def scene_text(draft: SceneDraft) -> str:
         _label_lines(draft),
         _wavelength_lines(draft),
         _nodata_lines(draft),
-        _class_lines(draft.classes, draft.legend),
+        _class_lines(draft),
     ]
     return "\n\n".join("\n".join(lines) for lines in parts if lines) + "\n"
 
@@ -133,7 +134,8 @@ def _nodata_lines(draft: SceneDraft) -> list[str]:
     return lines
 
 
-def _class_lines(classes: tuple[FoundClass, ...], legend: Path | None) -> list[str]:
+def _class_lines(draft: SceneDraft) -> list[str]:
+    classes, legend = draft.classes, draft.legend
     if not classes:
         return []
     void = [one for one in classes if one.no_class]
@@ -144,7 +146,10 @@ def _class_lines(classes: tuple[FoundClass, ...], legend: Path | None) -> list[s
         for one in guess[:1]
     ]
     named = f"names from {_said(legend.name)}" if legend is not None else "rename them as you like"
-    lines += ["", f"[classes]   # name = value in the label files, share of all pixels; {named}"]
+    told = f"name = value in the label files, share of all pixels; {named}"
+    if all(is_polygon_file(label) for label in draft.files.labels.values()):
+        told = "name = number, share of the labelled pixels; polygons say the name or the number"
+    lines += ["", f"[classes]   # {told}"]
     return lines + [f"{_key(one.name)} = {_value(one)}   # {one.share:.1%}" for one in classes if one not in void[:1]]
 
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -82,6 +83,7 @@ class Raster:
     geobox: GeoBox | None = None  # where its pixels lie on the earth
     void: NDArray[np.bool_] | None = None  # (y, x) pixels that are transparent or masked: they have no value
     bad_bands: tuple[int, ...] = ()  # that the file itself calls bad, from 0
+    scaling: str = ""  # scale and offset that were applied to the file's numbers, for hashes
 
     def three_axes(self, path: Path) -> NDArray[Any]:
         """(y, x, band) values; two axes are one band (SceneError: it has others)."""
@@ -164,6 +166,47 @@ def check_numbers(kind: np.dtype[Any], where: object) -> None:
         raise SceneError(f"{where} holds complex numbers; store their magnitude")
     if kind.kind not in "buif":
         raise SceneError(f"{where} holds {kind}, expected whole or floating numbers")
+
+
+def unpacked(
+    raw: NDArray[Any], scale: float | NDArray[np.float64], offset: float | NDArray[np.float64], fill: float | None
+) -> NDArray[np.float32]:
+    """Return packed numbers (..., band) as the values that they mean: ``raw * scale + offset``, NaN where raw is fill.
+
+    Scale and offset are one number, or one for each band.
+    """
+    values = (raw * np.asarray(scale, np.float64) + offset).astype(np.float32)
+    if fill is not None:
+        values[raw == fill] = np.nan
+    return values
+
+
+def read_by_chunks(read: ReadLines, lines: int, chunk_lines: int) -> ReadLines:
+    """Return a reader that asks for whole rows of chunks and keeps the last one, so that none is unpacked twice.
+
+    It is for files whose chunks hold more lines than are asked for at a time. Threads take turns.
+    """
+    if chunk_lines <= 1:
+        return read
+    kept: dict[int, NDArray[Any]] = {}
+    lock = Lock()
+
+    def chunk(number: int) -> NDArray[Any]:
+        if number not in kept:
+            kept.clear()
+            kept[number] = read(number * chunk_lines, min((number + 1) * chunk_lines, lines))
+        return kept[number]
+
+    def read_lines(start: int, stop: int) -> NDArray[Any]:
+        """Give some lines (line, sample, band)."""
+        with lock:
+            numbers = range(start // chunk_lines, -(-stop // chunk_lines))
+            parts = [
+                chunk(number)[max(start - number * chunk_lines, 0) : stop - number * chunk_lines] for number in numbers
+            ]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    return read_lines
 
 
 def scene_lines(source: CubeSource, start: int, stop: int) -> NDArray[Any]:

@@ -17,11 +17,13 @@ from storage.readers.label_files import (
     folders_within,
     image_folder,
     is_label_name,
+    is_store,
     listed_names,
     match_folder,
     scene_entries,
 )
 from storage.readers.labels import found_classes, load_codes
+from storage.readers.polygon_labels import is_polygon_file, polygon_classes
 from storage.readers.raster_files import SCENE_ENDINGS, split_variable
 from storage.readers.scene_files import SceneFile, label_file, load_scene_file, scene_number
 from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings
@@ -63,6 +65,14 @@ class DataSet:
         settings = find_scene_settings(Path(next(iter(self.files.values()))))
         if settings.classes:
             return {}
+        polygons = [file for file in self.label_files.values() if is_polygon_file(file)]
+        if polygons and len(polygons) < len(self.label_files):
+            raise SceneError(
+                f"{self.path}: some labels are polygons ({listed_names(polygons)}) and some are pictures; name their"
+                f" classes in a {SETTINGS_NAME}, or use one kind"
+            )
+        if polygons:
+            return dict(polygon_classes(polygons, settings))
         return found_classes(self.label_files.values(), settings.unlabelled)
 
     @property
@@ -197,7 +207,7 @@ class _Scenes:
 
 def _scenes(path: str | Path, train_mask: str | Path | None) -> _Scenes:
     file, _ = split_variable(path)
-    if not file.is_dir() or file.suffix.lower() == ".zarr":
+    if not file.is_dir() or is_store(file):
         if not file.exists():
             raise SceneError(f"there is no file or folder {file}; check the name (seen from {Path.cwd()})")
         return _Scenes({file.stem: str(path)})

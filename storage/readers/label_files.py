@@ -1,8 +1,9 @@
 """Which label file belongs to which image, by their names alone, and the names of classes that lie beside label files.
 
-Labels lie beside their images (``001_mask.png``, ``field_a_labels.png``) or in a folder of labels there, or beside a
-folder of images (``labels/001.png``, ``annotations/001_annotation.png``); names are equal, or but for a word such as
-``_mask``. Upper and lower case are alike.
+Labels are pictures, or polygons where there is no picture. They lie beside their images (``001_mask.png``,
+``field_a_labels.png``, ``field_a.gpkg``) or in a folder of labels there, or beside a folder of images
+(``labels/001.png``, ``annotations/001_annotation.png``); names are equal, or but for a word such as ``_mask``. Upper
+and lower case are alike.
 
 Names of classes come as a list in a text file, as JSON, and as GDAL, QGIS and ENVI write them. Each is read leniently,
 as people write them: ``1 crop``, ``crop: 1``, ``crop, 0, 255, 0``, ``#00ff00 crop``, or names alone, in the order of
@@ -23,6 +24,7 @@ from xml.etree import ElementTree
 
 from pipeline.errors import SceneError
 from storage.readers.envi_cubes import find_envi_pair, load_envi_header
+from storage.readers.polygon_labels import POLYGON_ENDINGS
 from storage.readers.raster_files import SCENE_ENDINGS
 from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, is_image_folder
 
@@ -59,12 +61,12 @@ class MatchedFiles:
 
 
 def scene_entries(folder: Path) -> list[Path]:
-    """Files and Zarr stores of a folder that may be scenes or labels, by name; hidden ones are nobody's."""
+    """Files, Zarr stores and .SAFE folders that may be scenes or labels, by name; hidden ones are nobody's."""
     return sorted(
         entry
         for entry in folder.iterdir()
         if not entry.name.startswith(".")
-        and ((entry.suffix.lower() in SCENE_ENDINGS and entry.is_file()) or _is_store(entry))
+        and ((entry.suffix.lower() in SCENE_ENDINGS and entry.is_file()) or is_store(entry))
     )
 
 
@@ -85,7 +87,9 @@ def match_folder(folder: Path) -> MatchedFiles:
     images = [entry for entry in own if entry not in beside]
     if not images:  # a folder of labels is asked for as such: they are what there is
         images, beside = own, []
-    labels = {image: found for image in images if (found := _label_of(image, [*beside, *apart])) is not None}
+    polygons = _polygons_about(folder)
+    told = {image: _label_of(image, [*beside, *apart]) or _label_of(image, polygons) for image in images}
+    labels = {image: found for image, found in told.items() if found is not None}
     if len(images) == len([*beside, *apart]) == 1:  # they need no name to belong together
         labels = dict(zip(images, [*beside, *apart], strict=True))
     _refuse_shared(labels)
@@ -95,11 +99,12 @@ def match_folder(folder: Path) -> MatchedFiles:
 
 def find_label(scene: Path) -> Path | None:
     """The label file of one scene by its name; None where there is none (SceneError: there are several)."""
-    if not scene.parent.is_dir() or (scene.is_dir() and not _is_store(scene)):
+    if not scene.parent.is_dir() or (scene.is_dir() and not is_store(scene)):
         return None
     try:
         beside = [entry for entry in scene_entries(scene.parent) if is_label_name(entry) and entry != scene]
-        return _label_of(scene, [*beside, *_in_label_folders(scene.parent)])
+        found = _label_of(scene, [*beside, *_in_label_folders(scene.parent)])
+        return found or _label_of(scene, _polygons_about(scene.parent))
     except PermissionError:  # who may read the file need not be allowed to list the folder
         return None
 
@@ -112,7 +117,7 @@ def is_label_name(path: Path) -> bool:
 
 def folders_within(folder: Path) -> str:
     """Words for the folders of a folder in which images lie, for whoever looks for some; nothing where none does."""
-    inner = [entry for entry in sorted(folder.iterdir()) if entry.is_dir() and not _is_store(entry)]
+    inner = [entry for entry in sorted(folder.iterdir()) if entry.is_dir() and not is_store(entry)]
     found = [entry for entry in inner if not entry.name.startswith(".") and scene_entries(image_folder(entry))]
     return f"; there are some in its folders {listed_names(found)}: name one" if found else ""
 
@@ -124,15 +129,31 @@ def listed_names(paths: Iterable[Path]) -> str:
     return ", ".join(names[:SHOWN]) + more
 
 
-def _is_store(entry: Path) -> bool:
-    return entry.suffix.lower() == ".zarr" and entry.is_dir()
+def is_store(entry: Path) -> bool:
+    """Whether a folder is one scene: a Zarr store or a product of Sentinel-2."""
+    return entry.suffix.lower() in (".zarr", ".safe") and entry.is_dir()
 
 
 def _in_label_folders(folder: Path) -> list[Path]:
-    """All that may be labels in folders of labels: in this one, or beside it where it is one of images."""
+    """All pictures that may be labels in folders of labels: in this one, or beside it where it is one of images."""
+    return [entry for inner in _label_folders(folder) for entry in scene_entries(inner)]
+
+
+def _label_folders(folder: Path) -> list[Path]:
     around = [folder, folder.parent] if is_image_folder(folder) else [folder]
     found = [entry for place in around for entry in sorted(place.iterdir()) if entry.name.lower() in LABEL_FOLDERS]
-    return [entry for inner in found if inner.is_dir() and inner != folder for entry in scene_entries(inner)]
+    return [inner for inner in found if inner.is_dir() and inner != folder]
+
+
+def _polygons_about(folder: Path) -> list[Path]:
+    """Files of polygons that may be labels: in a folder, in one of labels, or beside it where it is one of images."""
+    places = [folder, *([folder.parent] if is_image_folder(folder) else []), *_label_folders(folder)]
+    return [
+        entry
+        for place in dict.fromkeys(places)
+        for entry in sorted(place.iterdir())
+        if entry.suffix.lower() in POLYGON_ENDINGS and entry.is_file() and not entry.name.startswith(".")
+    ]
 
 
 def _label_of(image: Path, candidates: Sequence[Path]) -> Path | None:

@@ -27,9 +27,9 @@ from storage.readers.label_files import (
 )
 from storage.readers.labels import Labels, load_labels
 from storage.readers.raster_files import split_variable
+from storage.readers.scan_files import reader_of
 from storage.readers.scene_files import OpenScene, open_scene_file
 from storage.readers.scene_toml import find_scene_settings
-from storage.readers.zarr_scenes import find_zarr_store
 
 if TYPE_CHECKING:
     import odc.geo.geobox as odc_geobox
@@ -71,7 +71,7 @@ def is_glob(address: str | Path) -> bool:
 def tiles_of(address: str | Path) -> tuple[str, ...]:
     """Return the files that an address stands for: itself, the images of a folder, or what a glob names, by name.
 
-    A folder that is itself a cube, a Zarr store or a Headwall camera's, stands for itself. Label files are no tiles.
+    A folder that is itself a cube (Zarr, Sentinel-2, a Headwall camera) stands for itself. Label files are no tiles.
     Raises SceneError: there is no image.
     """
     path, _ = split_variable(address)
@@ -84,7 +84,7 @@ def tiles_of(address: str | Path) -> tuple[str, ...]:
         if not found:
             raise SceneError(f"--scene {address} names no image; check the pattern (seen from {Path.cwd()})")
         return tuple(map(str, found))
-    if not path.is_dir() or find_zarr_store(path) is not None or is_headwall_folder(path):
+    if not path.is_dir() or reader_of(address) != "headwall" or is_headwall_folder(path):
         return (str(address),)
     images = match_folder(image_folder(path)).images
     if not images:

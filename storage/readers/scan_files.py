@@ -27,22 +27,24 @@ from pipeline.errors import SceneError
 from storage.arrays.georeference import ON_THE_MAP, map_attributes, write_grid_mapping
 from storage.arrays.layout import create_array, create_group, image_spec, write_bands, write_counts, write_small
 from storage.arrays.quicklooks import LineThumbnail, write_quicklook
-from storage.readers.cube_sources import BLOCK_LINES, Bands, CubeSource, LineFacts, check_cube_source
+from storage.readers.cube_sources import BLOCK_LINES, Bands, CubeSource, LineFacts, check_cube_source, read_by_chunks
 from storage.readers.envi_cubes import DATA_ENDINGS, find_envi_pair, open_envi_cube
+from storage.readers.hdf_cubes import HDF_ENDINGS, open_hdf_cube
 from storage.readers.headwall_folders import find_reference, open_envi_source, open_headwall_cube
 from storage.readers.labels import load_frame_or_raster
 from storage.readers.raster_files import (
+    ROW_ENDINGS,
     SCENE_ENDINGS,
-    TIFF_ENDINGS,
     TiffRows,
     load_raster,
     open_tiff_rows,
     split_variable,
 )
+from storage.readers.safe_products import is_safe_product, open_safe_rows
 from storage.readers.scene_toml import BandWavelengths, SceneSettings, find_scene_settings, settle_wavelengths
 from storage.readers.zarr_scenes import find_zarr_store, open_zarr_cube
 
-Reader = Literal["zarr", "headwall", "envi", "raster"]
+Reader = Literal["zarr", "headwall", "envi", "hdf", "safe", "raster"]
 
 
 def reader_of(address: str | Path) -> Reader:
@@ -52,10 +54,14 @@ def reader_of(address: str | Path) -> Reader:
     lines. Everything else, also what is not there, is for `load_raster`, which refuses what it does not know.
     """
     path, _ = split_variable(address)
+    if is_safe_product(path):
+        return "safe"
     if path.is_dir():
         return "headwall" if find_zarr_store(path) is None else "zarr"
     if path.suffix.lower() == ".hdr":
         return "envi"
+    if path.suffix.lower() in HDF_ENDINGS and path.is_file():
+        return "hdf"
     if path.suffix.lower() in SCENE_ENDINGS or not path.is_file():
         return "raster"
     beside = {path.with_name(path.name + ".hdr").name.lower(), path.with_suffix(".hdr").name.lower()}
@@ -83,6 +89,10 @@ def open_cube_source(
             found = [(kind, find_reference(path, kind)) for kind, frame in stated if frame is None]
         case "envi":
             source = open_envi_source(path)
+        case "hdf":
+            source = open_hdf_cube(path, variable)
+        case "safe":
+            source = _tiff_source(path, open_safe_rows(path, variable))
         case "raster":
             source = _raster_source(address)
     for kind, frame in (*found, *stated):
@@ -116,12 +126,12 @@ def load_frame(address: str | Path) -> tuple[NDArray[np.float32], tuple[Path, ..
     """
     path, _ = split_variable(address)
     match reader_of(address):
-        case "zarr" | "headwall":
+        case "zarr" | "headwall" | "safe":
             raise SceneError(f"{path} is a folder, expected a reference frame (ENVI or .npy); name the file")
         case "envi":
             files: tuple[Path, ...] = find_envi_pair(path)
             values = open_envi_cube(path).values
-        case "raster":
+        case "hdf" | "raster":
             values, files = load_raster(address, dims=3).values, (path,)
     if values.dtype.kind not in "uif":
         raise SceneError(f"{path} holds {values.dtype}, expected the real numbers of a reference frame")
@@ -131,7 +141,7 @@ def load_frame(address: str | Path) -> tuple[NDArray[np.float32], tuple[Path, ..
 
 def _raster_source(address: str | Path) -> CubeSource:
     path, _ = split_variable(address)
-    if path.suffix.lower() in TIFF_ENDINGS:
+    if path.suffix.lower() in ROW_ENDINGS:
         return _tiff_source(path, open_tiff_rows(path))
     raster, _ = load_frame_or_raster(address)
     values = raster.three_axes(path)
@@ -156,7 +166,7 @@ def _raster_source(address: str | Path) -> CubeSource:
 
 
 def _tiff_source(path: Path, rows: TiffRows) -> CubeSource:
-    """A TIFF as lines; of one with transparent or masked pixels they are float32, with NaN there."""
+    """A TIFF or JPEG 2000 as lines; of one with transparent or masked pixels they are float32, with NaN there."""
     starts = range(0, rows.shape[0], BLOCK_LINES)
     voids = (rows.void(start, min(start + BLOCK_LINES, rows.shape[0])) for start in starts)
     gaps = any(void is not None and bool(void.any()) for void in voids)
@@ -170,8 +180,8 @@ def _tiff_source(path: Path, rows: TiffRows) -> CubeSource:
         name=path.name,
         shape=rows.shape,
         dtype=np.dtype(np.float32) if gaps else rows.dtype,
-        read=read if gaps else rows.read,
-        files=(path,),
+        read=read_by_chunks(read if gaps else rows.read, rows.shape[0], rows.block_lines),
+        files=rows.files or (path,),
         lines=LineFacts(np.ones(rows.shape[0], np.bool_)),
         bands=_raster_bands(path, rows.assumed_nm, rows.known, rows.shape[2]),
         nodata=rows.nodata,

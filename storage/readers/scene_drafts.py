@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import PipelineError, SceneError
+from pipeline.geometry.grid import UNLABELLED
 from pipeline.readings import edge_fill
 from storage.readers.cube_sources import CubeSource
 from storage.readers.label_files import (
@@ -22,14 +23,16 @@ from storage.readers.label_files import (
     folders_within,
     image_folder,
     is_label_name,
+    is_store,
     listed_names,
     match_folder,
 )
 from storage.readers.labels import MIXED, MOST_FOUND_CLASSES, load_codes, shown_value, value_of_code
-from storage.readers.raster_files import IMAGE_ENDINGS, TIFF_ENDINGS, image_shape, open_tiff_rows, split_variable
+from storage.readers.polygon_labels import is_polygon_file, load_polygon_labels, polygon_classes
+from storage.readers.raster_files import IMAGE_ENDINGS, ROW_ENDINGS, image_shape, open_tiff_rows, split_variable
 from storage.readers.scan_files import open_cube_source
 from storage.readers.scene_files import scene_number
-from storage.readers.scene_toml import ClassValue
+from storage.readers.scene_toml import ClassValue, SceneSettings
 
 Report = Callable[[float, str], None]  # how far it is, 0..1, and at which file
 NO_CLASS = ("unlabelled", "unlabeled", "void", "ignore", "ignored", "undefined", "nodata", "no data", "none")
@@ -73,7 +76,7 @@ def draft_scene(address: str | Path, report: Report = lambda done, name: None) -
     their values are mixed.
     """
     path, _ = split_variable(address)
-    alone = not path.is_dir() or path.suffix.lower() == ".zarr"
+    alone = not path.is_dir() or is_store(path)
     if not path.exists():
         raise SceneError(f"there is no file or folder {path}; check the name (seen from {Path.cwd()})")
     found = _one_file(path) if alone else match_folder(image_folder(path))
@@ -85,7 +88,11 @@ def draft_scene(address: str | Path, report: Report = lambda done, name: None) -
     legend = find_legend([folder, *(label.parent for label in found.labels.values())], list(found.labels.values()))
     unseen: list[str] = []
     unseen += _polygons(found)
-    classes = _classes(found, source.shape, legend, unseen, report)
+    pictures = {image: label for image, label in found.labels.items() if not is_polygon_file(label)}
+    if pictures or not found.labels:
+        classes = _classes(replace(found, labels=pictures), source.shape, legend, unseen, report)
+    else:
+        classes = _polygon_classes(found, unseen, report)
     edge, missing = _look_at_edge(source)
     return SceneDraft(
         folder=folder,
@@ -110,13 +117,11 @@ def _one_file(path: Path) -> MatchedFiles:
 
 
 def _polygons(found: MatchedFiles) -> list[str]:
-    """Tell of files beside images without labels that may hold outlines, which no reader here draws."""
-    outlines = [
-        one for image in found.bare for one in map(image.with_suffix, (".json", ".xml", ".geojson")) if one.is_file()
-    ]
+    """Tell of files beside images without labels that may hold outlines in words that no reader here knows."""
+    outlines = [one for image in found.bare for one in map(image.with_suffix, (".json", ".xml")) if one.is_file()]
     if not outlines:
         return []
-    return [f"what is in {listed_names(outlines)}: outlines are no labels; draw them as pictures of the same pixels"]
+    return [f"what is in {listed_names(outlines)}: outlines are read as GeoPackage, GeoJSON or shapefile alone"]
 
 
 def _pattern(found: MatchedFiles, folder: Path) -> str | None:
@@ -181,6 +186,25 @@ def _classes(
     return tuple(classes)
 
 
+def _polygon_classes(found: MatchedFiles, unseen: list[str], report: Report) -> tuple[FoundClass, ...]:
+    """All classes of label files that are polygons, and their shares of the labelled pixels."""
+    settings, counts, readable = SceneSettings(), Counter[str](), list[Path]()
+    for number, (image, label) in enumerate(found.labels.items()):
+        report(number / len(found.labels), label.name)
+        try:
+            source = open_cube_source(image)
+            labels, _ = load_polygon_labels(label, source.shape[:2], source.geobox, settings=settings)
+        except PipelineError as error:
+            unseen.append(str(error))
+            continue
+        readable.append(label)
+        pixels = np.bincount(labels.index[labels.index != UNLABELLED], minlength=len(labels.names))
+        counts.update(dict(zip(labels.names, pixels.tolist(), strict=True)))
+    report(1.0, "")
+    values = polygon_classes(readable, settings) if readable else {}
+    return tuple(FoundClass(name, value, counts[name] / counts.total()) for name, value in values.items())
+
+
 def _refuse_mixed(label: Path, values: NDArray[np.int64], counts: NDArray[np.int64], *, is_colour: bool) -> None:
     if len(values) <= MOST_FOUND_CLASSES:
         return
@@ -203,7 +227,7 @@ def _shape(image: Path) -> tuple[int, int, int]:
     """(y, x, band) of an image, by its head where it has one."""
     if image.suffix.lower() in IMAGE_ENDINGS:
         return image_shape(image)
-    rows = open_tiff_rows(image) if image.suffix.lower() in TIFF_ENDINGS else None
+    rows = open_tiff_rows(image) if image.suffix.lower() in ROW_ENDINGS else None
     return open_cube_source(image).shape if rows is None else rows.shape
 
 

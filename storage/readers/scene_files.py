@@ -19,6 +19,7 @@ from storage.archive.staging import file_hash
 from storage.readers.cube_sources import BLOCK_LINES
 from storage.readers.label_files import find_label
 from storage.readers.labels import Labels, Layout, load_frame_or_raster, load_labels
+from storage.readers.polygon_labels import is_polygon_file, load_polygon_labels
 from storage.readers.raster_files import split_variable
 from storage.readers.scan_files import reader_of
 from storage.readers.scene_rows import SceneRows, load_scan, open_rows
@@ -31,6 +32,7 @@ from storage.readers.scene_toml import (
     settle_wavelengths,
 )
 from storage.readers.scene_values import ValueCount, as_values, bands_text
+from storage.readers.zone_files import split_layer
 
 if TYPE_CHECKING:
     from odc.geo.geobox import GeoBox
@@ -100,15 +102,15 @@ def load_scene_file(
     classes: Mapping[str, ClassValue] | None = None,
     labels_needed: bool = True,
 ) -> SceneFile:
-    """Read a scene from an image, .npy, .npz, .mat, ENVI, Zarr or a Headwall folder.
+    """Read a scene from an image, .npy, .npz, .mat, ENVI, Zarr, NetCDF, HDF5, Sentinel-2 or a Headwall folder.
 
     ``path`` may be ``FILE.mat:VARIABLE`` or ``STORE.zarr:ARRAY``, and end in a step of time, ``FILE.npy:STEP``. Axes
     are y, x, band; two axes are one band. What comes in lines with dark and white frames is taken over the white panel.
     What is given here wins over the ``scene.toml`` beside the file, and that over what the file says: a file of class
-    numbers or colours on the same pixels (frames of HyKo2 and RANUS bring their own, others are found by their names),
-    bands to use, counted from 0, and wavelengths [nm], one for each band used or for each of the file. ``classes`` are
-    those of a scene.toml that states none. Labels found by their names that cannot be used are left out with a note
-    where no ``labels_needed``. Raises SceneError: a file is missing, damaged, of a kind or shape that
+    numbers or colours on the same pixels, or of polygons (frames of HyKo2 and RANUS bring their own, others are found
+    by their names), bands to use, counted from 0, and wavelengths [nm], one for each band used or for each of the file.
+    ``classes`` are those of a scene.toml that states none. Labels found by their names that cannot be used are left out
+    with a note where no ``labels_needed``. Raises SceneError: a file is missing, damaged, of a kind or shape that
     cannot be used, or the labels do not fit. WavelengthError: wavelengths are missing, or their number, unit or range
     is wrong.
     """
@@ -214,6 +216,7 @@ class _Draft:
         widths = None if self.light.fwhm_nm is None else self.light.fwhm_nm.tolist()
         said: tuple[str, ...] = () if self.settings.nodata is None else (f"nodata {self.settings.nodata!r}",)
         said += () if self.gaps is None else (f"void {hashlib.sha256(np.packbits(self.gaps).tobytes()).hexdigest()}",)
+        said += (self.rows.scaling,) if self.rows.scaling else ()
         content = _content_hash(self.file, self.rows.files)
         light_hash = _digest(content, self.variable, self.chosen, self.light.centre_nm.tolist(), widths, *said)
         content_hash = light_hash
@@ -242,7 +245,9 @@ class _Draft:
         if self.layout is not None and by_name:
             return self.layout.labels, (self.layout.label_note,), by_name
         try:
-            return *_labels(self.file, shape, stated.labels, self.settings, stated.classes), by_name
+            return *_labels(
+                self.file, shape, self.rows.about.geobox, stated.labels, self.settings, stated.classes
+            ), by_name
         except SceneError as error:
             if stated.labels_needed or not by_name:
                 raise
@@ -319,7 +324,7 @@ def label_file(scene: Path, settings: SceneSettings) -> tuple[Path | None, str]:
         )
     told = settings.labels.replace("{number}", number or "").replace("{name}", scene.stem)
     address = settings.path.parent / told
-    if told != settings.labels and not address.is_file():
+    if told != settings.labels and not split_layer(address)[0].is_file():
         return None, f"no labels: there is no {address}"
     return address, ""
 
@@ -327,6 +332,7 @@ def label_file(scene: Path, settings: SceneSettings) -> tuple[Path | None, str]:
 def _labels(
     scene: Path,
     shape: tuple[int, int],
+    geobox: GeoBox | None,
     stated: str | Path | None,
     settings: SceneSettings,
     classes: Mapping[str, ClassValue],
@@ -334,10 +340,14 @@ def _labels(
     address, why_none = (stated, "") if stated is not None else label_file(scene, settings)
     if address is None:
         return None, (why_none,) if why_none else ()
-    found = load_labels(address, shape, classes=settings.classes or classes, unlabelled=settings.unlabelled)
+    known, notes = settings.classes or classes, tuple[str, ...]()
+    if is_polygon_file(address):
+        found, notes = load_polygon_labels(address, shape, geobox, settings=replace(settings, classes=known))
+    else:
+        found = load_labels(address, shape, classes=known, unlabelled=settings.unlabelled)
     how = f"classes from {settings.path}" if settings.classes else f"{len(found.names)} classes as found in the file"
     by_name = "" if stated is not None or settings.labels is not None else ", found by its name"
-    return found, (f"labels from {address}{by_name}, {how}", *_one_class_note(found))
+    return found, (f"labels from {address}{by_name}, {how}", *notes, *_one_class_note(found))
 
 
 def _one_class_note(found: Labels) -> tuple[str, ...]:

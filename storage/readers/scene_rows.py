@@ -12,9 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
-from storage.readers.cube_sources import BLOCK_LINES, CubeSource, Raster, check_numbers, machine_bytes, scene_lines
+from storage.readers.cube_sources import (
+    BLOCK_LINES,
+    CubeSource,
+    Raster,
+    check_numbers,
+    machine_bytes,
+    read_by_chunks,
+    scene_lines,
+)
 from storage.readers.labels import Layout, load_frame_or_raster
-from storage.readers.raster_files import TIFF_ENDINGS, TiffRows, content_guess, open_tiff_rows, split_variable
+from storage.readers.raster_files import ROW_ENDINGS, TiffRows, content_guess, open_tiff_rows, split_variable
 from storage.readers.scan_files import known_bands, open_cube_source, reader_of
 
 
@@ -27,12 +35,13 @@ class SceneRows:
     void: NDArray[np.bool_] | None  # (y, x) pixels that are transparent or masked
     about: Raster | TiffRows  # the file's words
     files: tuple[Path, ...] = ()
+    scaling: str = ""  # scale and offset that were applied, for hashes
 
     @staticmethod
     def of(raster: Raster, cube: NDArray[Any]) -> SceneRows:
         """Take the (y, x, band) numbers of a file that was read whole."""
         shape = (cube.shape[0], cube.shape[1], cube.shape[2])
-        return SceneRows(shape, lambda first, last: cube[first:last], raster.void, raster, raster.files)
+        return SceneRows(shape, lambda first, last: cube[first:last], raster.void, raster, raster.files, raster.scaling)
 
 
 def open_rows(path: str | Path) -> tuple[SceneRows, Layout | None]:
@@ -47,12 +56,14 @@ def open_rows(path: str | Path) -> tuple[SceneRows, Layout | None]:
         return SceneRows(
             source.shape, lambda first, last: scene_lines(source, first, last), None, about, source.files
         ), None
-    if file.suffix.lower() in TIFF_ENDINGS and file.is_file():
+    if file.suffix.lower() in ROW_ENDINGS and file.is_file():
         if guess := content_guess(file):
             raise SceneError(f"{file} cannot be read as {file.suffix.lower()}: {guess}")
         rows = open_tiff_rows(file)
         check_numbers(rows.dtype, file)
-        return SceneRows(rows.shape, rows.read, _void_of(rows), rows), None
+        scaling = "" if rows.scaling is None else rows.scaling.stated
+        read = read_by_chunks(rows.read, rows.shape[0], rows.block_lines)
+        return SceneRows(rows.shape, read, _void_of(rows), rows, rows.files, scaling), None
     raster, layout = load_frame_or_raster(path)
     return SceneRows.of(raster, raster.three_axes(file)), layout
 

@@ -34,6 +34,7 @@ class SceneSettings:
     nodata: float | None = None  # the number that stands for no value
     labels: str | None = None  # relative to the folder of scene.toml; may hold {number}, {name}; "": there are none
     unlabelled: ClassValue | None = None
+    class_attribute: str | None = None  # of labels that are polygons: which attribute says the class
     classes: Mapping[str, ClassValue] = field(default_factory=dict)
 
 
@@ -80,6 +81,7 @@ def load_scene_settings(path: Path) -> SceneSettings:
         dropped_bands=_value(path, content, "dropped_bands", int, whole, many=True) or (),
         nodata=None if nodata is None else float(nodata),
         labels=_value(path, content, "labels", str, "a file name in quotes", many=False),
+        class_attribute=_value(path, content, "class_attribute", str, "the name of an attribute in quotes", many=False),
         unlabelled=None if "unlabelled" not in content else _class_value(path, "unlabelled", content["unlabelled"]),
         classes=_classes(path, content.get("classes", {})),
     )

@@ -32,6 +32,17 @@ POLYGONS = ("Polygon", "MultiPolygon")
 
 
 @dataclass(frozen=True)
+class PolygonLayer:
+    """Polygons of one layer, in its order, and their attributes."""
+
+    crs: pyproj.CRS | None  # None where the file names none
+    shapes: list[BaseGeometry]  # x before y, longitude before latitude
+    rows: list[int]  # of the layer, from 0, that the polygons stand in
+    fields: dict[str, NDArray[Any]]  # attributes by name, one value a polygon
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class ZoneFile:
     """Polygons of one file, those of one name together, and what was mended of them."""
 
@@ -48,7 +59,24 @@ def read_zones(source: str, *, named_by: str | None = None) -> ZoneFile:
     are one zone. Those whose borders cross or touch themselves are mended, and a note says so. Raises ZoneError: no
     such file, layer or attribute, a file that cannot be read, or one with anything but polygons.
     """
-    path, layer = _parted(source)
+    layer = read_polygons(source)
+    called = _names(layer, named_by, source)
+    shapes: dict[str, BaseGeometry] = {}
+    for name, shape in zip(called, layer.shapes, strict=True):
+        shapes[name] = shape if name not in shapes else shapely.union(shapes[name], shape)
+    return ZoneFile(source, layer.crs, shapes, layer.notes)
+
+
+def read_polygons(source: str) -> PolygonLayer:
+    """Read the polygons of ``FILE`` or ``FILE.gpkg:LAYER`` with their attributes; ZoneError as for `read_zones`.
+
+    Polygons whose borders cross or touch themselves are mended, and a note says so; empty ones are left out.
+    """
+    path, layer = split_layer(source)
+    if path.suffix.lower() not in ZONE_ENDINGS:
+        raise ZoneError(f"{source}: expected polygons as {', '.join(ZONE_ENDINGS)}; save the layer as one of them")
+    if not path.is_file():
+        raise ZoneError(f"there is no file {path}; give the path of a file with polygons, or leave it out")
     content = _read(path, _layer_of(path, layer, source), source)
     geometry = [None if one is None else shapely.from_wkb(one) for one in content.geometry]
     rows = [number for number, one in enumerate(geometry) if one is not None and not one.is_empty]
@@ -56,20 +84,12 @@ def read_zones(source: str, *, named_by: str | None = None) -> ZoneFile:
     if kinds or not rows:
         came = " and ".join(f"{count} {kind}" for kind, count in kinds.items()) or "none"
         raise ZoneError(f"{source}: expected polygons, got {came}; draw areas, zones and plots as closed polygons")
-    called, notes = _names(content, named_by, source), []
-    shapes: dict[str, BaseGeometry] = {}
-    mended = 0
-    for number in rows:
-        shape = shapely.force_2d(geometry[number])
-        if not shape.is_valid:
-            shape, mended = polygons_of(shapely.make_valid(shape)), mended + 1
-        name = called[number]
-        shapes[name] = shape if name not in shapes else shapely.union(shapes[name], shape)
-    if mended:
-        notes.append(
-            f"{source}: the borders of {mended} of {len(rows)} polygons cross or touch themselves and were mended"
-        )
-    return ZoneFile(source, content.crs, shapes, tuple(notes))
+    shapes = [shapely.force_2d(geometry[number]) for number in rows]
+    crossed = sum(not shape.is_valid for shape in shapes)
+    shapes = [shape if shape.is_valid else polygons_of(shapely.make_valid(shape)) for shape in shapes]
+    told = f"{source}: the borders of {crossed} of {len(rows)} polygons cross or touch themselves and were mended"
+    fields = {name: column[rows] for name, column in content.fields.items()}
+    return PolygonLayer(content.crs, shapes, rows, fields, (told,) if crossed else ())
 
 
 def polygons_of(shape: BaseGeometry) -> BaseGeometry:
@@ -79,15 +99,10 @@ def polygons_of(shape: BaseGeometry) -> BaseGeometry:
     return shapely.union_all([*parts, *inner]) if len(parts) + len(inner) != 1 else (parts + inner)[0]
 
 
-def _parted(source: str) -> tuple[Path, str | None]:
-    """Path and layer of ``FILE`` or ``FILE.gpkg:LAYER``."""
-    head, mark, layer = source.rpartition(".gpkg:")
-    path = Path(f"{head}.gpkg" if mark else source)
-    if path.suffix.lower() not in ZONE_ENDINGS:
-        raise ZoneError(f"{source}: expected polygons as {', '.join(ZONE_ENDINGS)}; save the layer as one of them")
-    if not path.is_file():
-        raise ZoneError(f"there is no file {path}; give the path of a file with polygons, or leave it out")
-    return path, layer if mark else None
+def split_layer(source: str | Path) -> tuple[Path, str | None]:
+    """``FILE.gpkg:LAYER`` -> path and layer; None where none is named."""
+    head, mark, layer = str(source).rpartition(".gpkg:")
+    return Path(f"{head}.gpkg" if mark else source), layer if mark else None
 
 
 def _layer_of(path: Path, layer: str | None, source: str) -> str | None:
@@ -129,9 +144,9 @@ def _names_crs(path: Path) -> bool:
     return isinstance(content, dict) and content.get("crs") is not None
 
 
-def _names(content: _VectorLayer, named_by: str | None, source: str) -> list[str]:
+def _names(content: PolygonLayer, named_by: str | None, source: str) -> list[str]:
     """What each polygon is called."""
-    numbers = [str(number + 1) for number in range(len(content.geometry))]
+    numbers = [str(row + 1) for row in content.rows]
     by_word = {name.lower(): name for name in reversed(content.fields)}
     if named_by is not None and named_by not in content.fields:
         known = ", ".join(content.fields) or "no attribute"
@@ -139,10 +154,10 @@ def _names(content: _VectorLayer, named_by: str | None, source: str) -> list[str
     found = named_by or next((by_word[word] for word in USUAL_NAMES if word in by_word), None)
     if found is None:
         return numbers
-    return [_word(value) or number for value, number in zip(content.fields[found], numbers, strict=True)]
+    return [word_of(value) or number for value, number in zip(content.fields[found], numbers, strict=True)]
 
 
-def _word(value: object) -> str:
+def word_of(value: object) -> str:
     """An attribute as a name; empty where it says nothing."""
     if value is None or (isinstance(value, float | np.floating) and np.isnan(value)):
         return ""

@@ -119,6 +119,26 @@ def _zarr(folder: Path, version: int) -> str:
     return "a.zarr"
 
 
+def _netcdf(folder: Path, engine: Any) -> str:
+    import xarray as xr
+
+    cube = xr.DataArray(_cube(), dims=("y", "x", "wl"), name="cube").astype("i4").to_dataset()
+    packing = {"cube": {"zlib": True, "chunksizes": (10, 6, 5)}} if engine == "h5netcdf" else {}
+    cube = cube.assign_coords(wl=("wl", np.linspace(400, 800, SHAPE[2]), {"units": "nm"}))
+    cube.to_netcdf(folder / "a.nc", engine=engine, encoding=packing)
+    return "a.nc"
+
+
+def _jpeg_2000(folder: Path) -> str:
+    import rasterio
+
+    with rasterio.open(
+        folder / "a.jp2", "w", "JP2OpenJPEG", SHAPE[1], SHAPE[0], 3, dtype="uint16", QUALITY="100", REVERSIBLE="YES"
+    ) as file:
+        file.write(np.moveaxis(_cube()[..., :3], -1, 0))
+    return "a.jp2"
+
+
 FORMATS: dict[str, Callable[[Path], str]] = {
     "ENVI": _envi,
     "Headwall folder": _headwall,
@@ -137,6 +157,9 @@ FORMATS: dict[str, Callable[[Path], str]] = {
     "TIFF pages": _pages,
     "Zarr v2": lambda folder: _zarr(folder, 2),
     "Zarr v3": lambda folder: _zarr(folder, 3),
+    "NetCDF 4": lambda folder: _netcdf(folder, "h5netcdf"),
+    "NetCDF 3": lambda folder: _netcdf(folder, "scipy"),
+    "JPEG 2000": _jpeg_2000,
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
@@ -43,6 +44,8 @@ def _pictures(here: Path, picture: np.ndarray) -> None:
     (here / "empty.png").touch()
     (here / "field.jp2").write_bytes(b"\0\0\0\x0cjP  ")
     (here / "field.pdf").write_bytes(b"%PDF-1.4")
+    (here / "field.fits").write_bytes(b"SIMPLE  =                    T")
+    (here / "text.zip").write_text("this is a text\n")
     shutil.copy(here / "field.png", here / "no_ending")
     shutil.copy(here / "field.png", here / "field.tif")
     (here / "loop.png").symlink_to("loop.png")
@@ -90,6 +93,11 @@ def _arrays(here: Path, cube: np.ndarray) -> None:
 
 
 def _containers(here: Path, cube: np.ndarray) -> None:
+    with h5py.File(here / "bare.h5", "w") as file:
+        file["cube"] = cube
+    with h5py.File(here / "two.h5", "w") as file:
+        file["one"] = file["two"] = cube
+    (here / "cut.nc").write_bytes((here / "two.h5").read_bytes()[:900])
     scipy.io.savemat(here / "one_cube.mat", {"cube": cube, "wl": np.arange(5.0), "day": 130})
     scipy.io.savemat(here / "with_nm.mat", {"cube": cube, "wavelengths": [0.46, 0.55, 0.64, 0.7, 0.8]})
     scipy.io.savemat(here / "table.mat", {"X": np.ones((198, 10000), np.float32), "y": np.arange(198.0)})
@@ -114,6 +122,9 @@ def _containers(here: Path, cube: np.ndarray) -> None:
 
 
 def _texts(here: Path) -> None:
+    square = {"type": "Polygon", "coordinates": [[[0, 0], [9, 0], [9, 9], [0, 9], [0, 0]]]}
+    owned = {"type": "Feature", "properties": {"owner": "Ada"}, "geometry": square}
+    (here / "owners.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [owned]}))
     (here / "bom.toml").write_bytes(b'\xef\xbb\xbfscene = "field.png"\nweights = "w.safetensors"\nbudget = 0.8\n')
     (here / "unknown.toml").write_text('scene = "field.png"\nbuget = 0.8\n')
     (here / "broken.toml").write_text("scene = field.png\n")

@@ -249,7 +249,7 @@ def test_without_a_server_the_survey_runs_plain(
 def test_a_named_server_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     """It is named, with its address."""
     monkeypatch.setenv("PREFECT_API_URL", "http://127.0.0.1:9/api")
-    with pytest.raises(ServerUnavailable, match="no Prefect server answers at http://127.0.0.1:9/api"):  # noqa: SIM117
+    with pytest.raises(ServerUnavailable, match=r"no Prefect server answers at http://127\.0\.0\.1:9/api"):  # noqa: SIM117
         with survey_command._prefect_server(SimpleNamespace(out="x")):  # type: ignore[arg-type]
             pytest.fail("it was taken for one that answers")
 

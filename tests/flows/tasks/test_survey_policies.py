@@ -75,7 +75,7 @@ def test_every_policy_scores_the_field(archive: Path, policy: str) -> None:
     assert np.isfinite(attention.score).all()
     assert 0 < (attention.rank >= 0).sum() < attention.rank.size
     runs = [replace(run, settings=replace(run.settings, seed=seed)) for seed in (1, 2)]
-    keys = {attend.key(attend.needed(one, mosaic)) for one in runs}
+    keys = {attend.key(attend.wants(one, mosaic)) for one in runs}
     assert len(keys) == (2 if policy in SEEDED_POLICIES else 1)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import re
 import socket
 from collections.abc import Iterator
@@ -67,8 +68,8 @@ SMALL: dict[str, Any] = {
 
 
 def small_settings(out: Path, **changed: Any) -> Settings:
-    """Settings of a tiny survey."""
-    return load_settings(None, {**SMALL, "out": str(out), **changed})
+    """Settings of a tiny survey; the port is of this process, as two tests may look through rigs at a time."""
+    return load_settings(None, {**SMALL, "rig.port": f"rig-{os.getpid()}", "out": str(out), **changed})
 
 
 @contextmanager

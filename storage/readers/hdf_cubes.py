@@ -1,0 +1,353 @@
+"""Cubes out of NetCDF and HDF5 files, a few lines at a time: CF's arrays, and products of EMIT, PRISMA and NEON.
+
+h5py opens both formats. EMIT's files follow CF but for their wavelengths, which lie in a group of their own, and a list
+of good ones. NEON says scale, no-data value and place in its own words. PRISMA keeps a cube for each of its two
+spectrometers, with scale, wavelengths and place as attributes of the file. The layouts are those that the providers
+publish; no such file was at hand.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import partial
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from affine import Affine
+from numpy.typing import NDArray
+
+from pipeline.errors import SceneError
+from pipeline.lazy import deferred
+from storage.readers.cf_cubes import ArrayCube, bands_of, find_cube, line_reader, placed, spectral_names
+from storage.readers.cube_sources import (
+    BLOCK_LINES,
+    Bands,
+    CubeSource,
+    LineFacts,
+    check_claim,
+    check_memory,
+    read_by_chunks,
+    unpacked,
+)
+
+if TYPE_CHECKING:
+    import h5py
+    import odc.geo.geobox as odc_geobox
+    import xarray as xr
+    from odc.geo.geobox import GeoBox
+else:
+    h5py = deferred("h5py")
+    odc_geobox = deferred("odc.geo.geobox")
+    xr = deferred("xarray")
+
+HDF_ENDINGS = (".nc", ".nc4", ".h5", ".hdf5", ".he5")
+GOOD_BANDS = ("good_wavelengths", "good_bands", "bbl")  # 0 marks a bad band
+NO_UNIT = ("", "1", "unitless", "none", "dimensionless")
+_CLASSIC = b"CDF"  # how NetCDF files of version 3 begin
+_ONLY_A_DIMENSION = "This is a netCDF dimension but not a netCDF variable"
+_NEON_SCALES = ("Scale_Factor", "Scale Factor")  # what values are divided by, where CF's scale_factor multiplies
+_NEON_VOID = ("Data_Ignore_Value", "data ignore value")
+_PRISMA = "HDFEOS/SWATHS/PRS_L2{}_HCO/Data Fields/{}_Cube"
+_PRISMA_LEVELS, _PRISMA_PARTS = "DCB", ("Vnir", "Swir")
+_PRISMA_TOP = 65535  # the number that stands for the greatest value
+
+
+@dataclass(frozen=True)
+class FileArray:
+    """One array of a file: its axes, attributes, and what reads a part of it."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    attrs: Mapping[str, Any]
+    get: Callable[[Any], NDArray[Any]] = field(repr=False)
+    chunks: tuple[int, ...] | None = None
+
+    @property
+    def ndim(self) -> int:
+        return len(self.shape)
+
+    def __getitem__(self, part: Any) -> NDArray[Any]:
+        return self.get(part)
+
+
+def open_hdf_cube(path: Path, variable: str | None = None) -> CubeSource:
+    """Open one array of a NetCDF or HDF5 file as a cube; nothing but attributes and coordinates is read yet.
+
+    ``variable`` names the array, by its name alone or with its groups (``SERC/Reflectance/Reflectance_Data``), and may
+    end in a step of time. Raises SceneError: the file is damaged, has no such array or several, or axes that are not
+    y, x and band.
+    """
+    with _named(path):
+        arrays, attributes = _classic_arrays(path) if _is_classic(path) else _hdf_arrays(path)
+        level = next((one for one in _PRISMA_LEVELS if _PRISMA.format(one, "VNIR") in arrays), None)
+        if level is not None and variable is None:
+            return _prisma_cube(path, level, arrays, attributes)
+        if any(name.startswith("HDFEOS/SWATHS/PRS_") for name in arrays):
+            what = "is a PRISMA product of level 1" if level is None else f"has {variable} as a part of one cube"
+            raise SceneError(
+                f"{path} {what}, which is not read; give a product of level 2B, 2C or 2D by its name alone, and --bands"
+                " for some of its bands"
+            )
+        cube = find_cube(arrays, variable, path)
+        near = _in_scope(arrays, cube.name)
+        for name in spectral_names(arrays) | {dim for dim in cube.dims if dim in near}:
+            _check_array(path, name, (arrays | near)[name], lines=None)
+        return _array_source(path, cube, near, {**attributes, **cube.array.attrs})
+
+
+def _array_source(path: Path, cube: ArrayCube, arrays: Mapping[str, Any], about: Mapping[str, Any]) -> CubeSource:
+    """A cube as lines, with all that the arrays beside it say."""
+    lines, _, count = cube.shape
+    chunk = 1 if cube.array.chunks is None else cube.array.chunks[cube.order[0]]
+    _check_array(path, cube.name, cube.array, lines=(cube.order[0], max(chunk, BLOCK_LINES)))
+    read, kind, fill = line_reader(cube, lambda: _named(path))
+    unit = str(about.get("units", "")).strip()
+    source = CubeSource(
+        name=path.name,
+        shape=cube.shape,
+        dtype=kind,
+        read=read_by_chunks(read, lines, chunk),
+        files=(path,),
+        lines=LineFacts(np.ones(lines, np.bool_)),
+        bands=bands_of(cube, arrays),
+        nodata=fill,
+        bad_bands=_bad_bands(arrays, count),
+        notes=(*cube.notes, *([] if unit.lower() in NO_UNIT else [f"values are in {unit}"])),
+    )
+    source = placed(source, cube, arrays, about)
+    if source.geobox is None:
+        geobox, notes = _neon_place(arrays, cube)
+        return replace(source, geobox=geobox, notes=(*source.notes, *notes))
+    return source
+
+
+def _bad_bands(arrays: Mapping[str, Any], count: int) -> tuple[int, ...]:
+    """Bands, from 0, that a list of the file marks by 0, as EMIT's of good wavelengths does."""
+    for name, array in arrays.items():
+        if name.rpartition("/")[2].lower() in GOOD_BANDS and array.shape == (count,):
+            return tuple(int(band) for band in np.flatnonzero(array[...] == 0))
+    return ()
+
+
+def _neon_place(arrays: Mapping[str, Any], cube: ArrayCube) -> tuple[GeoBox | None, tuple[str, ...]]:
+    """The place by NEON's map info and EPSG code; else a note where the file has a place that is not read."""
+    rows, columns, _ = cube.shape
+    folder = f"{cube.name.rpartition('/')[0]}/Metadata/Coordinate_System"
+    if f"{folder}/Map_Info" in arrays and f"{folder}/EPSG Code" in arrays:
+        told = [_text(arrays[f"{folder}/{name}"][()]) for name in ("Map_Info", "EPSG Code")]
+        try:
+            words = [word.strip() for word in told[0].split(",")]
+            x, y, east, north, wide, high = map(float, words[1:7])
+            if any(word.lower().startswith("rotation") and float(word.partition("=")[2]) for word in words):
+                raise ValueError("it is turned")
+            corner = Affine(wide, 0, east - (x - 1) * wide, 0, -high, north + (y - 1) * high)
+            return odc_geobox.GeoBox((rows, columns), corner, f"EPSG:{int(told[1])}"), ()
+        except Exception as error:  # of PROJ, too
+            return None, (f"its place on the earth cannot be read: map info {told[0]!r}: {error}",)
+    names = {name.rpartition("/")[2].lower() for name, array in arrays.items() if array.ndim == 2}
+    if "glt_x" in names:
+        return None, (
+            "its pixels are in the sensor's own geometry and have no map grid; for a place on the earth, write it"
+            " orthorectified by its lookup table (glt_x, glt_y) first",
+        )
+    if {"lat", "latitude"} & names:
+        return None, ("its place is told by a latitude and longitude of each pixel, which are not read",)
+    return None, ()
+
+
+def _prisma_cube(path: Path, level: str, arrays: Mapping[str, FileArray], about: Mapping[str, Any]) -> CubeSource:
+    """Both cubes of a PRISMA product of level 2 as one, its used bands by ascending wavelength.
+
+    Their axes are y, band and x. Pixels that are 0 in every band lie outside the swath.
+    """
+    parts: list[tuple[FileArray, float, float]] = []
+    centres: list[float] = []
+    widths: list[float] = []
+    used: list[NDArray[np.bool_]] = []
+    for part in _PRISMA_PARTS:
+        array = arrays[_PRISMA.format(level, part.upper())]
+        _check_array(path, f"{part}_Cube", array, lines=(0, (array.chunks or (1,))[0]))
+        told = [np.asarray(about[f"List_{word}_{part}"], np.float64).ravel() for word in ("Cw", "Fwhm")]
+        if array.ndim != 3 or any(len(one) != array.shape[1] for one in told):
+            raise SceneError(
+                f"{path}: {part}_Cube has the shape {array.shape} and {len(told[0])} wavelengths, expected (y, band, x)"
+                " with one for each band; copy the file again"
+            )
+        low, high = (float(about[f"L2Scale{part}{end}"]) for end in ("Min", "Max"))
+        parts.append((array, low, (high - low) / _PRISMA_TOP))
+        centres, widths = [*centres, *told[0]], [*widths, *told[1]]
+        used += [told[0] > 0]
+    (lines, _, samples), bands = parts[0][0].shape, np.flatnonzero(np.concatenate(used))
+    if {(array.shape[0], array.shape[2]) for array, _, _ in parts} != {(lines, samples)}:
+        raise SceneError(f"{path}: the cubes {[array.shape for array, _, _ in parts]} (y, band, x) are of two sizes")
+    order = bands[np.argsort(np.array(centres)[bands], kind="stable")]
+
+    def read(start: int, stop: int) -> NDArray[Any]:
+        """Give some lines (line, sample, band)."""
+        with _named(path):
+            raw = [np.moveaxis(array[start:stop], 1, 2) for array, _, _ in parts]
+        void = np.logical_and.reduce([(block == 0).all(axis=2) for block in raw])
+        values = [unpacked(block, scale, low, None) for block, (_, low, scale) in zip(raw, parts, strict=True)]
+        lit = np.concatenate(values, axis=2)[..., order]
+        lit[void] = np.nan
+        return lit
+
+    chunk = max((array.chunks or (1,))[0] for array, _, _ in parts)
+    check_memory(path, max(chunk, BLOCK_LINES) * samples * len(centres) * 8)
+    geobox, notes = _prisma_place(about, (lines, samples)) if level == "D" else (None, ("it has no map grid",))
+    unused = len(centres) - len(order)
+    return CubeSource(
+        name=path.name,
+        shape=(lines, samples, len(order)),
+        dtype=np.dtype(np.float32),
+        read=read_by_chunks(read, lines, chunk),
+        files=(path,),
+        lines=LineFacts(np.ones(lines, np.bool_)),
+        bands=Bands(np.array(centres)[order], np.array(widths)[order], "nm", "wavelengths from List_Cw of the file"),
+        geobox=geobox,
+        notes=(f"a PRISMA product of level 2{level}; {unused} bands without a wavelength are left out", *notes),
+    )
+
+
+def _prisma_place(about: Mapping[str, Any], shape: tuple[int, int]) -> tuple[GeoBox | None, tuple[str, ...]]:
+    """The grid between the centres of the upper left and the lower right pixel."""
+    try:
+        (west, north), (east, south) = (
+            [float(about[f"Product_{corner}corner_{axis}"]) for axis in ("easting", "northing")]
+            for corner in ("UL", "LR")
+        )
+        wide, high = (east - west) / (shape[1] - 1), (north - south) / (shape[0] - 1)
+        corner = Affine(wide, 0, west - wide / 2, 0, -high, north + high / 2)
+        return odc_geobox.GeoBox(shape, corner, f"EPSG:{int(about['Epsg_Code'])}"), ()
+    except Exception as error:  # attributes may be missing or hold anything; of PROJ, too
+        return None, (f"its place on the earth cannot be read: {type(error).__name__}: {error}",)
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except SceneError:
+        raise
+    except KeyError as error:
+        raise SceneError(f"{path} lacks what products of its kind have: {error}; copy it again") from error
+    except Exception as error:  # h5py raises anything at all on damaged bytes
+        raise SceneError(
+            f"{path} cannot be read as NetCDF or HDF5: {type(error).__name__}: {error}; is it damaged? copy it again"
+        ) from error
+
+
+def _in_scope(arrays: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """All arrays by their paths; those of the array's group and of groups above by their names alone, too."""
+    groups = name.split("/")[:-1]
+    found: dict[str, Any] = {}
+    for depth in range(len(groups) + 1):
+        head = "".join(f"{group}/" for group in groups[:depth])
+        found |= {
+            other.removeprefix(head): array
+            for other, array in arrays.items()
+            if other.startswith(head) and "/" not in other.removeprefix(head)
+        }
+    return found | {other: array for other, array in arrays.items() if "/" in other}
+
+
+def _check_array(path: Path, name: str, array: FileArray, *, lines: tuple[int, int] | None) -> None:
+    """Refuse what the memory cannot hold: all of an array, or so many ``lines`` of an axis (SceneError)."""
+    part = math.prod(array.shape) * array.dtype.itemsize
+    if lines is not None and array.shape[lines[0]]:
+        part = part // array.shape[lines[0]] * min(lines[1], array.shape[lines[0]])
+    claimed = max(math.prod(array.shape), math.prod(array.chunks or ())) * array.dtype.itemsize
+    check_claim(f"{path}:{name}", claimed, path.stat().st_size)
+    check_memory(path, part + math.prod(array.chunks or ()) * array.dtype.itemsize)
+
+
+def _is_classic(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(3) == _CLASSIC
+
+
+def _classic_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
+    """Arrays and attributes of a NetCDF file of version 3, which is no HDF5.
+
+    The file is read whole: asked for more bytes than it has, it would take the memory for them first.
+    """
+    check_memory(path, 3 * path.stat().st_size)
+    data = xr.open_dataset(BytesIO(path.read_bytes()), engine="scipy", decode_cf=False)
+    arrays = {
+        str(name): FileArray(
+            one.shape,
+            one.dtype,
+            {**_plain(one.attrs), "_ARRAY_DIMENSIONS": [str(dim) for dim in one.dims]},
+            lambda part, one=one: np.asarray(one[part].values),  # type: ignore[misc]
+        )
+        for name, one in data.variables.items()
+        if one.dtype.kind in "buif"
+    }
+    return arrays, _plain(data.attrs)
+
+
+def _hdf_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
+    """Arrays of an HDF5 file by their paths, and the attributes of its root.
+
+    Only what is kept in this very file: links and virtual arrays may lead anywhere on the disk.
+    """
+    arrays: dict[str, FileArray] = {}
+
+    def visit(name: str, item: Any) -> None:
+        """Keep an array of numbers, or a single text."""
+        if not isinstance(item, h5py.Dataset) or item.external or item.is_virtual or item.shape is None:
+            return
+        about = _plain(item.attrs)
+        if str(about.get("NAME", "")).startswith(_ONLY_A_DIMENSION) or item.dtype.kind not in "buifSO":
+            return
+        if item.dtype.kind in "SO" and item.ndim:
+            return  # texts are read where they are one, as NEON's map info
+        arrays[name] = FileArray(
+            item.shape, item.dtype, {**about, **_words(about, item)}, partial(_read, path, name), item.chunks
+        )
+
+    with h5py.File(path, "r") as file:
+        file.visititems(visit)  # hard links alone
+        return arrays, _plain(file.attrs)
+
+
+def _read(path: Path, name: str, part: Any) -> NDArray[Any]:
+    with h5py.File(path, "r") as file:
+        return np.asarray(file[name][part])
+
+
+def _words(about: Mapping[str, Any], item: Any) -> dict[str, Any]:
+    """What an array says in other words than CF's: names of its axes, NEON's scale, no-data value and units."""
+    dims = [dim[0].name.removeprefix("/") if len(dim) else dim.label for dim in item.dims]
+    words: dict[str, Any] = {"_ARRAY_DIMENSIONS": dims} if any(dims) else {}
+    scale = next((about[name] for name in _NEON_SCALES if about.get(name)), None)
+    void = next((about[name] for name in _NEON_VOID if name in about), None)
+    unit = about.get("units", about.get("Units"))
+    words |= {} if scale is None else {"scale_factor": 1 / float(scale)}
+    words |= {} if void is None else {"_FillValue": float(void)}
+    return words | ({} if unit is None else {"units": unit})
+
+
+def _plain(attributes: Any) -> dict[str, Any]:
+    """Attributes as Python's own texts and numbers, lists as arrays; those that cannot be read are left out."""
+    found = {}
+    for name in attributes:
+        try:
+            value = attributes[name]
+        except Exception:  # of a type that h5py does not know
+            continue
+        if isinstance(value, np.ndarray | np.generic) and value.size == 1:
+            value = np.asarray(value).reshape(-1)[0]
+            value = value.item() if isinstance(value, np.generic) else value
+        found[str(name)] = value.decode("utf-8", "replace") if isinstance(value, bytes) else value
+    return found
+
+
+def _text(value: Any) -> str:
+    one = np.asarray(value).reshape(-1)[0]
+    return one.decode("utf-8", "replace") if isinstance(one, bytes) else str(one)

@@ -1,0 +1,310 @@
+"""NetCDF and HDF5 cubes: EMIT, PRISMA and NEON in their published layouts, CF files as xarray writes them, bad ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import rasterio
+import rioxarray  # noqa: F401 - registers the accessor that writes a place
+import xarray as xr
+from numpy.typing import NDArray
+
+from pipeline.errors import SceneError, WavelengthError
+from storage.readers.cube_sources import read_by_chunks
+from storage.readers.scan_files import open_cube_source
+from storage.readers.scene_files import load_scene_file
+
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:Use `@` matmul:PendingDeprecationWarning", "ignore:Dataset has no geotransform"
+)
+RNG = np.random.default_rng(5)
+NM = np.array([450.0, 550.0, 660.0, 800.0, 900.0])
+CUBE = RNG.integers(1, 9000, (7, 6, 5)).astype(np.int16)  # (y, x, band)
+CORNER = 400_000.0, 5_700_000.0  # upper left, of pixels of 2 m
+
+
+def emit_file(path: Path) -> NDArray[np.float32]:
+    """Write EMIT L2A reflectance: (downtrack, crosstrack, bands), and groups of wavelengths and of its lookup table."""
+    values = (CUBE / 9000).astype(np.float32)
+    values[2, 3] = -9999
+    root = xr.Dataset(
+        {"reflectance": (("downtrack", "crosstrack", "bands"), values, {"units": "unitless", "long_name": "R"})},
+        attrs={"geotransform": [10.0, 0.0005, 0.0, 50.0, 0.0, -0.0005], "spatial_ref": 'GEOGCS["WGS 84"]'},
+    )
+    bands = {
+        "wavelengths": (("bands",), NM.astype(np.float32), {"units": "nm"}),
+        "fwhm": (("bands",), np.full(5, 8.5, np.float32), {"units": "nm"}),
+        "good_wavelengths": (("bands",), np.array([1, 1, 0, 1, 1], np.float32)),
+    }
+    table = {name: (("ortho_y", "ortho_x"), np.ones((9, 9), np.int32)) for name in ("glt_x", "glt_y")}
+    tree = xr.DataTree.from_dict(
+        {"/": root, "/sensor_band_parameters": xr.Dataset(bands), "/location": xr.Dataset(table)}
+    )
+    packed = {"/": {"reflectance": {"_FillValue": np.float32(-9999), "zlib": True, "chunksizes": (4, 3, 5)}}}
+    tree.to_netcdf(path, engine="h5netcdf", encoding=packed)
+    return values
+
+
+def test_emit_reflectance(tmp_path: Path) -> None:
+    """Values, wavelengths, widths and bad bands as EMIT says them; a note says that there is no map grid."""
+    values = emit_file(tmp_path / "emit.nc")
+    source = open_cube_source(tmp_path / "emit.nc")
+    assert (source.shape, source.nodata, source.bad_bands) == ((7, 6, 5), -9999.0, (2,))
+    scene = load_scene_file(tmp_path / "emit.nc")
+    np.testing.assert_array_equal(scene.wavelength_nm, NM[[0, 1, 3, 4]])
+    assert scene.fwhm_nm is not None
+    np.testing.assert_array_equal(scene.fwhm_nm, 8.5)
+    read = xr.open_dataset(tmp_path / "emit.nc", engine="h5netcdf")["reflectance"].values
+    np.testing.assert_array_equal(scene.values, read[..., [0, 1, 3, 4]])
+    assert np.isnan(scene.values[2, 3]).all()
+    assert values[2, 3, 0] == -9999
+    assert scene.geobox is None
+    assert any("sensor's own geometry" in note for note in scene.provenance)
+
+
+def neon_file(path: Path, **about: Any) -> None:
+    """Write NEON AOP reflectance: int16 (y, x, band) without named axes, everything else below Metadata."""
+    with h5py.File(path, "w") as file:
+        data = file.create_dataset("SERC/Reflectance/Reflectance_Data", data=CUBE, chunks=(2, 2, 5))
+        data[1, 1] = -9999
+        data.attrs.update({"Scale_Factor": 10000.0, "Data_Ignore_Value": -9999.0, **about})
+        below = file.create_group("SERC/Reflectance/Metadata")
+        spectra = below.create_group("Spectral_Data")
+        spectra.create_dataset("Wavelength", data=NM).attrs["Units"] = "nanometers"
+        spectra.create_dataset("FWHM", data=np.full(5, 5.8))
+        below.create_dataset("Ancillary_Imagery/Weather_Quality_Indicator", data=np.zeros((7, 6, 3), np.uint8))
+        info = "UTM, 1.000, 1.000, 400000.00, 5700000.0, 2.0, 2.0, 32, North, WGS-84, units=Meters, 0"
+        below.create_dataset("Coordinate_System/Map_Info", data=info)
+        below.create_dataset("Coordinate_System/EPSG Code", data="32632")
+
+
+def test_neon_reflectance(tmp_path: Path) -> None:
+    """Divided by its scale, without the number for no data, on the grid of its map info."""
+    neon_file(tmp_path / "NEON_SERC.h5")
+    scene = load_scene_file(tmp_path / "NEON_SERC.h5")
+    expected = CUBE / 10000
+    expected[1, 1] = np.nan
+    np.testing.assert_allclose(scene.values, expected, rtol=1e-6)
+    np.testing.assert_array_equal(scene.wavelength_nm, NM)
+    assert scene.fwhm_nm is not None
+    assert scene.geobox is not None
+    assert scene.geobox.crs.epsg == 32632
+    assert scene.geobox.affine[:6] == (2.0, 0.0, CORNER[0], 0.0, -2.0, CORNER[1])
+    with rasterio.open(f"HDF5:{tmp_path / 'NEON_SERC.h5'}://SERC/Reflectance/Reflectance_Data") as other:
+        assert other.count == 7  # GDAL takes the first axis for bands
+        np.testing.assert_array_equal(other.read(1)[3], CUBE[0, 3])
+
+
+def prisma_file(path: Path, level: str = "D", **about: Any) -> dict[str, NDArray[np.uint16]]:
+    """Write PRISMA L2: (y, band, x) of two spectrometers, wavelengths descending, 0 for bands that are not used."""
+    cubes = {"Vnir": RNG.integers(1, 65536, (7, 4, 6)), "Swir": RNG.integers(1, 65536, (7, 3, 6))}
+    for cube in cubes.values():
+        cube[0, :, 0] = 0  # outside the swath
+    cubes["Vnir"][3, 2, 3] = 0  # a dark reading
+    said: dict[str, Any] = {
+        "List_Cw_Vnir": np.array([0, 977.4, 660.3, 450.1], np.float32),
+        "List_Fwhm_Vnir": np.array([0, 13.0, 12.0, 11.0], np.float32),
+        "List_Cw_Swir": np.array([2490.0, 943.4, 0], np.float32),
+        "List_Fwhm_Swir": np.array([9.0, 10.0, 0], np.float32),
+        **{f"L2Scale{part}{end}": value for part in ("Vnir", "Swir") for end, value in (("Min", 0.1), ("Max", 0.9))},
+        "Epsg_Code": np.int64(32632),
+        "Product_ULcorner_easting": 400_015.0,
+        "Product_ULcorner_northing": 5_699_985.0,
+        "Product_LRcorner_easting": 400_165.0,
+        "Product_LRcorner_northing": 5_699_805.0,
+    }
+    with h5py.File(path, "w") as file:
+        for part, cube in cubes.items():
+            file[f"HDFEOS/SWATHS/PRS_L2{level}_HCO/Data Fields/{part.upper()}_Cube"] = cube.astype(np.uint16)
+        file.attrs.update(said | about)
+    return {part: cube.astype(np.uint16) for part, cube in cubes.items()}
+
+
+def test_prisma_reflectance(tmp_path: Path) -> None:
+    """One cube of both spectrometers by ascending wavelength, scaled; corners are centres of pixels of 30 m."""
+    cubes = prisma_file(tmp_path / "PRS_L2D.he5")
+    scene = load_scene_file(tmp_path / "PRS_L2D.he5")
+    np.testing.assert_allclose(scene.wavelength_nm, [450.1, 660.3, 943.4, 977.4, 2490.0], rtol=1e-6)
+    assert scene.fwhm_nm is not None
+    np.testing.assert_allclose(scene.fwhm_nm, [11, 12, 10, 13, 9])
+    expected = np.stack([cubes["Vnir"][:, 3], cubes["Vnir"][:, 2], cubes["Swir"][:, 1], cubes["Vnir"][:, 1]], axis=-1)
+    np.testing.assert_allclose(scene.values[1:, :, :4], 0.1 + expected[1:] / 65535 * 0.8, rtol=1e-6)
+    assert np.isnan(scene.values[0, 0]).all()
+    assert scene.values[3, 3, 1] == pytest.approx(0.1)  # 0 in one band is a value
+    assert scene.geobox is not None
+    assert scene.geobox.crs.epsg == 32632
+    assert scene.geobox.affine[:6] == (30.0, 0.0, 400_000.0, 0.0, -30.0, 5_700_000.0)
+    assert "a PRISMA product of level 2D; 2 bands without a wavelength are left out" in scene.provenance
+
+
+def test_one_spectrometer_of_prisma(tmp_path: Path) -> None:
+    """Its axes are y, band and x: it is refused by its own name, and part of the whole."""
+    prisma_file(tmp_path / "PRS_L2D.he5")
+    with pytest.raises(SceneError, match="has VNIR_Cube as a part of one cube, which is not read"):
+        load_scene_file(f"{tmp_path / 'PRS_L2D.he5'}:VNIR_Cube")
+
+
+def test_prisma_in_sensor_geometry(tmp_path: Path) -> None:
+    """Level 2C has no map grid, and says so."""
+    prisma_file(tmp_path / "PRS_L2C.he5", "C")
+    assert load_scene_file(tmp_path / "PRS_L2C.he5").geobox is None
+
+
+def cf_dataset(dims: tuple[str, ...] = ("y", "x", "wl"), unit: str = "nm", scale: float = 1.0) -> xr.Dataset:
+    """Return a cube with wavelengths and a place, as rioxarray writes it."""
+    order = [("y", "x", "wl").index(dim) for dim in dims]
+    values = CUBE.transpose(order) * 0.25 + 3
+    data = xr.DataArray(values, dims=dims, name="radiance", attrs={"units": "W m-2 sr-1 um-1"}).to_dataset()
+    x, y = CORNER[0] + 1 + 2 * np.arange(6), CORNER[1] - 1 - 2 * np.arange(7)
+    data = data.assign_coords(wl=("wl", NM * scale, {"units": unit}), x=x, y=y)
+    return data.rio.write_crs(32632).rio.write_coordinate_system()
+
+
+@pytest.mark.parametrize("engine", ["h5netcdf", "scipy"])
+@pytest.mark.parametrize("dims", [("y", "x", "wl"), ("wl", "y", "x"), ("y", "wl", "x")])
+@pytest.mark.parametrize(("unit", "scale"), [("nm", 1.0), ("micrometer", 1e-3), ("m", 1e-9)])
+def test_cf_files(tmp_path: Path, engine: Any, dims: tuple[str, ...], unit: str, scale: float) -> None:
+    """Any order of axes, unit of wavelengths and version of NetCDF give one scene: packed values, place and units."""
+    path = tmp_path / "cube.nc"
+    packing = {"dtype": "i2", "scale_factor": 0.25, "add_offset": 3.0, "_FillValue": -1}
+    data = cf_dataset(dims, unit, scale)
+    data["wl"].attrs["standard_name"] = "radiation_wavelength"
+    data.to_netcdf(path, engine=engine, encoding={"radiance": packing})
+    scene = load_scene_file(path)
+    with xr.open_dataset(path, engine=engine) as read:
+        np.testing.assert_allclose(scene.values, read["radiance"].transpose("y", "x", "wl").values, rtol=1e-6)
+    np.testing.assert_allclose(scene.wavelength_nm, NM)
+    assert scene.geobox is not None
+    assert scene.geobox.crs.epsg == 32632
+    assert scene.geobox.affine[:6] == (2.0, 0.0, CORNER[0], 0.0, -2.0, CORNER[1])
+    assert "values are in W m-2 sr-1 um-1" in scene.provenance
+
+
+def test_gdal_sees_the_same_place(tmp_path: Path) -> None:
+    """GDAL's reader of NetCDF gives the CRS and the transform that the scene has."""
+    cf_dataset(("wl", "y", "x")).to_netcdf(tmp_path / "cube.nc", engine="h5netcdf")
+    scene = load_scene_file(tmp_path / "cube.nc")
+    with rasterio.open(f"netcdf:{tmp_path / 'cube.nc'}:radiance") as other:
+        assert scene.geobox is not None
+        assert other.transform.almost_equals(scene.geobox.affine)
+        assert other.crs.to_epsg() == 32632
+        np.testing.assert_array_equal(np.moveaxis(other.read(), 0, -1), scene.values)
+
+
+def test_plain_hdf5_without_names(tmp_path: Path) -> None:
+    """The axis that has as many numbers as there are wavelengths is the band; a note says which."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["cube"], file["wavelength"] = np.moveaxis(CUBE, -1, 0), NM
+    scene = load_scene_file(tmp_path / "a.h5")
+    np.testing.assert_array_equal(scene.values, CUBE)
+    assert "dims have no names, read as y, x and band: axis 0 (from 0) is band" in scene.provenance
+
+
+def test_a_step_of_time_and_a_variable_are_named(tmp_path: Path) -> None:
+    """By the address, with groups or without."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["field/one"], file["field/two"], file["wavelength"] = CUBE, CUBE + 1, NM
+        file["series/days"] = np.stack([CUBE, CUBE + 7])
+    for name, more in (("field/one", 0), ("two", 1), ("series/days:1", 7)):
+        np.testing.assert_array_equal(load_scene_file(f"{tmp_path / 'a.h5'}:{name}").values, CUBE + more)
+    with pytest.raises(
+        SceneError, match=r"several arrays .* field/one \(7, 6, 5\), field/two .*; name one: a\.h5:ARRAY"
+    ):
+        load_scene_file(tmp_path / "a.h5")
+    with pytest.raises(SceneError, match="has no array third; it has field/one"):
+        load_scene_file(f"{tmp_path / 'a.h5'}:third")
+
+
+def test_chunks_are_read_once(tmp_path: Path) -> None:
+    """Lines asked for in order are the same as all at once, and no chunk is asked for twice."""
+    asked: list[int] = []
+
+    def read(start: int, stop: int) -> NDArray[Any]:
+        asked.append(start)
+        return CUBE[start:stop]
+
+    lines = read_by_chunks(read, 7, 3)
+    np.testing.assert_array_equal(np.concatenate([lines(at, min(at + 2, 7)) for at in range(0, 7, 2)]), CUBE)
+    np.testing.assert_array_equal(lines(0, 7), CUBE)
+    assert asked == [0, 3, 6, 0, 3, 6]
+
+
+def cut(path: Path) -> None:
+    neon_file(path)
+    path.write_bytes(path.read_bytes()[:3000])
+
+
+def no_wavelengths(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        file["cube"] = CUBE
+
+
+def wrong_axes(path: Path) -> None:
+    xr.Dataset({"rain": (("level", "lat", "lon"), CUBE.astype(float))}).to_netcdf(path, engine="h5netcdf")
+
+
+def no_cube(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        file["name"] = "nothing"
+
+
+def lost_attribute(path: Path) -> None:
+    prisma_file(path)
+    with h5py.File(path, "r+") as file:
+        del file.attrs["L2ScaleSwirMax"]
+
+
+def short_list(path: Path) -> None:
+    prisma_file(path, List_Cw_Vnir=np.ones(3, np.float32))
+
+
+def level_1(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        file["HDFEOS/SWATHS/PRS_L1_HCO/Data Fields/VNIR_Cube"] = np.ones((7, 4, 6), np.uint16)
+
+
+def linked_outside(path: Path) -> None:
+    neon_file(path.with_name("other.h5"))
+    with h5py.File(path, "w") as file:
+        file["cube"] = h5py.ExternalLink("other.h5", "/SERC/Reflectance/Reflectance_Data")
+
+
+@pytest.mark.parametrize(
+    ("write", "words"),
+    [
+        (cut, r"cannot be read as NetCDF or HDF5: OSError: .*truncated.*; is it damaged\? copy it again"),
+        (lambda path: path.write_text("text"), "cannot be read as NetCDF or HDF5"),
+        (no_wavelengths, "has 5 bands and nothing says their wavelengths; give --wavelengths"),
+        (wrong_axes, r"has dims level, lat, lon; expected y, x, band \(or band, y, x\); rename them"),
+        (no_cube, "has no array of numbers with the axes y, x and band; it has none"),
+        (lost_attribute, "lacks what products of its kind have: .*L2ScaleSwirMax"),
+        (short_list, r"Vnir_Cube has the shape \(7, 4, 6\) and 3 wavelengths"),
+        (level_1, "is a PRISMA product of level 1, which is not read; give a product of level 2B, 2C or 2D"),
+        (linked_outside, "has no array of numbers with the axes y, x and band; it has none"),
+    ],
+)
+def test_bad_files_end_in_one_message(write: Any, words: str, tmp_path: Path) -> None:
+    """Damaged, empty and mistaken files, and links that lead out of the file."""
+    write(tmp_path / "bad.h5")
+    with pytest.raises((SceneError, WavelengthError), match=words):
+        load_scene_file(tmp_path / "bad.h5")
+
+
+def test_an_array_that_claims_more_than_it_holds(tmp_path: Path) -> None:
+    """A file of a few bytes that promises terabytes is refused before any of it is asked for."""
+    with h5py.File(tmp_path / "huge.h5", "w") as file:
+        file.create_dataset("cube", (1 << 20, 1 << 20, 5), "u2", chunks=(64, 64, 5))
+        file["wavelength"] = NM
+    with pytest.raises(SceneError, match=r"claims .* bytes of numbers"):
+        load_scene_file(tmp_path / "huge.h5")
+
+
+def test_a_packed_cube_is_never_a_label_file(tmp_path: Path) -> None:
+    """The message says in which formats labels are read."""
+    neon_file(tmp_path / "a.h5")
+    with pytest.raises(SceneError, match=r"is read as a scene alone; write labels"):
+        load_scene_file(tmp_path / "a.h5", labels=tmp_path / "a.h5")

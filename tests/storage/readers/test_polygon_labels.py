@@ -1,0 +1,213 @@
+"""Labels that are polygons: on a map and in pixels, in every format, found by name; one message for each mistake."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import geopandas
+import numpy as np
+import pytest
+import rasterio
+import shapely
+from affine import Affine
+
+from pipeline.errors import SceneError
+from storage.readers.datasets import load_data_set
+from storage.readers.scene_drafts import draft_scene
+from storage.readers.scene_files import load_scene_file
+
+pytestmark = pytest.mark.filterwarnings(
+    "ignore:Use `@` matmul:PendingDeprecationWarning",
+    "ignore:Dataset has no geotransform",
+    "ignore:'crs' was not provided",
+)
+PLACE = Affine(2, 0, 400_000, 0, -2, 5_700_000)
+SHAPE = 10, 12  # (y, x)
+WEST, EAST = shapely.box(400_000, 5_699_980, 400_008, 5_700_000), shapely.box(400_012, 5_699_990, 400_024, 5_700_000)
+PIXELS = shapely.box(0, 0, 4, 10), shapely.box(6, 0, 12, 5)  # the same in pixels
+NONE = 255
+TRUTH = np.full(SHAPE, NONE)
+TRUTH[:, :4], TRUTH[:5, 6:] = 1, 0
+
+
+def scene(folder: Path, name: str = "field.tif", place: Affine | None = PLACE) -> Path:
+    """Write a scene of two bands, on a map or nowhere."""
+    path = folder / name
+    path.parent.mkdir(exist_ok=True)
+    known: dict[str, Any] = {} if place is None else {"crs": "EPSG:32632", "transform": place}
+    with rasterio.open(path, "w", "GTiff", SHAPE[1], SHAPE[0], 2, dtype="uint8", **known) as file:
+        file.write(np.arange(240, dtype=np.uint8).reshape(2, *SHAPE))
+        file.descriptions = ["500 nm", "600 nm"]
+    return path
+
+
+def written(path: Path, shapes: Any = (WEST, EAST), crs: Any = 32632, layer: str | None = None, **columns: Any) -> Path:
+    """Write polygons with attributes."""
+    path.parent.mkdir(exist_ok=True)
+    columns = columns or {"crop": ["wheat", "maize"]}
+    table = geopandas.GeoDataFrame(columns, geometry=list(shapes), crs=crs)
+    table.to_file(path, engine="pyogrio", **({} if layer is None else {"layer": layer}))
+    return path
+
+
+@pytest.mark.parametrize("name", ["a.gpkg", "a.geojson", "a.shp"])
+@pytest.mark.parametrize("crs", [32632, 4326, 3857])
+def test_polygons_on_a_map(name: str, crs: int, tmp_path: Path) -> None:
+    """In whatever format and CRS, the pixels whose centres they hold have their class, and no other."""
+    table = geopandas.GeoSeries([WEST, EAST], crs=32632).to_crs(crs)
+    found = load_scene_file(scene(tmp_path), labels=written(tmp_path / "x" / name, table, crs))
+    assert found.class_names == ("maize", "wheat")
+    assert found.class_values == (1, 2)
+    np.testing.assert_array_equal(found.labels, TRUTH)
+    assert "2 polygons by their attribute crop" in found.provenance
+
+
+def test_the_same_as_rasterio(tmp_path: Path) -> None:
+    """A turned grid and slanted polygons give what rasterio's own features give."""
+    place = PLACE * Affine.rotation(20)
+    shapes = [shapely.Point(400_010, 5_699_995).buffer(6), shapely.Point(400_016, 5_699_990).buffer(5)]
+    found = load_scene_file(scene(tmp_path, place=place), labels=written(tmp_path / "a.gpkg", shapes, code=[4, 7]))
+    other = rasterio.features.rasterize(
+        zip(shapes, (0, 1), strict=True), SHAPE, fill=NONE, transform=place, dtype="uint8"
+    )
+    np.testing.assert_array_equal(found.labels, other)
+    assert found.class_names == ("class_4", "class_7")
+    assert found.class_values == (4, 7)
+
+
+def test_polygons_in_pixels(tmp_path: Path) -> None:
+    """A scene without a place takes polygons without a CRS in its pixels."""
+    shapes = [
+        {"type": "Feature", "properties": {"label": name}, "geometry": shapely.geometry.mapping(shape)}
+        for name, shape in zip(("wheat", "maize"), PIXELS, strict=True)
+    ]
+    (tmp_path / "a.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": shapes}))
+    found = load_scene_file(scene(tmp_path, place=None), labels=tmp_path / "a.geojson")
+    np.testing.assert_array_equal(found.labels, TRUTH)
+    assert "polygons are taken in pixels of the scene, x to the right and y down" in found.provenance
+
+
+def test_a_layer_is_named(tmp_path: Path) -> None:
+    """``FILE.gpkg:LAYER`` takes one of several, as a flag and in scene.toml; without it the message names them."""
+    path = written(tmp_path / "farm.gpkg", layer="crops")
+    written(path, layer="soil", soil=["clay", "sand"])
+    image = scene(tmp_path)
+    np.testing.assert_array_equal(load_scene_file(image, labels=f"{path}:crops").labels, TRUTH)
+    with pytest.raises(SceneError, match=r"has several layers; name one of crops, soil"):
+        load_scene_file(image, labels=path)
+    with pytest.raises(SceneError, match=r"has no layer 'trees'; name one of crops, soil"):
+        load_scene_file(image, labels=f"{path}:trees")
+    (tmp_path / "scene.toml").write_text('labels = "farm.gpkg:soil"\nclass_attribute = "soil"\n')
+    assert load_scene_file(image).class_names == ("clay", "sand")
+
+
+def test_classes_of_scene_toml(tmp_path: Path) -> None:
+    """Names and numbers of [classes] hold for polygons, unlabelled ones count for nothing."""
+    image = scene(tmp_path)
+    (tmp_path / "scene.toml").write_text("unlabelled = 9\n[classes]\nmaize = 3\nwheat = 1\nbarley = 2\n")
+    found = load_scene_file(image, labels=written(tmp_path / "names.gpkg"))
+    assert found.class_values == (3, 1, 2)
+    np.testing.assert_array_equal(found.labels, TRUTH)
+    found = load_scene_file(image, labels=written(tmp_path / "numbers.gpkg", code=[1, 9]))
+    np.testing.assert_array_equal(found.labels, np.where(TRUTH == 1, 1, NONE))
+    with pytest.raises(SceneError, match="have 1 polygons of crop = 'oats', which is no class"):
+        load_scene_file(image, labels=written(tmp_path / "odd.gpkg", crop=["wheat", "oats"]))
+
+
+def test_overlaps_and_gaps(tmp_path: Path) -> None:
+    """The later polygon counts, and a note says how many pixels; a polygon without a value is left out."""
+    shapes = [WEST, WEST.buffer(-2, join_style="mitre"), EAST]
+    path = written(tmp_path / "a.gpkg", shapes, crop=["wheat", "maize", None])
+    found = load_scene_file(scene(tmp_path), labels=path)
+    expected = np.where(TRUTH == 1, 1, NONE)
+    expected[1:9, 1:3] = 0
+    np.testing.assert_array_equal(found.labels, expected)
+    assert "16 px lie in polygons of several classes: the later polygon counts" in found.provenance
+    assert "1 polygons without a value of crop are left out" in found.provenance
+
+
+@pytest.mark.parametrize("name", ["field.gpkg", "field_labels.geojson", "labels/field.shp"])
+def test_labels_are_found_by_their_names(name: str, tmp_path: Path) -> None:
+    """Beside the scene under its name, with a word, or in a folder of labels; a picture comes first."""
+    image = scene(tmp_path)
+    written(tmp_path / name)
+    found = load_scene_file(image)
+    assert found.labels_found
+    np.testing.assert_array_equal(found.labels, TRUTH)
+    with rasterio.open(tmp_path / "field_mask.tif", "w", "GTiff", SHAPE[1], SHAPE[0], 1, dtype="uint8") as file:
+        file.write(np.ones((1, *SHAPE), np.uint8))
+    assert load_scene_file(image).class_names == ("class_1",)
+
+
+def test_a_folder_of_scenes(tmp_path: Path) -> None:
+    """Each scene has its own polygons; classes are those of all files by name, and init finds them with shares."""
+    for name, crops in (("a", ["wheat", "maize"]), ("b", ["maize", "oats"])):
+        scene(tmp_path, f"{name}.tif")
+        written(tmp_path / f"{name}.gpkg", crop=crops)
+    data = load_data_set(tmp_path)
+    assert data.classes == {"maize": 1, "oats": 2, "wheat": 3}
+    assert [data.load(name).class_names for name in ("a", "b")] == [("maize", "oats", "wheat")] * 2
+    assert (data.load("b").labels == 0).sum() == (TRUTH == 1).sum()
+    draft = draft_scene(tmp_path)
+    assert {one.name: (one.value, round(one.share * 140)) for one in draft.classes} == {
+        "maize": (1, 70),
+        "oats": (2, 30),
+        "wheat": (3, 40),
+    }
+    assert draft.pattern == "{name}.gpkg"
+    with rasterio.open(tmp_path / "c_mask.tif", "w", "GTiff", SHAPE[1], SHAPE[0], 1, dtype="uint8") as file:
+        file.write(np.ones((1, *SHAPE), np.uint8))
+    scene(tmp_path, "c.tif")
+    with pytest.raises(SceneError, match=r"some labels are polygons .* and some are pictures"):
+        _ = load_data_set(tmp_path).classes
+
+
+def test_unfit_labels_found_by_name_are_left_out(tmp_path: Path) -> None:
+    """A survey goes on without them, with a note."""
+    image = scene(tmp_path)
+    written(tmp_path / "field.gpkg", owner=["Ada", "Ben"])
+    found = load_scene_file(image, labels_needed=False)
+    assert found.labels is None
+    assert any(note.startswith("the labels beside the scene are left out: labels ") for note in found.provenance)
+
+
+@pytest.mark.parametrize(
+    ("shapes", "crs", "columns", "place", "words"),
+    [
+        ([shapely.Point(1, 1)] * 2, 32632, {}, PLACE, "expected polygons, got 2 Point"),
+        ((WEST, EAST), 32632, {"owner": ["a", "b"]}, PLACE, r"lack an attribute that says the class; they have owner;"),
+        ((WEST, EAST), 32632, {"crop": [None, None]}, PLACE, "say no class of any polygon"),
+        ((WEST, EAST), 32632, {}, None, r"are in WGS 84 / UTM zone 32N, and the scene does not say where it lies"),
+        ((WEST, EAST), None, {}, PLACE, "do not say their CRS; save them with one"),
+        (PIXELS, 32632, {}, PLACE, "do not lie on the scene: all polygons are within x 0 to 12, y 0 to 10 in WGS 84"),
+        ([WEST.centroid.buffer(0.1)] * 2, 32632, {}, PLACE, "no pixel's centre lies in a polygon that has a class"),
+    ],
+)
+def test_mistakes_end_in_one_message(
+    shapes: Any, crs: Any, columns: Any, place: Any, words: str, tmp_path: Path
+) -> None:
+    """Each says what is wrong with which file, and what to do."""
+    path = written(tmp_path / "labels.shp", shapes, crs, **columns)
+    with pytest.raises(SceneError, match=words):
+        load_scene_file(scene(tmp_path, place=place), labels=path)
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    """One that is missing, and one that is cut off."""
+    image = scene(tmp_path)
+    with pytest.raises(SceneError, match="there is no file"):
+        load_scene_file(image, labels=tmp_path / "none.gpkg")
+    path = written(tmp_path / "labels.gpkg")
+    path.write_bytes(path.read_bytes()[:2000])
+    with pytest.raises(SceneError, match=r"cannot read .*labels\.gpkg"):
+        load_scene_file(image, labels=path)
+
+
+def test_an_attribute_that_is_not_there(tmp_path: Path) -> None:
+    """The message lists those that are."""
+    (tmp_path / "scene.toml").write_text('class_attribute = "culture"\n')
+    path = written(tmp_path / "labels.gpkg", crop=["a", "b"], owner=["c", "d"])
+    with pytest.raises(SceneError, match="lack the attribute 'culture'; they have crop, owner; write class_attribute"):
+        load_scene_file(scene(tmp_path), labels=path)
