@@ -56,8 +56,8 @@ from pipeline.source import References
 from storage.archive.archive import Archive
 from storage.archive.keys import array_digest
 from storage.arrays.layout import AngularGrid, image_spec
-from storage.arrays.raster_work import RasterPixels
 from storage.arrays.tile_work import MosaicWork, tile_budget
+from storage.rasters.raster_work import RasterPixels
 from storage.readers.raster_files import load_raster
 from storage.readers.scene_files import OpenScene
 from storage.remote.opening import is_archive, open_archive

@@ -22,7 +22,7 @@ from storage.readers.labels import Labels, Layout, load_frame_or_raster, load_la
 from storage.readers.polygon_labels import is_polygon_file, load_polygon_labels
 from storage.readers.raster_files import split_variable
 from storage.readers.scan_files import reader_of
-from storage.readers.scene_rows import SceneRows, load_scan, open_rows
+from storage.readers.scene_rows import SceneRows, ValueCount, as_values, bands_text, load_scan, open_rows
 from storage.readers.scene_toml import (
     SETTINGS_NAME,
     BandWavelengths,
@@ -31,7 +31,6 @@ from storage.readers.scene_toml import (
     find_scene_settings,
     settle_wavelengths,
 )
-from storage.readers.scene_values import ValueCount, as_values, bands_text
 from storage.readers.zone_files import split_layer
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from pipeline.setting_fields import numbers_of
 from storage.readers.raster_tags import bad_bands
 from storage.readers.scan_files import open_cube_source, write_ingested_cube
 from storage.readers.scene_files import load_scene_file
-from storage.readers.scene_values import bands_text
+from storage.readers.scene_rows import bands_text
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:Use `@` matmul:PendingDeprecationWarning", "ignore:Dataset has no geotransform"
