@@ -109,7 +109,7 @@ class ZoneChoice:
 
 
 def source_of(scene: str) -> str:
-    """Return where the pixels of a scene come from unless somebody says otherwise; see the setting ``source``."""
+    """Return where the pixels of a scene come from by default; see the setting ``source``."""
     if scene == RIG_FIELD:
         return RIG
     return SIM if scene in BUILT_IN_SCENES else RASTER

@@ -83,7 +83,7 @@ def open_scene(settings: Settings, known: Sequence[str] | None = None) -> tuple[
 def open_map(settings: Settings, known: Sequence[str] | None = None) -> tuple[OpenScene, RasterScene, tuple[str, ...]]:
     """Open a raster whose pixels are taken as they are; its scene holds all but light, which no camera looks at.
 
-    Raises SceneError, WavelengthError: its files. Labels that nobody named count as in `open_scene`.
+    Raises SceneError, WavelengthError: its files. Labels found by their name count as in `open_scene`.
     """
     file = open_raster(settings.scene, labels=settings.labels, bands=settings.bands, wavelengths=settings.wavelengths)
     file = _judged_by_known(file, known)
@@ -113,7 +113,7 @@ Facts = TypeVar("Facts", bound=SceneFacts)
 
 
 def _judged_by_known(file: Facts, known: Sequence[str] | None) -> Facts:
-    """Leave labels out that nobody named and that have a class beside the ``known`` ones."""
+    """Leave labels out that were found by their name and have a class beside the ``known`` ones."""
     strange = [name for name in file.class_names if known is not None and name not in known]
     if not (file.labels_found and strange):
         return file
@@ -303,7 +303,7 @@ class SimulatedField:
 
 @dataclass(frozen=True)
 class TakenAsItIs:
-    """Nobody looks at a raster: its pixels are read from the file."""
+    """A raster, which no camera looks at: its pixels are read from the file."""
 
     name = RASTER
     simulates = False
