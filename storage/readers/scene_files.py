@@ -238,7 +238,7 @@ class _Draft:
         }
 
     def _labels(self) -> tuple[Labels | None, tuple[str, ...], bool]:
-        """Labels, a note of them, and whether nobody but the file's name says where they lie."""
+        """Return labels, a note of them, and whether their file was found by its name alone."""
         stated, shape = self.stated, self.rows.shape[:2]
         by_name = stated.labels is None and self.settings.labels is None
         if self.layout is not None and by_name:
