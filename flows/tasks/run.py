@@ -30,6 +30,7 @@ from flows.tasks.scene import (
     field_source,
     for_rig,
     judged_labels,
+    open_map,
     open_scene,
 )
 from flows.tasks.seat_budget import SeatBudget
@@ -56,7 +57,9 @@ from storage.archive.archive import Archive
 from storage.archive.keys import array_digest
 from storage.arrays.layout import AngularGrid, image_spec
 from storage.arrays.tile_work import MosaicWork, tile_budget
+from storage.rasters.raster_work import RasterPixels
 from storage.readers.raster_files import load_raster
+from storage.readers.scene_files import OpenScene
 from storage.remote.opening import is_archive, open_archive
 
 
@@ -130,6 +133,7 @@ class SurveyRun(CaptureRun):
     plan: CapturePlan
     scans: ScanChoice
     zones: SurveyZones  # what the survey keeps to, and plots
+    raster: RasterPixels | None = None  # the pixels of a scene that is a map already: nothing is captured of it
     budget: SeatBudget | None = None  # of seats of a plain scan, where a part of them alone is kept and read
     look: LookChoice | None = None  # the part of a remembered field that is looked at, where one was chosen
     prior: Prior | None = None  # the run whose belief is gone on from
@@ -155,9 +159,14 @@ class SurveyRun(CaptureRun):
         return {"weights": self.weights_key, **({} if self.device == PROCESSOR else {"device": self.device})}
 
     @property
+    def chooses(self) -> bool:
+        """Whether patches are chosen by their scores; where all are seen and read there is nothing to choose."""
+        return not self.plan.plain or self.budget is not None
+
+    @property
     def controls(self) -> bool:
         """Whether other placements of seats are judged too; a plain scan that is read whole places none."""
-        return self.settings.controls and (not self.plan.plain or self.budget is not None)
+        return self.settings.controls and (self.chooses or self.raster is not None)
 
     @cached_property
     def labels(self) -> NDArray[np.uint8] | None:
@@ -210,7 +219,7 @@ def _run_by(path: Path, settings: Settings, *, planning: bool, archive: Archive 
     refused = farm_refusal(settings)
     if refused is not None and not planning:
         raise SettingsError(refused)
-    scene, notes, label_notes = _scene_for(model, settings, planning=planning)
+    pixels, scene, notes, label_notes = _scene_for(model, settings, planning=planning)
     grid = SceneGrid(*scene.shape, described.config.patch, described.config.factor)
     zones = open_zones(settings, place_of_field(settings, scene), grid)
     outside = beyond_training(settings, scene, described, model.trained_on, path)
@@ -223,14 +232,21 @@ def _run_by(path: Path, settings: Settings, *, planning: bool, archive: Archive 
         found = (None, ()) if archive is None else find_prior(archive, settings, name, grid, described.class_names)
     prior = None if found is None else found[0]
     settings, look, look_notes = choose_look(settings, prior, described, path, model.reader, grid, zones.shown)
-    settings, scans = choose_plain_scan(settings, described, path, grid, len(scene.wavelength_nm), zones.shown)
-    plan = plan_capture(settings, grid, zones.shown)
+    plan, scans, raster = CapturePlan.of_map(), ScanChoice(), None
+    if pixels is None:
+        settings, scans = choose_plain_scan(settings, described, path, grid, len(scene.wavelength_nm), zones.shown)
+        plan = plan_capture(settings, grid, zones.shown)
+    else:
+        raster = RasterPixels(pixels.read, pixels.missing, len(scene.wavelength_nm), grid)
     channels = 3 if model.vgg is None else model.vgg.channels
     costs = ReadingCosts(described.config, grid, len(scene.wavelength_nm), channels)
     budget = SeatBudget.asked(settings, costs, None if zones.shares is None else zones.shares > 0)
     simulated, planned = make_source(scene, settings), (*plan.coarse, *plan.full)
     source = field_source(scene, settings, simulated, planned)
-    check_memory(settings, simulated, grid, plan)
+    if raster is None:
+        check_memory(settings, simulated, grid, plan)
+    else:
+        raster.rows_at_once(settings.memory)  # refuses memory for not one row of patches
     archive = open_archive(settings.out) if archive is None else archive
     prior, prior_notes = found or find_prior(archive, settings, name, grid, described.class_names)
     if settings.prior != AUTO:  # what is meant when it is asked for again
@@ -250,6 +266,7 @@ def _run_by(path: Path, settings: Settings, *, planning: bool, archive: Archive 
         plan=plan,
         scans=scans,
         zones=zones,
+        raster=raster,
         budget=budget,
         look=look,
         prior=prior,
@@ -263,9 +280,16 @@ def _run_by(path: Path, settings: Settings, *, planning: bool, archive: Archive 
 
 def _scene_for(
     model: SurveyModel, settings: Settings, *, planning: bool
-) -> tuple[RasterScene, tuple[str, ...], tuple[str, ...]]:
-    """Open a scene that the weights can read, drawn unless for ``planning``; what to say of it and of its labels."""
-    scene, notes = open_scene(settings, model.described.class_names)
+) -> tuple[OpenScene | None, RasterScene, tuple[str, ...], tuple[str, ...]]:
+    """Open a scene that the weights can read, drawn unless for ``planning``; what to say of it and of its labels.
+
+    The first value is the scene's file where its pixels are taken as they are.
+    """
+    pixels = None
+    if settings.is_map:
+        pixels, scene, notes = open_map(settings, model.described.class_names)
+    else:
+        scene, notes = open_scene(settings, model.described.class_names)
     if not planning:  # what the rig would find there: no stage's work
         scene.raster.drawn()
         scene.light()
@@ -273,7 +297,7 @@ def _scene_for(
     label_notes = check_labels(scene, model.described)
     if settings.mask is not None:
         check_mask(settings.mask, scene.shape)
-    return scene, notes, label_notes
+    return pixels, scene, notes, label_notes
 
 
 def make_source(scene: RasterScene, settings: Settings) -> SimulatedSource:
