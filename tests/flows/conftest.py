@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import subprocess
@@ -17,9 +16,8 @@ import pytest
 from PIL import Image
 
 from flows.cli.main import main
-from flows.schedule.served import NAMED_BY
-from flows.tasks.prefect_engine import PASSWORD, QUIET
-from flows.tasks.survey import STAGES
+from flows.tasks.local_server import QUIET, local_server
+from flows.tasks.open_survey import STAGES
 from storage.archive.archive import Archive
 from storage.remote.opening import verify_archive
 from tests.conftest import Survey
@@ -111,7 +109,7 @@ def python(code: str, *words: object, **environment: str) -> subprocess.Complete
 
 
 def act_instead(patch: pytest.MonkeyPatch, name: str, wants: Callable[..., Any]) -> None:
-    """Have a stage tell something else when it is asked what it wants."""
+    """Have a stage want something else."""
     patch.setitem(STAGES, name, replace(STAGES[name], wants=wants))
 
 
@@ -140,10 +138,16 @@ def prefect_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Prefect's files in a folder of their own. Set before any test imports it, as it reads its settings only then."""
     home = tmp_path_factory.mktemp("prefect")
     with pytest.MonkeyPatch.context() as patch:
-        known = {"PREFECT_API_AUTH_STRING": PASSWORD, "PREFECT_SERVER_API_AUTH_STRING": PASSWORD}
-        for name, value in {**QUIET, **known, "PREFECT_HOME": str(home)}.items():
+        for name, value in {**QUIET, "PREFECT_HOME": str(home)}.items():
             patch.setenv(name, value)
         yield home
+
+
+@pytest.fixture(scope="module")
+def server(prefect_home: Path) -> Iterator[str]:
+    """A Prefect server that all flows of a module share, and the address of its API."""
+    with local_server(prefect_home) as api:
+        yield api
 
 
 @pytest.fixture
@@ -164,19 +168,6 @@ def field_file(tmp_path: Path, scene_files: Path, weights: Path) -> Callable[...
         return path
 
     return write
-
-
-@pytest.fixture
-def served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
-    """Say what scheduled flows of this test may survey, as `serve` does."""
-
-    def say(*files: Path, **words: object) -> Path:
-        path = tmp_path / "served.json"
-        path.write_text(json.dumps({"files": [str(file) for file in files], "timezone": "UTC", **words}))
-        monkeypatch.setenv(NAMED_BY, str(path))
-        return path
-
-    return say
 
 
 @pytest.fixture(scope="session")

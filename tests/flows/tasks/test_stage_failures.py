@@ -25,7 +25,7 @@ from flows.schedule.serve_command import load_fields
 from flows.schedule.times import parse_timetable
 from flows.tasks import prefect_engine as engine
 from flows.tasks.stage import Stage, Wanted
-from flows.tasks.survey import STAGES
+from flows.tasks.open_survey import STAGES
 from pipeline.errors import ArchiveError, RigError
 from storage.archive.archive import Archive
 from storage.archive.ledger import Ledger
@@ -51,7 +51,7 @@ def failing(stage: str, error: Exception, tried: Callable[[], None] = lambda: No
 
     def fail(*given: Any) -> Wanted:
         tried()
-        wanted = real(*given)
+        wanted = real.wants(*given)
         if wanted is None:
             raise error
 
@@ -124,7 +124,7 @@ def counted(stage: str, builds: Counter[str]) -> Stage:
     real = STAGES[stage]
 
     def count(*given: Any) -> Wanted | None:
-        wanted = real(*given)
+        wanted = real.wants(*given)
         if wanted is None:
             return None
 

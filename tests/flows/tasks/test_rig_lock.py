@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from flows.schedule import rig_lock as schedule_lock
-from flows.schedule.rig_lock import RigLock, rig_lock
 from flows.settings.survey_settings import Settings
+from flows.tasks import rig_lock as rig_locks
+from flows.tasks.rig_lock import RigLock, rig_lock
 from pipeline.errors import ArchiveError, RigError
 from storage.archive.ledger import Ledger
 from storage.archive.staging import take_lock
@@ -26,7 +26,7 @@ import os, sys
 from dataclasses import replace
 from pathlib import Path
 os.access = lambda *given, **named: False  # /run/lock is for others
-from flows.schedule.rig_lock import rig_lock
+from flows.tasks.rig_lock import rig_lock
 from flows.settings.survey_settings import Settings
 settings = Settings()
 lock = rig_lock(replace(settings, source="rig", rig=replace(settings.rig, port=sys.argv[1])), Path())
@@ -105,18 +105,18 @@ def test_a_rig_that_cannot_be_locked_is_not_used(monkeypatch: pytest.MonkeyPatch
     def refuse(*_: object) -> None:
         raise PermissionError(1, "Operation not permitted")
 
-    monkeypatch.setattr(schedule_lock.socket, "socket", refuse)
+    monkeypatch.setattr(rig_locks.socket, "socket", refuse)
     with pytest.raises(RigError, match=r"cannot lock the rig .*: Operation not permitted; .* goes on without"):
         lock_of().take()
 
 
 def test_a_system_without_such_names_uses_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Elsewhere than on Linux a file at a fixed place is the lock, whatever TMPDIR says, and links are refused."""
-    monkeypatch.setattr(schedule_lock.sys, "platform", "darwin")
+    monkeypatch.setattr(rig_locks.sys, "platform", "darwin")
     place = lock_of("/dev/cu.usb").place
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     assert lock_of("/dev/cu.usb").place == place == Path("/tmp/spectralzoom-rig-dev-cu.usb.lock")
-    monkeypatch.setattr(schedule_lock, "FIXED_FOLDER", tmp_path)
+    monkeypatch.setattr(rig_locks, "FIXED_FOLDER", tmp_path)
     lock, other = lock_of("/dev/cu.usb"), lock_of("/dev/cu.usb")
     assert lock.take("a survey")
     assert not other.take()
