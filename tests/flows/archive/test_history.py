@@ -93,7 +93,7 @@ def test_a_report_that_cannot_be_written(
 
 
 def test_charts_and_pages_of_little(tmp_path: Path) -> None:
-    """One point is drawn too, the same points alike; a schedule that has just begun has a page; links are relative."""
+    """One point is drawn too, the same points alike; a field without a run has a page; links are relative."""
     series = {"soil": [(0.0, 1.0), (86400.0, 0.5)], "crop": [(0.0, 0.2)]}
     chart, again = line_chart(series, "Share", "%"), line_chart(series, "Share", "%")
     assert chart.drawing == again.drawing

@@ -16,7 +16,6 @@ from flows.settings.survey_settings import Settings
 from flows.tasks import rig_lock as rig_locks
 from flows.tasks.rig_lock import RigLock, rig_lock
 from pipeline.errors import ArchiveError, RigError
-from storage.archive.ledger import Ledger
 from storage.archive.staging import take_lock
 
 ROOT = Path(__file__).parents[3]
@@ -143,20 +142,17 @@ def test_what_a_lock_points_at_is_left_alone(tmp_path: Path, kind: str) -> None:
     assert not target.exists() or target.read_text() == "bytes"
 
 
-def test_locks_and_ledgers_of_an_archive_follow_no_link(tmp_path: Path) -> None:
-    """Neither a lock, nor the folder of locks, nor a field's ledger is used through a link; a FIFO is no lock file."""
+def test_locks_of_an_archive_follow_no_link(tmp_path: Path) -> None:
+    """Neither a lock nor the folder of locks is used through a link; a FIFO is no lock file."""
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
-    for name in ("linked", "piped", "schedule"):
+    for name in ("linked", "piped"):
         (tmp_path / name).mkdir()
     (tmp_path / "linked" / ".locks").symlink_to(elsewhere)
     (tmp_path / "piped" / ".locks").mkdir()
     os.mkfifo(tmp_path / "piped" / ".locks" / "use.lock")
-    (tmp_path / "schedule" / "north.jsonl").symlink_to(elsewhere / "north")
     with pytest.raises(ArchiveError, match=r"\.locks is a link, expected a folder of its own"):
         take_lock(tmp_path / "linked" / ".locks" / "use.lock")
     with pytest.raises(ArchiveError, match=r"use\.lock is no file, expected a lock file"):
         take_lock(tmp_path / "piped" / ".locks" / "use.lock")
-    with pytest.raises(ArchiveError, match="it is a link, expected a file; take it out"):
-        Ledger(tmp_path, "north").append({})
     assert list(elsewhere.iterdir()) == []

@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +19,11 @@ import pytest
 
 from flows.cli.main import main
 from flows.publish import run_folder as publish
-from flows.schedule.field_schedule import moment_words
-from flows.schedule.serve_command import load_fields
-from flows.schedule.times import parse_timetable
 from flows.tasks import prefect_engine as engine
 from flows.tasks.stage import Stage, Wanted
 from flows.tasks.open_survey import STAGES
 from pipeline.errors import ArchiveError, RigError
 from storage.archive.archive import Archive
-from storage.archive.ledger import Ledger
 from storage.arrays.class_maps import load_class_map
 from tests.flows.conftest import Ended, problems
 
@@ -250,34 +245,18 @@ def test_a_stage_that_fails_by_prefect(
     assert problems(tmp_path) == []
 
 
-def test_a_due_run_of_which_a_stage_fails(
-    server: None,
-    scene_files: Path,
-    weights: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    served: Callable[..., Path],
+def test_a_served_field_of_which_a_stage_fails(
+    server: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, field_file: Callable[..., Path]
 ) -> None:
-    """The scheduled flow ends Failed with the stage's words alone, the ledger has them, and no run is published."""
-    from flows.schedule.prefect_flows import survey_scheduled
+    """The flow ends Failed with the stage's words alone, and no run is published."""
+    from flows.settings.parameters import SurveySettings
+    from flows.survey import survey
 
-    out, file = tmp_path / "archive", tmp_path / "north.toml"
-    file.write_text(f'scene = "{scene_files / "scene.png"}"\nweights = "{weights}"\nbudget = 0.8\nout = "{out}"\n')
-    (one,) = load_fields([file])
-    due = datetime.now(UTC).replace(microsecond=0) - timedelta(seconds=1)
-    cron = {"cron": f"{due.minute} {due.hour} {due.day} {due.month} *", "timezone": "UTC"}
-    table, due = parse_timetable(cron["cron"], None, "UTC"), due.replace(second=0)
-    told = {"event": "opened", "at": moment_words(due - timedelta(minutes=1)), "late": 0.5, "pid": 1}
-    one.schedule(table, 0.5).ledger.append({**told, "schedule": table.to_dict()})
-    served(file, late=0.5, cron=cron["cron"])
+    out, file = tmp_path / "archive", field_file("north")
     with monkeypatch.context() as broken:
         broken.setitem(STAGES, "cut_patches", failing("cut_patches", refusal("cut_patches")))
-        state = survey_scheduled("north", moment_words(due), return_state=True)
-    run, tasks = newest_run("survey", list(STAGES).index("cut_patches") + 1)
-    assert (state.is_failed(), state.message, run.name) == (True, FULL_DISK, "survey-north")
-    assert tasks["cut_patches-north"].state.type.value == "FAILED"
-    line = Ledger(one.archive, "north").lines()[-1]
-    assert (line["event"], line["reason"]) == ("failed", FULL_DISK)
+        state = survey(SurveySettings(settings_file=str(file), name="north"), return_state=True)
+    assert (state.is_failed(), FULL_DISK in str(state.message)) == (True, True)
     assert (Archive.open(out).runs(), problems(out)) == ([], [])
 
 
@@ -286,26 +265,23 @@ def test_a_reprocessing_of_which_a_stage_fails(
     walk: Walk,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    field_file: Callable[..., Path],
-    served: Callable[..., Path],
 ) -> None:
     """It ends Failed and says where the reason stands; the next one makes what was missing, and completes."""
-    from flows.schedule.prefect_flows import reprocess_archive
+    from flows.archive.reprocess_flow import reprocess
 
     out = Path(shutil.copytree(walk.undisturbed, tmp_path / "archive"))
-    served(field_file(out=str(out)), every="1h")
     archive = Archive.open(out)
     (missing,) = archive.refs("segment")
     archive.discard(missing)
     with monkeypatch.context() as broken:
         broken.setitem(STAGES, "draw_map", failing("draw_map", refusal("draw_map")))
-        state = reprocess_archive(archive=str(out), return_state=True)
+        state = reprocess(archive=str(out), return_state=True)
     run, _ = newest_run("reprocess", 0)
     assert (state.is_failed(), run.name, run.state.message) == (True, f"reprocess-{out}", state.message)
-    assert state.message == "no field could be reprocessed; reprocess-TIME.json beside the archive says why"
+    assert "no field could be reprocessed; reprocess-TIME.json beside the archive says why" in state.message
     (summary,) = tmp_path.glob("reprocess-*.json")
     assert [row["message"] for row in json.loads(summary.read_text())["fields"]] == [FULL_DISK]
     assert archive.find("segment", missing.key) is None
-    state = reprocess_archive(archive=str(out), return_state=True)
-    assert (state.is_completed(), state.message, problems(out)) == (True, "done", [])
+    state = reprocess(archive=str(out), return_state=True)
+    assert (state.is_completed(), problems(out)) == (True, [])
     np.testing.assert_array_equal(class_map(out), class_map(walk.undisturbed))

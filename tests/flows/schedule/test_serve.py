@@ -1,0 +1,127 @@
+"""Serving fields: what is refused before anything runs, the deployments that are made, and how it is stopped."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flows.schedule import serve_command
+from flows.schedule.serve_command import load_fields, schedule_of
+from storage.archive.archive import Archive
+from storage.archive.staging import take_lock
+
+pytestmark = pytest.mark.usefixtures("no_effects")
+
+BAD = {
+    "no fields": ((), "--every 30m", 2, "no fields: give the settings file of one or more"),
+    "cron nonsense": (("north",), "--cron hourly", 2, "--cron 'hourly': expected five fields"),
+    "cron out of range": (("north",), "--cron 0_25_*_*_*", 2, "--cron '0 25 \\* \\* \\*': expected five fields"),
+    "neither": (("north",), "", 2, "a schedule needs --cron or --every, got neither"),
+    "both": (("north",), "--every 1h --cron 0_6_*_*_*", 2, "a schedule needs --cron or --every, got both"),
+    "too often": (("north",), "--every 10s", 2, "--every '10s': expected a number and s, m, h or d, from 1m to 366d"),
+    "no zone": (("north",), "--cron 0_6_*_*_* --timezone Mars/Base", 2, "--timezone 'Mars/Base' is no time zone"),
+    "no such file": (("nowhere",), "--every 30m", 2, "no settings file .*nowhere.toml"),
+    "unknown key": (("typo",), "--every 30m", 2, "unknown setting 'sceene' in .*typo.toml; did you mean 'scene'"),
+    "neither scene nor rig": (("blind",), "--every 30m", 2, "blind.toml says neither scene nor source = 'rig'"),
+    "scene missing": (("gone",), "--every 30m", 1, "gone.toml: there is no file .*gone.png"),
+    "twice": (("north", "north"), "--every 30m", 2, "are both called north"),
+    "limit": (("north",), "--every 30m --limit 0", 2, "--limit 0: expected 1 or more"),
+    "name": (("named",), "--every 30m", 2, "'name' in .*named.toml must be a name of letters, digits"),
+    "late": (("north",), "--every 30m --late 0.5", 2, "--late; Prefect begins a run late rather than never"),
+    "notify": (("north",), "--every 30m --notify x", 2, "--notify; Prefect tells of failed runs by an automation"),
+    "engine": (("north",), "--every 30m --engine plain", 2, "Unknown option: --engine"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_refused_before_anything_is_served(
+    case: str, field_file: Callable[..., Path], tmp_path: Path, command_line: Any
+) -> None:
+    """One clear message and the right exit code; no server is left."""
+    names, words, code, message = BAD[case]
+    field_file("north")
+    field_file("typo", lines='sceene = "x"')
+    field_file("blind", scene=None)
+    field_file("gone", scene="gone.png")
+    field_file("named", name="../north")
+    given = [word.replace("_", " ") for word in words.split()]
+    command_line("serve", *(tmp_path / f"{name}.toml" for name in names), *given).refused(code, message)
+    assert not (tmp_path / "archive" / ".prefect").exists()
+
+
+def test_two_serves_on_one_archive(field_file: Callable[..., Path], tmp_path: Path, command_line: Any) -> None:
+    """The second is refused while the first serves."""
+    file = field_file()
+    release = take_lock(Archive.open(tmp_path / "archive").root / ".locks" / "serve.lock", wait=False)
+    assert release is not None
+    try:
+        command_line("serve", file, "--every", "30m").refused(1, "another serve works on the archive")
+    finally:
+        release()
+
+
+@pytest.mark.parametrize(
+    ("url", "words", "message"),
+    [
+        ("http://127.0.0.1:9/api", (), "no Prefect server answers at http://127.0.0.1:9/api, which PREFECT_"),
+        (None, ("--port", 70000), "--port 70000 cannot be used"),
+    ],
+)
+def test_a_server_that_cannot_be_had(
+    url: str | None,
+    words: Sequence[object],
+    message: str,
+    field_file: Callable[..., Path],
+    command_line: Any,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """One message, before anything is said to be served."""
+    if url is not None:
+        monkeypatch.setenv("PREFECT_API_URL", url)
+    ended = command_line("serve", field_file(), "--every", "30m", *words)
+    ended.refused(2, message.replace(" ", r"\s+"))
+    assert "serving" not in ended.err
+
+
+def test_sigterm_stops_a_schedule(
+    field_file: Callable[..., Path], command_line: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That is the way to stop it, and no error: it says how to go on, and ends with 0."""
+
+    def terminated(*given: Any, **named: Any) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        pytest.fail("SIGTERM was not heard")
+
+    monkeypatch.setattr(serve_command, "_server", terminated)
+    ended = command_line("serve", field_file(), "--every", "30m")
+    assert (ended.code, ended.errors) == (0, [])
+    assert ended.err.splitlines()[-1] == "stopped: nothing is due any more; the same command serves again"
+
+
+def test_a_field_is_a_deployment_of_the_survey(field_file: Callable[..., Path], tmp_path: Path) -> None:
+    """Its parameters name file, field and archive and pass the flow's own checks; one run at a time, others cancelled."""
+    from flows.archive.reprocess_flow import deployment
+    from flows.survey import survey
+
+    (north,) = load_fields([field_file("north")], out=str(tmp_path / "other"))
+    made = north.deployment(schedule_of("0 6 * * *", None, "Europe/Berlin"))
+    settings = survey.validate_parameters(made.parameters)["settings"].settings()
+    assert (settings.name, settings.out, settings.budget) == ("north", str(tmp_path / "other"), 0.8)
+    assert (made.concurrency_limit, made.concurrency_options.collision_strategy.value) == (1, "CANCEL_NEW")
+    (schedule,) = made.schedules
+    assert (schedule.schedule.cron, schedule.schedule.timezone) == ("0 6 * * *", "Europe/Berlin")
+    again = deployment(str(tmp_path / "other"))
+    assert (again.flow_name, again.name, again.schedules) == ("reprocess", "archive", [])
+
+
+def test_an_interval_counts_from_1970(tmp_path: Path) -> None:
+    """Due times do not depend on when serving began."""
+    schedule = schedule_of(None, "90m", None)
+    assert schedule.interval == timedelta(minutes=90)
+    assert schedule.anchor_date == datetime(1970, 1, 1, tzinfo=UTC)
