@@ -83,7 +83,7 @@ class SurveySettings(_Declared):  # type: ignore[misc]
     def of(cls, settings: Settings) -> SurveySettings:
         """Return the parameters of settings; within this process they are these very settings, passwords too."""
         table = anchor_paths(settings.to_dict(), Path.cwd())
-        usual = anchor_paths(Settings().to_dict(), Path.cwd())
+        usual = Settings().to_dict()
         given = {name: _changed(value, usual.get(name)) for name, value in table.items() if value != usual.get(name)}
         tables = {name: _model(name).model_construct(**value) for name, value in given.items() if name in TABLES}
         made: SurveySettings = cls.model_construct(**given | tables)

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     import prefect
     import prefect.client.orchestration as prefect_client
     import prefect.client.schemas.filters as prefect_filters
+    import prefect.logging.handlers as prefect_handlers
     import prefect.server.api.server as prefect_server
     import prefect.settings as prefect_settings
     import starlette.middleware.trustedhost as trustedhost
@@ -40,6 +41,7 @@ else:
     prefect = deferred("prefect")
     prefect_client = deferred("prefect.client.orchestration")
     prefect_filters = deferred("prefect.client.schemas.filters")
+    prefect_handlers = deferred("prefect.logging.handlers")
     prefect_server = deferred("prefect.server.api.server")
     prefect_settings = deferred("prefect.settings")
     trustedhost = deferred("starlette.middleware.trustedhost")
@@ -103,11 +105,13 @@ def local_server(home: Path, port: int = 0, *, schedules: bool = False) -> Itera
     ServerUnavailable : it does not start; SettingsError : the port is taken.
     """
     with _listening(port) as listening, _using(home, listening.getsockname()[1], schedules=schedules) as api:
-        started = _start(listening, schedules=schedules)
+        server, thread = _start(listening, schedules=schedules)
         try:
             yield api
         finally:
-            started.should_exit = True
+            prefect_handlers.APILogWorker.drain_all(timeout=PATIENCE_S)
+            server.should_exit = True
+            thread.join(ENDED_WITHIN_S)
 
 
 @contextmanager
@@ -144,7 +148,7 @@ def _using(home: Path, port: int, *, schedules: bool) -> Iterator[str]:
                 os.environ[name] = value
 
 
-def _start(listening: socket.socket, *, schedules: bool) -> uvicorn.Server:
+def _start(listening: socket.socket, *, schedules: bool) -> tuple[uvicorn.Server, threading.Thread]:
     """Start the server in a thread and wait until it answers (ServerUnavailable)."""
     collects = gc.isenabled()
     gc.disable()  # the 2000 modules of the server make no garbage, which is looked for a third of their time
@@ -164,7 +168,7 @@ def _start(listening: socket.socket, *, schedules: bool) -> uvicorn.Server:
         if not thread.is_alive() or time.monotonic() > end:
             raise ServerUnavailable("the Prefect server did not start")
         time.sleep(0.02)
-    return server
+    return server, thread
 
 
 def create_database(path: Path) -> None:
