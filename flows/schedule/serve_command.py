@@ -92,7 +92,9 @@ def serve(
         Of Prefect's pages on this machine; a server that PREFECT_API_URL names is used instead.
     """
     if limit is not None and limit < 1:
-        raise SettingsError(f"--limit {limit}: expected 1 or more surveys at a time; leave it out for one of each field")
+        raise SettingsError(
+            f"--limit {limit}: expected 1 or more surveys at a time; leave it out for one of each field"
+        )
     schedule = schedule_of(cron, every, timezone)
     served = load_fields(fields, out if out is None or is_remote(out) else str(Path(out).absolute()))
     archives = {one.settings.out: open_archive(one.settings.out).root for one in served}
@@ -270,20 +272,17 @@ async def _run(deployments: Sequence[Any], limit: int) -> None:
 
 def _prepare(fields: Sequence[str]) -> None:
     """Have one rig in Prefect's limits, and cancel what was due while nothing was served: its time is over."""
+    filters: Any = prefect_filters
+    named = filters.DeploymentFilter(name=filters.DeploymentFilterName(any_=list(fields)))
+    waiting = filters.FlowRunFilterState(
+        type=filters.FlowRunFilterStateType(any_=[prefect_objects.StateType.SCHEDULED])
+    )
+    before = filters.FlowRunFilterExpectedStartTime(before_=datetime.now(UTC))
+    missed: Any = prefect_states.Cancelled(message="nothing served the schedule when it was due")
     with prefect_client.get_client(sync_client=True) as client:
         client.upsert_global_concurrency_limit_by_name(RIG_LIMIT, 1)
-        for run in client.read_flow_runs(
-            deployment_filter=prefect_filters.DeploymentFilter(
-                name=prefect_filters.DeploymentFilterName(any_=list(fields))
-            ),
-            flow_run_filter=prefect_filters.FlowRunFilter(
-                state=prefect_filters.FlowRunFilterState(
-                    type=prefect_filters.FlowRunFilterStateType(any_=[prefect_objects.StateType.SCHEDULED])
-                ),
-                expected_start_time=prefect_filters.FlowRunFilterExpectedStartTime(before_=datetime.now(UTC)),
-            ),
-        ):
-            missed = prefect_states.Cancelled(message="nothing served the schedule when it was due")
+        of_field = filters.FlowRunFilter(state=waiting, expected_start_time=before)
+        for run in client.read_flow_runs(deployment_filter=named, flow_run_filter=of_field):
             client.set_flow_run_state(run.id, missed, force=True)
 
 

@@ -1,4 +1,4 @@
-"""A week of two fields on Prefect's own schedules, hourly and daily, while clocks are set back and the server is killed.
+"""A week of two fields on Prefect's own schedules, hourly and daily; clocks are set back, the server is killed.
 
 Prefect's scheduler plans the week, which lies in the past (its backfill, `POST /deployments/ID/schedule`): every run is
 due, none waits for a clock. Prefect's engine then runs the flow `survey` for each, in the order of their due times, in
@@ -90,7 +90,7 @@ def changed_week(now: datetime, month: int, days: int = 7) -> tuple[datetime, da
 
 
 def due_between(name: str, first: datetime, until: datetime) -> list[datetime]:
-    """Return when a field is due by the clock on the wall: an hour that comes twice counts once, one that is left out not."""
+    """Return when a field is due by the clock on the wall: an hour that comes twice counts once, one left out never."""
     zone, hours = ZoneInfo(ZONE), int((until - first) / timedelta(hours=1))
     local = [(first + timedelta(hours=hour)).astimezone(zone) for hour in range(hours)]
     wanted = [one for one in local if not one.fold and (name == "hourly" or one.hour == 6)]

@@ -26,7 +26,6 @@ from flows.schedule.serve_command import load_fields, schedule_of
 from flows.settings.load import load_settings
 from flows.tasks.local_server import local_server
 from flows.tasks.open_survey import RIG_LIMIT, OpenSurvey
-from pipeline.errors import RigError
 from storage.archive.archive import Archive
 from storage.archive.records import read_run
 from storage.parallel.crew import THREADS
@@ -97,16 +96,16 @@ def settings_of(out: Path) -> list[dict[str, Any]]:
 
 
 def test_a_wrong_parameter_ends_a_run_with_the_message_of_the_command_line(north: Any) -> None:
-    """The server refuses what is no number; the flow, before it begins, what is out of range."""
+    """The server refuses what is no setting; the flow, before it begins, what is out of range."""
     from prefect.exceptions import PrefectHTTPStatusError
 
     deployment = deployed(north)
     settings = {"settings_file": str(north.file), "out": north.settings.out}
-    with pytest.raises(PrefectHTTPStatusError, match="budget"):
-        planned(deployment, DUE, {"settings": {**settings, "budget": "much"}})
+    with pytest.raises(PrefectHTTPStatusError, match="bugdet"):
+        planned(deployment, DUE, {"settings": {**settings, "bugdet": 0.5}})
     state = run_here(planned(deployment, DUE, {"settings": {**settings, "budget": 2.0}}))
     assert state.is_failed()
-    assert "'budget' must be a number from 0 to 1, got 2.0" in state.message
+    assert "--budget must be a share of the full scan's seconds, above 0 and at most 1, got 2.0" in state.message
 
 
 def test_a_run_is_a_visit_of_its_due_time_and_goes_on_from_the_newest(north: Any) -> None:
@@ -247,8 +246,12 @@ def test_the_file_of_deployments_is_complete(scheduling: str) -> None:
         ("reading", 1),
     ]
     assert [one.concurrency_options.collision_strategy.value for one in (north, rig)] == ["CANCEL_NEW", "ENQUEUE"]
-    assert [(one.schedule.cron, one.schedule.timezone) for one in north.schedules] == [("0 6-20 * * *", "Europe/Berlin")]
-    assert set(north.parameters["settings"]) <= set(survey.parameters.model_dump()["definitions"]["SurveySettings"]["properties"])
+    assert [(one.schedule.cron, one.schedule.timezone) for one in north.schedules] == [
+        ("0 6-20 * * *", "Europe/Berlin")
+    ]
+    assert set(north.parameters["settings"]) <= set(
+        survey.parameters.model_dump()["definitions"]["SurveySettings"]["properties"]
+    )
     reprocess.validate_parameters(archive.parameters)
 
 
@@ -286,7 +289,9 @@ def test_the_automation_tells_of_a_failed_run(north: Any, tmp_path: Path, schedu
     assert "no settings file" in found["why"]
 
 
-def test_a_serve_goes_on_when_its_server_was_killed_and_is_back(field_file: Callable[..., Path], tmp_path: Path) -> None:
+def test_a_serve_goes_on_when_its_server_was_killed_and_is_back(
+    field_file: Callable[..., Path], tmp_path: Path
+) -> None:
     """Runs end well before and after; SIGTERM then ends it with one sentence and pauses the schedule."""
     from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary_settings
 

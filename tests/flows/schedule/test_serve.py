@@ -105,7 +105,7 @@ def test_sigterm_stops_a_schedule(
 
 
 def test_a_field_is_a_deployment_of_the_survey(field_file: Callable[..., Path], tmp_path: Path) -> None:
-    """Its parameters name file, field and archive and pass the flow's own checks; one run at a time, others cancelled."""
+    """Its parameters name file, field and archive and pass the flow's own checks; a second run is cancelled."""
     from flows.archive.reprocess_flow import deployment
     from flows.survey import survey
 

@@ -20,8 +20,8 @@ import pytest
 from flows.cli.main import main
 from flows.publish import run_folder as publish
 from flows.tasks import prefect_engine as engine
-from flows.tasks.stage import Stage, Wanted
 from flows.tasks.open_survey import STAGES
+from flows.tasks.stage import Stage, Wanted
 from pipeline.errors import ArchiveError, RigError
 from storage.archive.archive import Archive
 from storage.arrays.class_maps import load_class_map
@@ -261,10 +261,7 @@ def test_a_served_field_of_which_a_stage_fails(
 
 
 def test_a_reprocessing_of_which_a_stage_fails(
-    server: None,
-    walk: Walk,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    server: None, walk: Walk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It ends Failed and says where the reason stands; the next one makes what was missing, and completes."""
     from flows.archive.reprocess_flow import reprocess
