@@ -116,7 +116,7 @@ def rows(quick: bool) -> list[Row]:
     clock = Clock()
     with tempfile.TemporaryDirectory(prefix="soak-week-") as name:
         folder = Path(name)
-        fields = _fields(folder)
+        fields = small_fields(folder)
         week = _run(folder, fields, 1 if quick else 7)
         archive = Archive.open(folder / "archive")
         problems = [f"{one.uri}: {one.problem}" for one in verify_archive(archive) if one.problem is not None]
@@ -126,7 +126,8 @@ def rows(quick: bool) -> list[Row]:
     return _judged(week, problems, clock.seconds)
 
 
-def _fields(folder: Path) -> list[ServedField]:
+def small_fields(folder: Path) -> list[ServedField]:
+    """Write the settings of both fields, a small picture and small weights, and open them."""
     values, _ = patchy_scene((48, 64), 3, seed=1)
     Image.fromarray(values.astype(np.uint8)).save(folder / "scene.png")
     save_weights(random_weights(RGB_NM, CLASSES), folder / "weights.safetensors")

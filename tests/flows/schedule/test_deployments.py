@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from contextvars import copy_context
 from dataclasses import replace
 from datetime import UTC, datetime
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -157,7 +158,7 @@ def test_two_fields_that_are_due_at_once_take_turns_at_the_rig(tmp_path: Path) -
     assert rig.crew == THREADS
     with client() as asked:
         asked.upsert_global_concurrency_limit_by_name(RIG_LIMIT, 1)
-    threads = [threading.Thread(target=look) for _ in range(2)]
+    threads = [threading.Thread(target=copy_context().run, args=(look,)) for _ in range(2)]
     for one in threads:
         one.start()
     for one in threads:
