@@ -153,6 +153,8 @@ def _run(folder: Path, fields: list[ServedField], days: int) -> Week:
                 killer = threading.Thread(target=_kill_and_start, args=(servers, held, home, port))
                 killer.start()
             _run_here(run, killer)
+            if number % 25 == 24:
+                print(f"  {number + 1} have been run", file=sys.stderr, flush=True)
             if killer is not None:
                 week.hit = _state_of(run)
                 print(f"  the server was killed in run {number}: {week.hit}", file=sys.stderr, flush=True)
@@ -220,6 +222,8 @@ def _planned(deployment: Any, first: datetime, until: datetime) -> list[Any]:
 
 def _run_here(run: Any, killer: threading.Thread | None) -> None:
     """Run it as Prefect's runner has it run, in this process; a process that would have died is told as crashed."""
+    from asyncio import CancelledError
+
     from prefect.client.orchestration import get_client
     from prefect.flow_engine import run_flow
     from prefect.states import Crashed, Pending
@@ -231,12 +235,12 @@ def _run_here(run: Any, killer: threading.Thread | None) -> None:
         run = client.read_flow_run(run.id)
     try:
         run_flow(survey, flow_run=run, return_type="state")
-    except Exception as error:
+    except (Exception, CancelledError) as error:  # no answer, or Prefect gives a run up that cannot renew its place
         if killer is None:
             raise
         killer.join()
         with get_client(sync_client=True) as client:
-            client.set_flow_run_state(run.id, Crashed(message=f"its process ended: {error}"), force=True)
+            client.set_flow_run_state(run.id, Crashed(message=f"its process ended: {error!r}"), force=True)
     finally:
         if killer is not None:
             killer.join()
