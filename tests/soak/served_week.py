@@ -40,6 +40,7 @@ from tests.faults.nursery import ROOT
 ZONE = "Europe/Berlin"
 FIELDS = {"hourly": "0 * * * *", "daily": "0 6 * * *"}
 SETTINGS = 'scene = "scene.png"\nweights = "weights.safetensors"\nbudget = 0.8\neffects = "none"\ncontrols = false\n'
+IN_THE_PAST = {"PREFECT_SERVER_SERVICES_LATE_RUNS_ENABLED": "false"}  # all of the week is late
 KILLED_AT = 0.4  # of the runs
 INTO_RUN_S, AWAY_S = 0.4, 2.0
 STARTED_WITHIN_S = 120.0
@@ -61,11 +62,11 @@ def free_port() -> int:
 
 
 @contextmanager
-def server_process(home: Path, port: int) -> Iterator[subprocess.Popen[str]]:
-    """Have a Prefect server in a process of its own, on a port; killed at the end."""
+def server_process(home: Path, port: int, **settings: str) -> Iterator[subprocess.Popen[str]]:
+    """Have a Prefect server in a process of its own, on a port, with more settings; killed at the end."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
     words = [sys.executable, "-c", SERVES, str(home), str(port)]
-    environment |= {"PYTHONPATH": str(ROOT), "DO_NOT_TRACK": "1", "PREFECT_SERVER_LOGGING_LEVEL": "CRITICAL"}
+    environment |= {"PYTHONPATH": str(ROOT), "DO_NOT_TRACK": "1", "PREFECT_SERVER_LOGGING_LEVEL": "CRITICAL"} | settings
     with subprocess.Popen(words, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None
@@ -142,7 +143,7 @@ def _run(folder: Path, fields: list[ServedField], days: int) -> Week:
     home, port, week = folder / "home", free_port(), Week()
     with ExitStack() as held:
         held.enter_context(quiet_environment(home))
-        servers = [held.enter_context(server_process(home, port))]
+        servers = [held.enter_context(server_process(home, port, **IN_THE_PAST))]
         held.enter_context(_using(home, port))
         planned = _plan(fields, week, days)
         print(f"  {len(planned)} runs are planned", file=sys.stderr, flush=True)
@@ -251,7 +252,7 @@ def _kill_and_start(servers: list[subprocess.Popen[str]], held: ExitStack, home:
     servers[-1].kill()
     servers[-1].wait()
     time.sleep(AWAY_S)
-    servers.append(held.enter_context(server_process(home, port)))
+    servers.append(held.enter_context(server_process(home, port, **IN_THE_PAST)))
 
 
 def _state_of(run: Any) -> str:
