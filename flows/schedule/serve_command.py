@@ -13,9 +13,10 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 from zoneinfo import ZoneInfo
 
+import tzlocal
 from rich.markup import escape
 
 from flows.cli.app import removed, stderr
@@ -83,7 +84,7 @@ def serve(
     every
         Or how often: 30m, 2h, 1d; counted from midnight UTC of 1970, not from now.
     timezone
-        Of --cron, such as Europe/Berlin; UTC by default.
+        Of --cron, such as Europe/Berlin; this machine's by default.
     out
         Archive for all fields, a folder or s3://bucket/prefix; by default that of each field's settings.
     limit
@@ -96,20 +97,18 @@ def serve(
             f"--limit {limit}: expected 1 or more surveys at a time; leave it out for one of each field"
         )
     schedule = schedule_of(cron, every, timezone)
-    served = load_fields(fields, out if out is None or is_remote(out) else str(Path(out).absolute()))
+    served = load_fields(fields, out)
     archives = {one.settings.out: open_archive(one.settings.out).root for one in served}
     home = next(iter(archives.values())) / ".prefect"
     with ExitStack() as held:
         held.enter_context(_stopped_with_a_sentence())
         for name, root in archives.items():
             held.enter_context(_alone_on(name, root))
-        held.enter_context(_server(home, port))
+        pages = held.enter_context(_server(home, port))
         held.enter_context(_own_temporary_folder())
         wanted = cron or f"every {every}"
         _say(f"serving {', '.join(one.name for one in served)}, {wanted}; stop with Ctrl-C, the same command goes on")
-        pages = os.environ["PREFECT_API_URL"].rstrip("/").removesuffix("/api")
-        known = "" if "PREFECT_API_AUTH_STRING" not in os.environ else f"; the password is in {home / 'password'}"
-        _say(f"Prefect's pages: {pages}{known}")
+        _say(f"Prefect's pages: {pages}")
         _serve(served, schedule, limit or len(served) + 1)
     return DONE
 
@@ -151,6 +150,8 @@ def load_fields(files: Sequence[Path], out: str | None = None) -> list[ServedFie
     fields: dict[str, ServedField] = {}
     for file in files:
         settings = load_settings(file, {"out": out})
+        if not is_remote(settings.out):
+            settings = replace(settings, out=str(Path(settings.out).absolute()))
         if "scene" not in read_toml(file) and settings.source != "rig":
             raise SettingsError(
                 f"{file} says neither scene nor source = 'rig': nothing to look at; give the field's scene, or its rig"
@@ -169,12 +170,12 @@ def load_fields(files: Sequence[Path], out: str | None = None) -> list[ServedFie
 
 
 def schedule_of(cron: str | None, every: str | None, timezone: str | None = None) -> Any:
-    """Return Prefect's schedule for a cron line in a time zone (UTC without one) or an interval (SettingsError)."""
+    """Return Prefect's schedule for a cron line in a time zone (or this machine's) or an interval (SettingsError)."""
     if (cron is None) == (every is None):
         got = "neither" if cron is None else "both"
         raise SettingsError(f"a schedule needs --cron or --every, got {got}; such as --every 30m or --cron '0 6 * * *'")
     try:
-        zone = str(ZoneInfo(timezone or "UTC"))
+        zone = str(ZoneInfo(timezone or tzlocal.get_localzone_name()))
     except (KeyError, ValueError, OSError):
         raise SettingsError(f"--timezone {timezone!r} is no time zone; expected such as Europe/Berlin") from None
     if every is not None:
@@ -216,15 +217,19 @@ def _alone_on(name: str, root: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _server(home: Path, port: int) -> Iterator[None]:
-    """Have a server on this machine, or use the one that PREFECT_API_URL names (SettingsError: there is none)."""
+def _server(home: Path, port: int) -> Iterator[str]:
+    """Have a server on this machine, or use the one that PREFECT_API_URL names; gives where its pages are.
+
+    Raises SettingsError: the one that is named does not answer, or the port is taken.
+    """
     try:
         with quiet_environment(home), ExitStack() as held:
             if "PREFECT_API_URL" in os.environ:
                 check_answers(os.environ["PREFECT_API_URL"])
+                yield os.environ["PREFECT_API_URL"].rstrip("/").removesuffix("/api")
             else:
-                held.enter_context(local_server(home, port, schedules=True))
-            yield
+                api = held.enter_context(local_server(home, port, schedules=True))
+                yield f"{api.removesuffix('/api')}; the password is in {home / 'password'}"
     except ServerUnavailable as error:
         raise SettingsError(f"{error}: start it, or unset PREFECT_API_URL and have one started here") from error
 
@@ -271,19 +276,25 @@ async def _run(deployments: Sequence[Any], limit: int) -> None:
 
 
 def _prepare(fields: Sequence[str]) -> None:
-    """Have one rig in Prefect's limits, and cancel what was due while nothing was served: its time is over."""
-    filters: Any = prefect_filters
+    """Have one rig in Prefect's limits, and end what an earlier serve left.
+
+    What was due while nothing was served is cancelled, since its time is over; what ran then has crashed.
+    """
+    filters, kind = cast(Any, prefect_filters), prefect_objects.StateType
     named = filters.DeploymentFilter(name=filters.DeploymentFilterName(any_=list(fields)))
-    waiting = filters.FlowRunFilterState(
-        type=filters.FlowRunFilterStateType(any_=[prefect_objects.StateType.SCHEDULED])
+    left = filters.FlowRunFilter(
+        state=filters.FlowRunFilterState(
+            type=filters.FlowRunFilterStateType(any_=[kind.SCHEDULED, kind.PENDING, kind.RUNNING])
+        ),
+        expected_start_time=filters.FlowRunFilterExpectedStartTime(before_=datetime.now(UTC)),
     )
-    before = filters.FlowRunFilterExpectedStartTime(before_=datetime.now(UTC))
     missed: Any = prefect_states.Cancelled(message="nothing served the schedule when it was due")
+    crashed: Any = prefect_states.Crashed(message="the process that ran it is gone")
     with prefect_client.get_client(sync_client=True) as client:
         client.upsert_global_concurrency_limit_by_name(RIG_LIMIT, 1)
-        of_field = filters.FlowRunFilter(state=waiting, expected_start_time=before)
-        for run in client.read_flow_runs(deployment_filter=named, flow_run_filter=of_field):
-            client.set_flow_run_state(run.id, missed, force=True)
+        for run in client.read_flow_runs(deployment_filter=named, flow_run_filter=left):
+            waited = run.state is not None and run.state.is_scheduled()
+            client.set_flow_run_state(run.id, missed if waited else crashed, force=True)
 
 
 def _wait_for_server() -> None:

@@ -23,7 +23,7 @@ from typing import Any
 import pytest
 import yaml
 
-from flows.schedule.serve_command import load_fields, schedule_of
+from flows.schedule.serve_command import _prepare, load_fields, schedule_of
 from flows.settings.load import load_settings
 from flows.tasks.local_server import local_server
 from flows.tasks.open_survey import RIG_LIMIT, OpenSurvey
@@ -134,6 +134,26 @@ def test_a_run_that_is_due_while_the_last_still_runs_is_cancelled(north: Any) ->
         asked.set_flow_run_state(first, Completed())
         asked.set_flow_run_state(third, Pending())
         assert asked.read_flow_run(third).state.is_pending()
+
+
+def test_what_a_killed_serve_left_is_ended_when_it_is_served_again(north: Any) -> None:
+    """What waited is cancelled, what ran has crashed and gives its place back; what is to come stays."""
+    from prefect.states import Pending, Running
+
+    deployment = deployed(north)
+    ran, waited, later = (planned(deployment, DUE.replace(year=year)).id for year in (2024, 2025, 2099))
+    with client() as asked:
+        asked.set_flow_run_state(ran, Pending())
+        asked.set_flow_run_state(ran, Running())
+        _prepare(["north"])
+        assert [asked.read_flow_run(one).state.type.value for one in (ran, waited, later)] == [
+            "CRASHED",
+            "CANCELLED",
+            "SCHEDULED",
+        ]
+        after = planned(deployment, DUE).id
+        asked.set_flow_run_state(after, Pending())
+        assert asked.read_flow_run(after).state.is_pending()
 
 
 def test_two_fields_that_are_due_at_once_take_turns_at_the_rig(tmp_path: Path) -> None:
