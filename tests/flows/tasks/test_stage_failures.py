@@ -30,9 +30,8 @@ from tests.flows.conftest import Ended, problems
 pytestmark = pytest.mark.usefixtures("no_effects")
 
 RECORDED_S = 30.0  # in which a server has heard of a task that ended
-OF_THIS = [name for name in STAGES if name not in NOT_HERE]
-    name for name in STAGES if name not in ("register_coarse", "register_fine", "ground")
-]  # a survey in two passes
+NOT_HERE = ("register_coarse", "register_fine", "ground", "average_raster", "take_patches")
+OF_THIS = [name for name in STAGES if name not in NOT_HERE]  # a survey in two passes by a mirror that is believed
 CAPTURES = ("capture_coarse", "capture_fine")
 NO_REPLY = "no reply from the camera after 2 s; is it on?"
 FULL_DISK = "cannot write to the archive: no space left; make room"
