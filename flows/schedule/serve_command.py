@@ -259,6 +259,8 @@ def _serve(fields: Sequence[ServedField], schedule: Any, limit: int) -> None:
     while True:
         try:
             asyncio.run(_run([*surveys, *again], limit))
+        except asyncio.CancelledError:
+            raise KeyboardInterrupt from None
         except Exception as error:  # Prefect's runner gives up after three tries
             _say(f"Prefect's server does not answer ({type(error).__name__}); serving goes on when it does")
             _wait_for_server()
@@ -271,7 +273,7 @@ async def _run(deployments: Sequence[Any], limit: int) -> None:
         await runner.aadd_deployment(one)
     running = asyncio.ensure_future(runner.start())
     await asyncio.sleep(0)  # here it takes SIGTERM for itself, and would end without having paused the schedules
-    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, running.cancel)  # SIGINT may be ignored here
     await running
 
 

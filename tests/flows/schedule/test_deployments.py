@@ -318,7 +318,10 @@ def test_the_automation_tells_of_a_failed_run(north: Any, tmp_path: Path, schedu
 def test_a_serve_goes_on_when_its_server_was_killed_and_is_back(
     field_file: Callable[..., Path], tmp_path: Path
 ) -> None:
-    """Runs end well before and after; SIGTERM then ends it with one sentence and pauses the schedule."""
+    """Runs end well before and after; SIGTERM then ends it with one sentence and pauses the schedule.
+
+    It is started as a shell starts what goes on in the background, which ignores SIGINT.
+    """
     from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary_settings
 
     file, home, port = field_file("north", effects="none"), tmp_path / "home", free_port()
@@ -327,7 +330,8 @@ def test_a_serve_goes_on_when_its_server_was_killed_and_is_back(
         environment = {**os.environ, "PYTHONPATH": str(ROOT), "PREFECT_RUNNER_POLL_FREQUENCY": "1"}
         environment |= {"PREFECT_API_URL": api, "PREFECT_API_AUTH_STRING": password}
         environment |= {"PREFECT_CLIENT_MAX_RETRIES": "0"}  # else it asks for minutes before it gives up
-        words = [sys.executable, "-m", "flows.cli.main", "serve", str(file), "--every", "365d"]
+        words = ["sh", "-c", "trap '' INT; exec \"$@\"", "sh", sys.executable, "-m", "flows.cli.main"]
+        words += ["serve", str(file), "--every", "365d"]
         with (
             temporary_settings({PREFECT_API_URL: api, PREFECT_API_AUTH_STRING: password}),
             (tmp_path / "said").open("w") as said,
