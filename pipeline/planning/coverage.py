@@ -91,15 +91,16 @@ def cheapest_full(
     *,
     overlap_px: float = 0,
     cut: Callable[[list[Sweep]], list[Sweep]] = lambda sweeps: sweeps,
+    axes: Sequence[Axis] = ("x", "y"),
 ) -> tuple[Axis, list[Sweep], float]:
     """Choose the orientation of the full scan that takes the least time: axis of the lines, sweeps, seconds.
 
-    ``cut`` leaves of the sweeps what is to be captured, where that is not all.
+    ``cut`` leaves of the sweeps what is to be captured, where that is not all; ``axes`` are those that lines may lie
+    along.
 
     Raises PoseError: neither orientation is within the mirror's range.
     """
     found: list[tuple[Axis, list[Sweep], float]] = []
-    axes: tuple[Axis, Axis] = ("x", "y")
     for along in axes:
         try:
             sweeps = cut(full_sweeps(grid, camera, along, overlap_px=overlap_px))

@@ -33,9 +33,10 @@ from pipeline.geometry.scan import Sweep
 from pipeline.rectify.detector import find_bad_elements
 from pipeline.rig.camera.camera_texts import listed_numbers
 from pipeline.source import References
+from storage.archive.archive import Archive
 from storage.archive.keys import array_digest
 from storage.archive.manifests import manifest_sha256
-from storage.archive.records import read_run
+from storage.archive.records import Run, read_run, read_store
 from storage.archive.staging import MANIFEST_NAME
 from storage.arrays.cubes import RawCube, open_raw_cube
 from storage.arrays.layout import open_group
@@ -106,9 +107,7 @@ class Recording:
         if field_shape is None:
             sweeps, tangents = [one.sweep for one in self.sweeps], [one.tangents for one in self.sweeps]
             field_shape = covered_field(sweeps, tangents, self.camera).shape
-        return RecordedSource(
-            self.sweeps, self.camera, self.wavelength_nm, field_shape, name=self.name, notes=self.notes
-        )
+        return RecordedSource(self.sweeps, self.camera, self.wavelength_nm, field_shape, notes=self.notes)
 
 
 @dataclass(frozen=True)
@@ -186,13 +185,10 @@ def find_raw_cubes(address: str | Path) -> list[Path] | None:
     Raises ArchiveError: the archive has no run of that name, or no run with raw cubes; as `Archive.locate` where they
     are gone.
     """
-    text = str(address).rstrip("/")
-    place, _, run = text.rpartition("/runs/")
-    if place and run and is_archive(place):
-        return _cubes_of_run(place, run)
-    if is_remote(text) or (Path(text) / "stages").is_dir():
-        return _cubes_of_run(text, None)
-    path = Path(text)
+    named = _named_run(address)
+    if named is not None:
+        return _run_with_cubes(*named)[2]
+    path = Path(address)
     if not path.exists():
         raise SceneError(f"there is no recording {path}; check the name (seen from {Path.cwd()})")
     if not path.is_dir():
@@ -212,8 +208,36 @@ def _is_raw_cube(path: Path) -> bool:
         return False
 
 
-def _cubes_of_run(address: str, name: str | None) -> list[Path]:
-    """Raw cubes of a run of an archive, the newest that has some where none is named."""
+def find_recorded_run(address: str | Path) -> tuple[Run, tuple[int, int] | None] | None:
+    """Find the run of an archive whose raw cubes an address stands for, with its field's (y, x) size where known.
+
+    None of addresses that stand for no run. Raises SceneError, ArchiveError: as `find_raw_cubes`.
+    """
+    named = _named_run(address)
+    if named is None:
+        if not Path(address).exists():
+            raise SceneError(f"there is no recording {address}; check the name (seen from {Path.cwd()})")
+        return None
+    archive, run, _ = _run_with_cubes(*named)
+    for row in run.stages:
+        if row.get("name") == "attend":
+            grid = read_store(archive.ref("attend", str(row.get("key")))).params.get("grid", {})
+            if {"height", "width"} <= set(grid):
+                return run, (int(grid["height"]), int(grid["width"]))
+    return run, None
+
+
+def _named_run(address: str | Path) -> tuple[str, str | None] | None:
+    """The archive and the run, where one is named, that an address stands for; None where it is no such address."""
+    text = str(address).rstrip("/")
+    place, _, run = text.rpartition("/runs/")
+    if place and run and is_archive(place):
+        return place, run
+    return (text, None) if is_remote(text) or (Path(text) / "stages").is_dir() else None
+
+
+def _run_with_cubes(address: str, name: str | None) -> tuple[Archive, Run, list[Path]]:
+    """A run of an archive with its raw cubes, the newest that has some where none is named."""
     archive = open_archive(address, create=False, write=False)
     folders = archive.runs()
     if name is not None and name not in [folder.name for folder in folders]:
@@ -221,11 +245,11 @@ def _cubes_of_run(address: str, name: str | None) -> list[Path]:
         raise ArchiveError(f"{archive.name} has no run {name!r}; its latest are {known}")
     for folder in reversed(folders):
         if name in (None, folder.name):
-            products = read_run(folder, {}).products
-            stores = [archive.locate(products[product]) for product in RAW_PRODUCTS if product in products]
+            run = read_run(folder, {})
+            stores = [archive.locate(run.products[product]) for product in RAW_PRODUCTS if product in run.products]
             cubes = [path for store in stores for path in sorted(store.glob("*.zarr"))]
             if cubes:
-                return cubes
+                return archive, run, cubes
     which = "no run" if name is None else f"the run {name}"
     raise ArchiveError(f"{archive.name}: {which} has raw cubes; survey into the archive first, or name another run")
 
