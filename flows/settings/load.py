@@ -161,8 +161,11 @@ def load_settings(
     for wrong in _contradictions(given, origin):
         raise SettingsError(wrong)
     recorded = of_this_version(usual_of_recording(table)) if "sweeps" in given else {}
-    tables = {name: {**recorded.pop(name), **table[name]} for name in TABLES if name in recorded and name in table}
-    return parse_settings({**_usual_policy(table), **(usual or {}), **recorded, **table, **tables}, origin)
+    for name in TABLES:
+        inner = table.get(name)
+        if isinstance(inner, Mapping):
+            table[name] = {**recorded.pop(name, {}), **inner}
+    return parse_settings({**_usual_policy(table), **(usual or {}), **recorded, **table}, origin)
 
 
 def _usual_policy(table: Mapping[str, object]) -> dict[str, object]:
@@ -354,8 +357,8 @@ def _recorded_wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[
         for name in OF_RECORDINGS:
             if getattr(settings, name) is not None:
                 yield (
-                    f"{place_of(name, origin.get(name))} is for recorded sweeps, and source = {settings.source!r}: give "
-                    "--source recorded with --sweeps, or leave it out"
+                    f"{place_of(name, origin.get(name))} is for recorded sweeps, and source = {settings.source!r}; "
+                    "give --source recorded with --sweeps, or leave it out"
                 )
         return
     if settings.sweeps is None:

@@ -9,14 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from flows.settings.survey_settings import (
-    BUILT_IN_SCENES,
-    OF_TWO_PASSES,
-    PLAIN,
-    RECORDED,
-    RIG_FIELD,
-    SPARING,
-)
+from flows.settings.survey_settings import BUILT_IN_SCENES, OF_TWO_PASSES, PLAIN, RECORDED, RIG_FIELD, SPARING
 from storage.readers.recordings import find_recorded_run
 
 OF_THE_PLAN = (*PLAIN, *OF_TWO_PASSES, *SPARING, "scan_exposure_ms", "look")
@@ -36,8 +29,9 @@ def usual_of_recording(table: Mapping[str, object]) -> dict[str, Any]:
     found = find_recorded_run(str(table["sweeps"]))
     if found is not None:
         run, shape = found
-        of_another_plan = asked & set(PLAIN) or asked and any(run.settings.get(name) is not None for name in PLAIN)
-        names = OF_THE_RUN if of_another_plan else (*OF_THE_RUN, *OF_THE_PLAN)
+        uniform = any(run.settings.get(name) is not None for name in PLAIN)
+        another_plan = asked if uniform else asked & set(PLAIN)
+        names = OF_THE_RUN if another_plan else (*OF_THE_RUN, *OF_THE_PLAN)
         usual |= {name: run.settings[name] for name in names if run.settings.get(name) is not None}
         usual |= {"name": str(run.receipt.get("survey") or run.folder.name)}
         usual |= {} if shape is None else {"size": shape[::-1]}

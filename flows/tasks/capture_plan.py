@@ -39,10 +39,7 @@ class CapturePlan:
 
 
 def plan_capture(
-    settings: Settings,
-    grid: SceneGrid,
-    shown: NDArray[np.bool_] | None = None,
-    recorded: RecordedPasses | None = None,
+    settings: Settings, grid: SceneGrid, shown: NDArray[np.bool_] | None = None, recorded: RecordedPasses | None = None
 ) -> CapturePlan:
     """Lay out coarse and full sweeps; where the mirror may look beside the plan, with overlaps and margins.
 
@@ -61,10 +58,7 @@ def plan_capture(
 
 
 def lay_out_sweeps(
-    settings: Settings,
-    grid: SceneGrid,
-    shown: NDArray[np.bool_] | None = None,
-    recorded: RecordedPasses | None = None,
+    settings: Settings, grid: SceneGrid, shown: NDArray[np.bool_] | None = None, recorded: RecordedPasses | None = None
 ) -> tuple[Axis, list[Sweep], list[Sweep]]:
     """Give the axis that lines lie along, the coarse sweeps or those of a plain scan, and those of the full scan.
 

@@ -37,8 +37,8 @@ class RecordedPasses:
         if len(self._kinds) > 1:
             words = "; ".join(f"along {along}, step {step}, binning {binning}" for along, step, binning in self._kinds)
             raise SceneError(
-                f"the recording holds lines of {len(self._kinds)} kinds ({words}), which are not one uniform scan; give the "
-                "--budget of a survey in two passes, or name sweeps of one kind"
+                f"the recording holds lines of {len(self._kinds)} kinds ({words}), which are not one uniform scan; "
+                "give the --budget of a survey in two passes, or name sweeps of one kind"
             )
         return sweeps
 

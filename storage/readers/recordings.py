@@ -273,7 +273,7 @@ class RecordedFile:
 
 def _open_files(path: Path, camera: LineCamera, given: RecordedWith) -> Recording:
     """Open cubes of files with their pointing and reference frames."""
-    cubes = [_open_file(one, given.wavelengths) for one in _find_cubes(path)]
+    cubes = [_open_file(one, given.wavelengths) for one in find_cubes(path)]
     _check_bands(cubes)
     notes = [note for cube in cubes for note in (*cube.source.notes, cube.source.bands.origin) if note]
     samples = given.samples or max(cube.source.shape[1] for cube in cubes)
@@ -305,8 +305,11 @@ def _open_files(path: Path, camera: LineCamera, given: RecordedWith) -> Recordin
     )
 
 
-def _find_cubes(path: Path) -> list[Path]:
-    """The cubes that an address of files stands for: itself, or the ENVI cubes of a folder."""
+def find_cubes(path: Path) -> list[Path]:
+    """Find the cubes that an address of files stands for: itself, or the ENVI cubes or Zarr stores of a folder.
+
+    Raises SceneError: the folder holds none.
+    """
     if not path.is_dir() or find_zarr_store(path) is not None:
         return [path]
     headers = sorted(entry for entry in path.iterdir() if entry.suffix.lower() == ".hdr" and entry.is_file())

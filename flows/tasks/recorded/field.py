@@ -71,15 +71,13 @@ class OpenedRecording:
         """
         height, width = self.field.source.field_shape
         wavelength_nm = self.recording.wavelength_nm
-        labels = None
-        names, colours, notes = (), np.zeros((0, 3), np.uint8), ()
+        found, notes = None, tuple[str, ...]()
         if self.settings.labels is not None:
             found, notes = load_field_labels(self.settings.labels, (height, width))
-            labels, names, colours = found.index, found.names, found.colours
         scene = RasterScene(
             name=self.settings.name or _name_of(str(self.settings.sweeps)),
             key=f"{RECORDED}/{stage_key(RECORDED, 1, self.field.content, [])}/{width}x{height}",
-            raster=SceneRaster.of(np.zeros((height, width, 1), np.float32), labels),
+            raster=SceneRaster.of(np.zeros((height, width, 1), np.float32), None if found is None else found.index),
             light=Once.of(
                 SceneLight(
                     np.zeros((1, len(wavelength_nm)), np.float32),
@@ -89,8 +87,8 @@ class OpenedRecording:
             panel=self.recording.sweeps[0].references.panel,
             wavelength_nm=wavelength_nm,
             fwhm_nm=self.recording.fwhm_nm,
-            class_names=names,
-            class_colours=colours,
+            class_names=() if found is None else found.names,
+            class_colours=np.zeros((0, 3), np.uint8) if found is None else found.colours,
         )
         return scene, (*self.notes, *notes)
 
