@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Iterator
+import shlex
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 import storage.readers.recordings
-from flows.publish.run_folder import Published
+from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
+from flows.publish.run_folder import Published, load_receipt
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from pipeline.simulator.scenes.scene import RasterScene, raster_from_values
@@ -25,10 +28,12 @@ from storage.arrays.cubes import open_raw_cube
 from storage.arrays.mosaics import load_mosaic
 from storage.export.recorded_files import write_recorded_files
 from storage.remote.opening import verify_archive
-from tests.conftest import Survey, patchy_scene
+from tests.conftest import Survey, WeightsMaker, patchy_scene
+from tests.flows.conftest import CommandLine, be_version, command_line
 from tests.flows.tasks.test_survey_rig import emulated
 from tests.remembered_work import without_effects
 
+__all__ = ["command_line"]
 pytestmark = pytest.mark.usefixtures("no_effects")
 QUIET = Console(quiet=True)
 SIZE = (128, 96)  # x, y
@@ -62,9 +67,9 @@ def survey_sweeps(out: Path, sweeps: Path | str, **asked: Any) -> Published:
     return run_survey(load_settings(None, {"sweeps": str(sweeps), "engine": "plain", "out": str(out), **asked}), QUIET)
 
 
-def digest_of_map(out: Path, published: Published) -> tuple[str, str]:
+def digest_of_map(out: Path, receipt: Mapping[str, Any]) -> tuple[str, str]:
     """Hashes of class numbers and confidences."""
-    found = load_class_map(out / published.receipt["products"]["class_map"])
+    found = load_class_map(out / receipt["products"]["class_map"])
     return array_digest(np.asarray(found.classes)), array_digest(np.asarray(found.confidence))
 
 
@@ -85,15 +90,15 @@ def test_sweeps_of_the_rig_give_its_map(
     settings = rig_settings(tmp_path / "rig", weights, **asked)
     with emulated(settings, {}, monkeypatch, scene=field()):
         published = run_survey(settings, QUIET)
-    expected = digest_of_map(tmp_path / "rig", published)
+    expected = digest_of_map(tmp_path / "rig", published.receipt)
     assert len(np.unique(load_class_map(tmp_path / "rig" / published.receipt["products"]["class_map"]).classes)) > 1
     folder = write_sweeps(tmp_path / "rig", published, tmp_path / "sweeps")
     plan = asked if "budget" in asked else {}
     size = f"{SIZE[0]}x{SIZE[1]}"
     of_files = survey_sweeps(tmp_path / "files", folder, weights=str(weights), size=size, **plan)
-    assert digest_of_map(tmp_path / "files", of_files) == expected
+    assert digest_of_map(tmp_path / "files", of_files.receipt) == expected
     of_run = survey_sweeps(tmp_path / "again", published.folder)
-    assert digest_of_map(tmp_path / "again", of_run) == expected
+    assert digest_of_map(tmp_path / "again", of_run.receipt) == expected
     for one in (of_files, of_run):
         told = one.receipt["recording"]
         assert (one.receipt["source"], told["lines_read"]) == ("recorded", told["lines_recorded"])
@@ -134,7 +139,7 @@ def test_raw_cubes_of_a_simulated_survey_give_its_map(tmp_path: Path, full_scan:
     """An archive of a simulated survey is a recording like another, and its run says how it was planned."""
     archive, published, _ = full_scan
     again = survey_sweeps(tmp_path / "again", f"{archive}/runs/{published.folder.name}")
-    assert digest_of_map(tmp_path / "again", again) == digest_of_map(archive, published)
+    assert digest_of_map(tmp_path / "again", again.receipt) == digest_of_map(archive, published.receipt)
     assert again.receipt["survey"] == published.receipt["survey"]
 
 
@@ -220,11 +225,225 @@ def test_a_straight_scan_is_a_recording(
     assert ("scan has no pointing: taken as an even straight scan" in notes) == (column is None)
     assert ("a pixel is taken to be as long as lines are apart, 0.05 m" in notes) == (column == "position_m")
     width, height = published.receipt["settings"]["size"]
-    assert (width, height) == ((64, 96) if column != "angle_deg" else (63, 95))
+    assert (width, height) == (64, 96)
     mosaic = load_mosaic(tmp_path / "a" / published.receipt["products"]["mosaic"]).values
     light = (values.astype(np.float64) - 60) / (3500 - 60)
     light = light[::-1] if column == "position_px" else light
-    coarse = light[:96, :64].reshape(24, 4, 16, 4, 3).mean(axis=(1, 3))
+    coarse = light.reshape(24, 4, 16, 4, 3).mean(axis=(1, 3))
     inner = (slice(2, 20), slice(2, 14))
     assert np.nanmax(np.abs(mosaic[inner] - coarse[inner])) < (0.02 if column != "angle_deg" else 0.2)
     assert published.receipt["recording"]["lines_read"] == 96
+
+
+def table(folder: Path, header: str, rows: Sequence[str]) -> None:
+    """Write the pointing table beside the cube of a straight scan."""
+    (folder / "scan.pointing.csv").write_text("\n".join([header, *rows]) + "\n")
+
+
+def change_header(folder: Path, old: str, new: str) -> None:
+    """Change what the cube's header says."""
+    header = folder / "scan.hdr"
+    assert old in header.read_text()
+    header.write_text(header.read_text().replace(old, new))
+
+
+def shuffle_bytes(folder: Path) -> None:
+    """Say the other byte order than the file has."""
+    change_header(folder, "byte order = 0", "byte order = 1")
+
+
+def few_lines(folder: Path) -> None:
+    """Point every line 3 px after the one before, which no scan of every line can be made of."""
+    table(folder, "position_px", [str(3 * line) for line in range(96)])
+
+
+def two_ways(folder: Path) -> None:
+    """Say that the scan turns back half way."""
+    table(folder, "position_px", [str(line if line < 48 else 96 - line) for line in range(96)])
+
+
+Fault = Callable[[Path], None]
+BAD: dict[str, tuple[Fault, list[str], str]] = {
+    "fewer rows": (
+        lambda at: table(at, "position_px", [str(line) for line in range(95)]),
+        [],
+        "has 95 rows for scan, fewer than its 96 lines; give one row for each line",
+    ),
+    "angles beyond the mirror": (
+        lambda at: table(at, "angle_deg", [str(line) for line in range(96)]),
+        [],
+        r"row 53: angle_deg = 51 .*beyond the mirror, which turns the view by up to 50 deg.*correct the table",
+    ),
+    "times that do not rise": (
+        lambda at: table(at, "time,position_px", [f"{0.1 * min(line, 40)},{line}" for line in range(96)]),
+        [],
+        "row 43: time = 4 .*expected a time after that of the line before",
+    ),
+    "another interleave": (
+        lambda at: (at / "scan.img").rename(at / "scan.bip") and None,
+        [],
+        "says interleave = bil, and the name of scan.bip says bip; correct the header, or rename the file",
+    ),
+    "another byte order": (shuffle_bytes, [], "has the wrong byte order: .*Write the other byte order"),
+    "no wavelengths": (
+        lambda at: change_header(at, "wavelength = {640, 550, 460}", ""),
+        [],
+        "has 3 bands and nothing says their wavelengths; give --wavelengths in nm",
+    ),
+    "a scan that turns": (two_ways, [], "turns back at line .*give each way of the scan a sweep of its own"),
+    "a dark frame of another camera": (
+        lambda at: np.save(at / "other.npy", np.zeros((50, 3))),
+        ["--dark", "other.npy"],
+        r"the dark frame .* is \(50, 3\) \(sample, band\), the cube \(64, 3\)",
+    ),
+    "lines that were never taken": (
+        few_lines,
+        ["--scan-step", "1"],
+        "line 0 of sweep scan-0 was never taken: .*no finer than they were recorded",
+    ),
+    "lines too far apart": (
+        lambda at: table(at, "position_px", [str(9 * line) for line in range(96)]),
+        [],
+        "the lines of the recording lie 9 px .* apart, and a uniform scan may have up to 8 px",
+    ),
+    "no such table": (lambda at: None, ["--pointing", "nowhere.csv"], "there is no pointing table .*nowhere.csv"),
+    "no such recording": (lambda at: None, ["--sweeps", "nowhere"], "there is no recording nowhere; check the name"),
+    "a scene beside it": (
+        lambda at: None,
+        ["--scene", "farm"],
+        "--scene = 'farm', and the field of recorded sweeps is what they show; leave it out",
+    ),
+    "the simulated rig": (
+        lambda at: None,
+        ["--source", "sim"],
+        "--sweeps is for recorded sweeps, and source = 'sim'; give --source recorded",
+    ),
+    "a part of the field": (
+        lambda at: None,
+        ["--look", "part", "--seconds", "5"],
+        "--look = 'part' chooses lines and exposures for a camera that looks again",
+    ),
+    "two scans": (lambda at: None, ["--scan", "recorded", "--budget", "0.5"], "one plain scan .*leave one of them out"),
+}
+
+
+@pytest.mark.parametrize(("fault", "flags", "message"), BAD.values(), ids=BAD)
+def test_bad_input_gives_one_message(
+    command_line: CommandLine,
+    monkeypatch: pytest.MonkeyPatch,
+    pushbroom: tuple[Path, NDArray[np.uint16]],
+    weights: Path,
+    fault: Fault,
+    flags: list[str],
+    message: str,
+) -> None:
+    """By the command line: one message with value and remedy, no traceback, and no archive."""
+    folder, _ = pushbroom
+    monkeypatch.chdir(folder)
+    fault(folder)
+    asked = ["--engine", "plain", "--out", "a", "--weights", weights]
+    sweeps = [] if "--sweeps" in flags else ["--sweeps", "scan.hdr"]
+    ended = command_line("survey", *sweeps, *asked, *flags)
+    ended.refused(2 if ended.code == 2 else 1, message)  # 2 where settings alone are wrong
+    assert not (folder / "a").exists()
+
+
+def test_source_without_sweeps(command_line: CommandLine, tmp_path: Path) -> None:
+    """A recording has to lie somewhere."""
+    command_line("survey", "--source", "recorded", "--scene", "field", "--out", tmp_path / "a").refused(
+        2, "source = 'recorded' reads sweeps that were taken before; give --sweeps"
+    )
+
+
+def test_what_is_missing_is_assumed_and_said(
+    command_line: CommandLine, tmp_path: Path, pushbroom: tuple[Path, NDArray[np.uint16]], weights: Path
+) -> None:
+    """Without dark and white frames, and cut off after two thirds, a cube is surveyed; notes say what was taken for."""
+    folder, _ = pushbroom
+    for frame in ("dark", "white"):
+        (folder / f"scan.{frame}.hdr").unlink()
+    content = (folder / "scan.img").read_bytes()
+    (folder / "scan.img").write_bytes(content[: len(content) * 2 // 3])
+    flags = ("--weights", weights, "--engine", "plain", "--out", tmp_path / "a", "--json")
+    ended = command_line("survey", "--sweeps", folder / "scan.hdr", *flags)
+    assert ended.code == 0, ended.err
+    notes = " ".join(json.loads(ended.out)["settings"]["notes"])
+    for words in (
+        "is cut off: 64 of 96 lines are whole",
+        "a dark level of 0 is assumed; give --dark",
+        "full scale (4095 DN) is assumed to be white",
+        "nothing says the exposure: 100 ms is assumed",
+    ):
+        assert words in notes
+
+
+def test_init_drafts_what_the_files_do_not_say(
+    command_line: CommandLine, tmp_path: Path, pushbroom: tuple[Path, NDArray[np.uint16]], weights: Path
+) -> None:
+    """A folder of sweeps gives a survey.toml that says what is missing, and its next command surveys it."""
+    folder, _ = pushbroom
+    ended = command_line("init", folder, "--json")
+    assert ended.code == 0, ended.err
+    told = json.loads(ended.out)
+    assert (told["sweeps"], told["lines"], told["bands"]) == (["scan.hdr"], 96, 3)
+    text = (folder / "survey.toml").read_text()
+    assert '# pointing = "pointing.csv"   # where each line looked, a row a line; without it one straight' in text
+    assert "# the dark frame is here" in text
+    words = shlex.split(told["next"])[1:]
+    words[words.index("WEIGHTS.safetensors")] = str(weights)
+    surveyed = command_line(*words, "--engine", "plain", "--out", tmp_path / "a", "--json")
+    assert surveyed.code == 0, surveyed.err
+    assert json.loads(surveyed.out)["recording"]["lines_read"] == 96
+    command_line("init", folder).refused(1, r"there is a .*survey\.toml already; .*--force")
+    assert command_line("init", folder, "--force").code == 0
+    assert (folder / "survey.toml.old").read_text() == text
+
+
+def test_ingest_names_the_survey_as_the_next_step(
+    command_line: CommandLine, tmp_path: Path, pushbroom: tuple[Path, NDArray[np.uint16]], weights: Path
+) -> None:
+    """Its next command surveys the stored cube with the frames that were stored with it."""
+    folder, _ = pushbroom
+    frames = ("--dark", folder / "scan.dark.hdr", "--white", folder / "scan.white.hdr")
+    ended = command_line("ingest", folder / "scan.hdr", tmp_path / "store", *frames)
+    line = next(line for line in ended.err.splitlines() if line.startswith("next: "))
+    words = shlex.split(line.removeprefix("next: "))[1:]
+    assert words[:3] == ["survey", "--source", "recorded"]
+    words[words.index("WEIGHTS.safetensors")] = str(weights)
+    surveyed = command_line(*words, "--engine", "plain", "--out", tmp_path / "a", "--json")
+    assert surveyed.code == 0, surveyed.err
+    of_files = survey_sweeps(tmp_path / "b", folder / "scan.hdr", weights=str(weights))
+    assert digest_of_map(tmp_path / "a", json.loads(surveyed.out)) == digest_of_map(tmp_path / "b", of_files.receipt)
+
+
+def test_a_run_of_the_rig_is_reprocessed_from_its_raw_cubes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weights: Path
+) -> None:
+    """Once captures have a newer version the rig is not asked: the same map, once, and nothing is left to do."""
+    archive = tmp_path / "rig"
+    with emulated(rig_settings(archive, weights), {}, monkeypatch, scene=field()):
+        published = run_survey(rig_settings(archive, weights, scan_step=2), QUIET)
+    be_version(monkeypatch, "capture", 99)
+    assert run_reprocess(ReprocessRequest(archive), QUIET) == 0
+    first, second = Archive.open(archive).runs()
+    again = load_receipt(second)
+    assert first == published.folder
+    assert (again["source"], again["survey"]) == ("recorded", published.receipt["survey"])
+    assert digest_of_map(archive, again) == digest_of_map(archive, published.receipt)
+    assert run_reprocess(ReprocessRequest(archive), QUIET) == 0
+    assert len(Archive.open(archive).runs()) == 2
+
+
+def test_a_recording_whose_files_moved_is_reprocessed(
+    tmp_path: Path, pushbroom: tuple[Path, NDArray[np.uint16]], weights: Path, make_weights: WeightsMaker
+) -> None:
+    """New weights read the raw cubes that the archive has of it."""
+    folder, _ = pushbroom
+    archive = tmp_path / "a"
+    survey_sweeps(archive, folder / "scan.hdr", weights=str(weights))
+    folder.rename(tmp_path / "elsewhere")
+    other = make_weights(dim=24)
+    assert run_reprocess(ReprocessRequest(archive, weights=other), QUIET) == 0
+    again = load_receipt(Archive.open(archive).runs()[-1])
+    fresh = survey_sweeps(tmp_path / "b", tmp_path / "elsewhere" / "scan.hdr", weights=str(other))
+    assert digest_of_map(archive, again) == digest_of_map(tmp_path / "b", fresh.receipt)
