@@ -365,15 +365,15 @@ def _recorded_wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[
         yield "source = 'recorded' reads sweeps that were taken before; give --sweeps, where they lie"
     if settings.scene != RIG_FIELD:
         yield (
-            f"{place_of('scene', origin.get('scene'))} = {settings.scene!r}, and the field of recorded sweeps is what they "
-            "show; leave it out, and give --labels FILE where there are some"
+            f"{place_of('scene', origin.get('scene'))} = {settings.scene!r}, and the field of recorded sweeps is what "
+            "they show; leave it out, and give --labels FILE where there are some"
         )
     if settings.bands is not None:
         yield f"{place_of('bands', origin.get('bands'))} is for scenes: all bands of a recording are read; leave it out"
     if settings.look == LOOK_PART:
         yield (
-            f"{place_of('look', origin.get('look'))} = 'part' chooses lines and exposures for a camera that looks again,"
-            " and a recording has those that were taken; leave it out"
+            f"{place_of('look', origin.get('look'))} = 'part' chooses lines and exposures for a camera that looks "
+            "again, and a recording has those that were taken; leave it out"
         )
 
 

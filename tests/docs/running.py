@@ -110,8 +110,9 @@ class Reader:
 
     def _matching(self, word: str) -> list[str]:
         """Names that a word with stars stands for, as a shell gives them; the word itself where there are none."""
-        found = sorted(path.relative_to(self.folder).as_posix() for path in self.folder.glob(word)) if "*" in word else []
-        return found or [word]
+        if "*" not in word:
+            return [word]
+        return sorted(path.relative_to(self.folder).as_posix() for path in self.folder.glob(word)) or [word]
 
     def _elsewhere(self, block: Block, flags: str) -> None:
         """Run the commands with the copy of the folders, in a process of its own."""
