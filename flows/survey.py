@@ -24,6 +24,8 @@ from flows.tasks.stages.effects import choose_effects
 from flows.tasks.stages.maps import draw_map
 from flows.tasks.stages.on_ground import ground
 from flows.tasks.stages.placement import cut_patches, locate, rectify, register_coarse, register_fine
+from flows.tasks.stages.raster import average_raster, take_patches
+from storage.archive.keys import StageRef
 
 
 @flow(name="survey", flow_run_name="survey-{settings.name_of_run}", validate_parameters=True, persist_result=False)
@@ -59,6 +61,18 @@ def survey(settings: SurveySettings, capture_deployment: str | None = None) -> R
 
 def draw_class_map(plan: OpenSurvey) -> None:
     """Run the stages from the first pass to the class map; their stores are the products of the plan."""
+    if plan.is_map:  # the scene's own pixels: nothing is captured
+        mosaic = average_raster(plan)
+        request = attend(plan, mosaic)
+        class_map = draw_map(plan, mosaic, take_patches(plan, request))
+    else:
+        mosaic, class_map = _draw_captured(plan)
+    if plan.on_the_ground:
+        ground(plan, class_map, mosaic)
+
+
+def _draw_captured(plan: OpenSurvey) -> tuple[StageRef, StageRef]:
+    """Capture the field, go back for what the plan requests, and draw its map; return mosaic and map."""
     effects = choose_effects(plan)
     raw = capture_pass(plan, "coarse", effects)
     seams = register_coarse(plan, raw) if plan.registers else None
@@ -71,8 +85,7 @@ def draw_class_map(plan: OpenSurvey) -> None:
     patches = cut_patches(plan, request, raw, seams)
     class_map = draw_map(plan, mosaic, patches)
     compare_turned(plan, mosaic, request)
-    if plan.on_the_ground:
-        ground(plan, class_map, mosaic)
+    return mosaic, class_map
 
 
 def judge(plan: OpenSurvey, run: RunRef) -> RunRef:

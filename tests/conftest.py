@@ -151,11 +151,12 @@ def scene_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def survey_png(scene_files: Path, weights: Path) -> Survey:
-    """Survey scene.png with its labels on the plain engine into a folder; keywords change flags, None drops one."""
+    """Survey scene.png with its labels by the simulated rig into a folder; keywords change flags, None drops one."""
 
     def survey(out: Path, console: Console | None = None, **flags: Any) -> Published:
         given = {
             "scene": str(scene_files / "scene.png"),
+            "source": "sim",
             "labels": str(scene_files / "labels.png"),
             "weights": str(weights),
             "engine": "plain",

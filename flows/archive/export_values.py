@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from flows.archive.export_layers import ExportedRun, Layer, Rows, layer_tags
 from flows.archive.product_choice import ProductChoice
+from flows.settings.survey_settings import RASTER
 from pipeline.errors import SettingsError
-from pipeline.geometry.grid import UNLABELLED
+from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.ground.map_grid import GroundGrid, grid_of_map, image_at, map_blocks
 from pipeline.ground.view import GroundView, RigPose
 from pipeline.products.areas import ShareEstimate, probable_shares, stratified_shares
@@ -29,6 +30,7 @@ from storage.arrays.class_maps import BeliefStore
 from storage.arrays.georeference import load_geobox
 from storage.arrays.ground_maps import load_bands, open_image
 from storage.arrays.layout import grid_of, read_array
+from storage.arrays.mosaics import PatchStore, open_patches
 from storage.export.image_files import CogImage, Place
 
 CSV = "text/csv"
@@ -125,6 +127,7 @@ class MosaicView:
     """A run's mosaic, as an image on the map where the run has a pose, else on its own grid."""
 
     run: ExportedRun
+    words = "Coarse mosaic"
 
     @cached_property
     def place(self) -> Place:
@@ -182,6 +185,65 @@ class MosaicView:
             yield first, out
 
 
+@dataclass(frozen=True)
+class RasterView:
+    """A raster's values on its own pixels: patches where the run kept them, elsewhere the coarse means."""
+
+    run: ExportedRun
+
+    @cached_property
+    def place(self) -> Place:
+        """Where the image lies."""
+        about = open_image(self.run.path("class_map"), "classes")
+        if about.geobox is not None:
+            return Place.on_map(about.geobox)
+        return Place(tuple(map(float, about.about["spatial:transform"])))
+
+    @cached_property
+    def shape(self) -> tuple[int, int]:
+        """(y, x) of the image [px]."""
+        rows, columns = open_image(self.run.path("class_map"), "classes").shape
+        return rows, columns
+
+    @cached_property
+    def grid(self) -> SceneGrid:
+        """The raster's grid, by the parameters of its map."""
+        drawn = self.run.store("class_map")
+        assert drawn is not None
+        return SceneGrid(**self.run.archive.manifest(drawn)["params"]["grid"])
+
+    @cached_property
+    def patches(self) -> PatchStore | None:
+        """The patches that the run kept; None where they were cleared away."""
+        ref = self.run.store("patches")
+        return None if ref is None else open_patches(self.run.path("patches"))
+
+    @property
+    def words(self) -> str:
+        """How much of the image is the raster's own pixels."""
+        kept, every = 0 if self.patches is None else len(self.patches.seats), len(self.grid.valid_seats())
+        s = self.grid.factor
+        if kept == every:
+            return "Pixels of the raster"
+        return f"Pixels of the raster in {kept} of {every} patches, means of {s} x {s} px elsewhere"
+
+    def rows(self, bands: Sequence[int]) -> Rows:
+        """Values (row, x, band) of some bands with the number of the first row, from the top down."""
+        grid, chosen = self.grid, list(bands)
+        p, s, (_, across) = grid.patch, grid.factor, grid.seat_shape
+        means = open_image(self.run.path("mosaic"), "values")
+        seats = np.empty(0, np.int64) if self.patches is None else self.patches.seats
+        for first in range(0, grid.height, p * s):  # rows that hold whole patches and whole means
+            coarse = read_array(means.group, "values", slice(first // s, first // s + p))[..., chosen]
+            rows = np.repeat(np.repeat(coarse, s, axis=0), s, axis=1)[: grid.height - first, : grid.width].copy()
+            entries = np.flatnonzero(seats // across // s == first // (p * s))
+            if self.patches is not None and len(entries):
+                for patch, (y, x) in zip(self.patches.pick(entries), grid.seat_origin(seats[entries]), strict=True):
+                    place = rows[y - first : y - first + p, x : x + p]
+                    place[...] = patch[: place.shape[0], : place.shape[1], chosen]
+            yield first, rows
+
+
 def _window_at(group: Any, pixels: NDArray[np.float64], factor: int, bands: Sequence[int]) -> Floats:
     """Values at scene places (row, column, 2), of which only the rows and columns around them are read."""
     known = pixels[np.isfinite(pixels).all(axis=-1)]
@@ -202,7 +264,7 @@ def spectral_layers(run: ExportedRun, choice: ProductChoice) -> list[Layer]:
     """
     if not (choice.reflectance or choice.indices):
         return []
-    view, (wave, _) = MosaicView(run), load_bands(run.path("mosaic"))
+    view, (wave, _) = _view(run), load_bands(run.path("mosaic"))
     picked = [pick_bands(index, wave) for index in choice.indices]
     white = _white(run)
     for index in choice.indices:
@@ -215,12 +277,18 @@ def spectral_layers(run: ExportedRun, choice: ProductChoice) -> list[Layer]:
     return layers + [_index(view, index, bands, white) for index, bands in zip(choice.indices, picked, strict=True)]
 
 
+def _view(run: ExportedRun) -> MosaicView | RasterView:
+    """Give a raster's own pixels, unless its map is drawn on the ground by a pose; else the coarse mosaic."""
+    taken = run.receipt["source"] == RASTER and run.store("ground_map") is None
+    return RasterView(run) if taken else MosaicView(run)
+
+
 def _white(run: ExportedRun) -> float:
     blocks = open_image(run.path("mosaic"), "values").rows()
     return white_level(np.concatenate([values[::SAMPLED, ::SAMPLED].reshape(-1) for _, values in blocks]))
 
 
-def _reflectance(view: MosaicView, white: float) -> Layer:
+def _reflectance(view: MosaicView | RasterView, white: float) -> Layer:
     wave, width = load_bands(view.run.path("mosaic"))
     image = CogImage(
         view.shape,
@@ -228,11 +296,11 @@ def _reflectance(view: MosaicView, white: float) -> Layer:
         view.place,
         tuple(f"{centre:.1f} nm" for centre in wave.tolist()),
         np.nan,
-        tags={**layer_tags(view.run, "mosaic", view.place), "values": _words(white)},
+        tags={**layer_tags(view.run, "mosaic", view.place), "values": _words(white), "pixels": view.words},
         wavelength_nm=wave.tolist(),
         fwhm_nm=None if width is None else width.tolist(),
     )
-    title = f"Coarse mosaic, {len(wave)} bands: {_words(white)}"
+    title = f"{view.words}, {len(wave)} bands: {_words(white)}"
     return Layer("reflectance", title, ("data", "reflectance"), image, lambda: view.rows(range(len(wave))), "1")
 
 
@@ -240,10 +308,10 @@ def _words(white: float) -> str:
     return "reflectance, 0 to 1" if white == 1.0 else "values of the scene, not reflectance"
 
 
-def _index(view: MosaicView, index: SpectralIndex, bands: Sequence[int], white: float) -> Layer:
+def _index(view: MosaicView | RasterView, index: SpectralIndex, bands: Sequence[int], white: float) -> Layer:
     wave = load_bands(view.run.path("mosaic"))[0][list(bands)].tolist()
     taken = ", ".join(f"{band.symbol} {nm:.1f} nm" for band, nm in zip(index.bands, wave, strict=True))
-    tags = {"index": index.name, "bands": taken, "reference": index.reference}
+    tags = {"index": index.name, "bands": taken, "reference": index.reference, "pixels": view.words}
     about = layer_tags(view.run, "mosaic", view.place) | tags
     image = CogImage(view.shape, "float32", view.place, (index.name,), np.nan, tags=about)
 

@@ -20,15 +20,22 @@ def field_figures(run: SurveyRun, fine: FinePlan | None) -> dict[str, Any]:
     """Figures of the field and of the captures as JSON tells them; None for what nobody knows.
 
     ``fine`` is the fine pass where it is planned already, else it takes what the budget leaves at most. Hectares are
-    those that the survey keeps to, and those an hour are of all of the camera's seconds.
+    those that the survey keeps to, and those an hour are of all of the camera's seconds. A raster has no camera: no
+    view but by a pose, no seconds, no lines.
     """
     scale, fine_s = run.zones.place.scale(run.camera.ifov_rad), run.plan.fine_s if fine is None else fine.seconds
     seconds = run.plan.coarse_s + fine_s
     kept = _kept(run, scale)
-    footprint = scale.footprint
+    footprint, captured = scale.footprint, run.raster is None
+    camera_s = {"coarse": run.plan.coarse_s, "fine": fine_s, "all": seconds, "full_scan": run.plan.full_s}
+    lines = {
+        "coarse": sum(sweep.lines for sweep in run.plan.coarse),
+        "fine": None if fine is None else fine.lines,
+        "full_scan": sum(sweep.lines for sweep in run.plan.full),
+    }
     return {
         "size_px": [scale.shape[1], scale.shape[0]],
-        "view_deg": [scale.view_deg[1], scale.view_deg[0]],
+        "view_deg": [scale.view_deg[1], scale.view_deg[0]] if captured or footprint is not None else None,
         "ground_pixel_m": scale.pixel_m,
         "range_m": None
         if footprint is None
@@ -37,15 +44,11 @@ def field_figures(run: SurveyRun, fine: FinePlan | None) -> dict[str, Any]:
         "footprint_east_north_m": None if footprint is None else footprint.outline_m.tolist(),
         "hectares": kept.hectares,
         "kept_share": None if run.zones.kept is None else float(run.zones.kept.kept.mean()),
-        "camera_s": {"coarse": run.plan.coarse_s, "fine": fine_s, "all": seconds, "full_scan": run.plan.full_s},
+        "camera_s": camera_s if captured else None,
         "fine_planned": fine is not None or run.plan.plain,
-        "lines": {
-            "coarse": sum(sweep.lines for sweep in run.plan.coarse),
-            "fine": None if fine is None else fine.lines,
-            "full_scan": sum(sweep.lines for sweep in run.plan.full),
-        },
-        "hectares_per_hour": kept.hectares_per_hour(seconds),
-        "full_scan_hectares_per_hour": kept.hectares_per_hour(run.plan.full_s),
+        "lines": lines if captured else None,
+        "hectares_per_hour": kept.hectares_per_hour(seconds) if captured else None,
+        "full_scan_hectares_per_hour": kept.hectares_per_hour(run.plan.full_s) if captured else None,
     }
 
 
@@ -61,14 +64,17 @@ def _kept(run: SurveyRun, scale: FieldScale) -> FieldScale:
 
 def figure_lines(figures: Mapping[str, Any]) -> list[str]:
     """The figures in words, a line each."""
-    (width, height), (across, down), camera = figures["size_px"], figures["view_deg"], figures["camera_s"]
-    lines = [f"field: {width} x {height} px, {across:.3g} x {down:.3g} degrees{_ground_words(figures)}"]
+    (width, height), view, camera = figures["size_px"], figures["view_deg"], figures["camera_s"]
+    degrees = "" if view is None else f", {view[0]:.3g} x {view[1]:.3g} degrees"
+    lines = [f"field: {width} x {height} px{degrees}{_ground_words(figures)}"]
     if figures["kept_share"] is not None:
         lines.append(f"zones: {format_percent(figures['kept_share'])} of the field is kept to")
     if figures["ground_pixel_m"] is None:
         lines.append(NO_METRES)
     else:
         lines.append(f"ground: {format_metres(figures['ground_pixel_m'])} a pixel{_range_words(figures)}")
+    if camera is None:
+        return [*lines, "camera: none; the pixels of the raster are taken as they are"]
     known = "" if figures["fine_planned"] else " at most, chosen once the coarse pass was looked at"
     parts = f"coarse {format_seconds(camera['coarse'])}, fine {format_seconds(camera['fine'])}{known}"
     lines.append(

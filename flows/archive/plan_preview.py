@@ -172,7 +172,8 @@ def _over(shown: PlanPicture) -> str:
 def _write_words(figure: Figure, shown: PlanPicture) -> None:
     run, high = shown.run, figure.get_figheight()
     figure.text(0.06, 1 - 0.3 / high, f"{run.name}: the plan", size=17, weight="bold", va="center")
-    marks: list[Any] = [Line2D([], [], color=COARSE, label="the scan" if run.plan.plain else "coarse sweeps")]
+    scans = "the scan" if run.plan.plain else "coarse sweeps"
+    marks: list[Any] = [Line2D([], [], color=COARSE, label=scans)] if run.plan.coarse else []
     if shown.fine is not None and shown.fine.sweeps:
         marks.append(Patch(facecolor=FINE, alpha=0.5, label="fine runs"))
     if run.zones.area:

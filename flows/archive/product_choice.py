@@ -22,7 +22,9 @@ ROWS = "rows"  # said as a heading: along the crop rows
 class ProductFlags:
     """What was given of the products to make of a run."""
 
-    reflectance: Annotated[Switch, Parameter(help="Also the coarse mosaic with all bands, as GeoTIFF.")] = False
+    reflectance: Annotated[
+        Switch, Parameter(help="Also all bands as GeoTIFF: the coarse mosaic, of a raster its own pixels.")
+    ] = False
     indices: Annotated[
         str | None, Parameter(help="Spectral indices to write as GeoTIFF, with commas: NDVI,NDRE,MCARI,PRI.")
     ] = None

@@ -44,6 +44,7 @@ from flows.tasks.scene import for_rig
 from flows.tasks.scores import score_of
 from flows.tasks.stages.accuracy import evaluate
 from flows.tasks.stages.placement import cut_patches
+from flows.tasks.stages.raster import take_patches
 from flows.terminal.figures import counted, format_points, format_seconds
 from flows.terminal.processes import DONE, FAILED, PARTLY
 from flows.terminal.progress import StageProgress, put_out
@@ -301,7 +302,7 @@ def run_judge(
     if labels is not None:
         settings = replace(settings, labels=labels)
     there = "accuracy" in receipt and labels is None
-    if there and (receipt["accuracy"]["controls"] or settings.plain or not settings.controls):
+    if there and (receipt["accuracy"]["controls"] or _places_none(settings) or not settings.controls):
         console.print(escape(f"{found.uri} has its accuracy already"), soft_wrap=True)
         return receipt
     use_one_thread()
@@ -315,7 +316,7 @@ def run_judge(
             if stage is not None and stage.name != evaluate.name and row.get("key"):
                 what = f"{stage.title} of {found.uri}"
                 survey.products[stage.name] = _store(catalogue, run.archive, what, str(row["key"]))
-        for name in (*JUDGED[:4], "attend"):
+        for name in _needed(survey):
             if name not in survey.products:
                 raise ArchiveError(f"the {TITLES[name]} of {found.uri} is missing or damaged; run verify --repair")
         _check_same(catalogue, found, survey.products, run)
@@ -326,12 +327,26 @@ def run_judge(
             raise ArchiveError(f"{found.uri} is being judged by another process; it adds the accuracy")
         with draft:
             made = survey.products
-            if catalogue.stores[made["cut_patches"].uri].cleared:
+            if catalogue.stores[made.patches.uri].cleared and survey.is_map:
+                take_patches(survey, made["attend"])
+            elif catalogue.stores[made.patches.uri].cleared:
                 last = "coarse" if survey.uniform else "fine"
                 cut_patches(survey, made["attend"], *made.there(f"capture_{last}", f"register_{last}"))
             published = extend_with_accuracy(survey, draft, evaluate(survey, *made.there(*JUDGED)))
     show_published(published, settings.out, console)
     return published.receipt
+
+
+def _places_none(settings: Settings) -> bool:
+    """Return whether a survey placed no patches, so that no other placement is judged beside it."""
+    return settings.plain and not settings.is_map
+
+
+def _needed(survey: OpenSurvey) -> tuple[str, ...]:
+    """Return the stages by whose stores a map is judged."""
+    if survey.is_map:
+        return ("average_raster", "take_patches", "draw_map", "attend")
+    return ("rectify", "cut_patches", "draw_map", "choose_effects", "attend")
 
 
 def _store(catalogue: Catalogue, archive: Archive, what: str, key: str) -> StageRef:

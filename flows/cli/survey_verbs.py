@@ -128,7 +128,7 @@ def simulate(
         A PNG to write: lines with everything on and exact, the same as simulated, and where they differ, with the times
         of both. Takes all lines once more both ways, or as many as about a minute allows.
     """
-    given = {"scene": scene, "out": out, **by_setting(flags)}
+    given = {"scene": scene, "out": out, "source": "sim", **by_setting(flags)}
     record = simulate_command.run_simulate(load_settings(settings, given), stderr, coarse=coarse, picture=compare)
     if as_json:
         print_json(record)

@@ -61,6 +61,7 @@ class QuicklookData:
     along: Axis = "x"  # of the scene along which the raw lines lie
     note: str = ""  # at the end of the title line, such as the accuracy
     scan: bool = False  # a plain scan, which looked nowhere twice
+    raster: bool = False  # no lines were taken: ``raw`` is the image of its coarse means
 
 
 def draw_quicklook(path: str | Path, panels: QuicklookData) -> None:
@@ -122,7 +123,13 @@ def _arrange(tallness: float) -> tuple[float, list[tuple[float, list[tuple[float
 
 
 def _draw_raw(axes: Axes, data: QuicklookData) -> None:
-    """Panel 1, first half: the sweeps as they came, next to each other, stretched to the field's shape."""
+    """Panel 1, first half: the sweeps as they came, next to each other, stretched to the field's shape.
+
+    Of a raster the means that attention looks at.
+    """
+    if data.raster:
+        _show(axes, colours_of(data, data.raw[0]), interpolation="nearest")
+        return _caption(axes, "1  Coarse means", "of the raster: what attention looks at first")
     sweeps = [colours_of(data, np.asarray(sweep)) for sweep in data.raw]
     tall, gap = max(one.shape[0] for one in sweeps), max(1, sum(one.shape[1] for one in sweeps) // 60)
     image = np.full((tall, sum(one.shape[1] for one in sweeps) + gap * (len(sweeps) - 1), 3), 0.98, np.float32)
@@ -134,14 +141,14 @@ def _draw_raw(axes: Axes, data: QuicklookData) -> None:
     axes.set_aspect("auto")
     count, kind = len(data.raw), "sweep" if data.policy is None or data.scan else "coarse sweep"
     words = f"{count} {kind}{'s' if count != 1 else ''}, {data.raw_lines} lines as they came"
-    _caption(axes, "1  Raw lines", words)
+    return _caption(axes, "1  Raw lines", words)
 
 
 def _draw_rectified(axes: Axes, data: QuicklookData) -> None:
     _, words = choose_bands(data.wavelength_nm)
     _show(axes, colours_of(data, data.rectified))
     draw_scale(axes, data.class_map.shape, data.pixel_mrad)
-    _caption(axes, "Rectified", words)
+    _caption(axes, "Raster" if data.raster else "Rectified", words)
 
 
 def colours_of(data: QuicklookData, image: NDArray[np.generic]) -> NDArray[np.float32]:

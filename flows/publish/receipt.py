@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Literal, NotRequired, TypedDict, cast, get_args
 
+from flows.settings.survey_settings import RASTER
 from flows.tasks.scores import JUDGING
 from pipeline.errors import ShapeError
 from storage.archive.records import StageRecord, State
@@ -47,13 +48,16 @@ class Split(Saving):
 
 
 class Savings(TypedDict):
-    """What the run spent against every line at full resolution; seconds against a scan that is nearly as good."""
+    """What the run spent against every line at full resolution; seconds against a scan that is nearly as good.
 
-    lines: Saving
-    samples: Saving
-    bytes_raw: Saving
+    Of a raster, of which nothing is captured, against keeping and reading every pixel.
+    """
+
+    lines: NotRequired[Saving]
+    samples: NotRequired[Saving]
+    bytes_raw: NotRequired[Saving]
     bytes_stored: Saving
-    capture_s: SecondsSaved
+    capture_s: NotRequired[SecondsSaved]
     tokens: Saving
     multiply_adds: Split
     segment_wall_s: NotRequired[dict[str, float]]
@@ -143,6 +147,7 @@ class Header:
 
 
 COSTS = ("lines", "samples", "bytes_raw", "bytes_stored", "capture_s", "tokens", "multiply_adds")
+OF_A_RASTER = ("bytes_stored", "tokens", "multiply_adds")  # of which nothing is captured
 FINDINGS = (
     "field",
     "plan",
@@ -184,10 +189,11 @@ def build_receipt(
 ) -> Receipt:
     """Put a receipt together in its fixed order and check that nothing is missing (ShapeError names what is).
 
-    ``savings`` are `COSTS` and, where measured, ``segment_wall_s``, each with the fields of `Saving`. ``accuracy`` has
-    the fields of `Accuracy`, ``judged`` is when it was worked out; None where the map is not judged, or not yet:
-    ``accuracy_is`` says which. ``simulation`` has ``effects``, rows with name, state, variant, bound, measured, cost_s,
-    why, unit, and ``total``, their sums; None for a source that is not simulated. ``findings``: see `FINDINGS`.
+    ``savings`` are `COSTS`, of a raster `OF_A_RASTER`, and, where measured, ``segment_wall_s``, each with the fields of
+    `Saving`. ``accuracy`` has the fields of `Accuracy`, ``judged`` is when it was worked out; None where the map is not
+    judged, or not yet: ``accuracy_is`` says which. ``simulation`` has ``effects``, rows with name, state, variant,
+    bound, measured, cost_s, why, unit, and ``total``, their sums; None for a source that is not simulated.
+    ``findings``: see `FINDINGS`.
     """
     receipt: dict[str, object] = {**asdict(header), "stages": [asdict(stage) for stage in stages]}
     receipt["savings"] = {name: savings[name] for name in (*COSTS, "segment_wall_s") if name in savings}
@@ -243,8 +249,9 @@ def check_receipt(receipt: Mapping[str, Any]) -> Receipt:
             place = f"receipt.stages[{number}].state"
             raise ShapeError(f"{place} must be one of {', '.join(get_args(State))}; got {stage['state']!r}")
     savings = receipt["savings"]
-    _need(savings, COSTS, "receipt.savings")
-    for name in COSTS:
+    costs = OF_A_RASTER if receipt["source"] == RASTER else COSTS
+    _need(savings, costs, "receipt.savings")
+    for name in costs:
         place = f"receipt.savings.{name}"
         _need(savings[name], _SAVING_FIELDS + (_SPLIT_FIELDS if name == "multiply_adds" else ()), place)
         if savings[name]["full_is"] not in ("measured", "predicted"):

@@ -33,9 +33,10 @@ def cost_rows(savings: Savings) -> list[dict[str, Any]]:
     rows = [
         {**entries[name], "label": label, "done": show(entries[name]["done"]), "full": show(entries[name]["full"])}
         for name, (label, show) in COST_LABELS.items()
+        if name in entries  # a raster takes no line and no second
     ]
-    if (before := entries["capture_s"].get("every_line_s")) is not None:
-        capture = entries["capture_s"]
+    capture = entries.get("capture_s", {})
+    if (before := capture.get("every_line_s")) is not None:
         told = {"full": format_seconds(before), "ratio": capture["done"] / before if before else None}
         rows.insert(1, {**rows[0], **told, "label": "beside every line at full exposure, as before"})
     if "segment_wall_s" in savings:

@@ -28,14 +28,17 @@ def headline(receipt: Receipt, looked_twice: float | None = None) -> str:
 
     ``looked_twice`` is the share of the field that was captured in detail, 0..1; None leaves it out.
     """
-    capture, plain = receipt["savings"]["capture_s"], receipt.get("plan", {}).get("kind") == "scan"
+    savings, kind = receipt["savings"], receipt.get("plan", {}).get("kind")
+    plain = kind in ("scan", "raster")
     if looked_twice == 0:
         twice = "The camera looked twice at nothing: no run of fine lines fits into the time left, or is worth it. "
     else:
         twice = (
             "" if looked_twice is None else f"The camera looked twice at {format_percent(looked_twice)} of the field. "
         )
-    text = f"{twice}{_capture_words(capture, receipt['settings'], plain=plain)}"
+    capture = savings.get("capture_s")
+    seen = _raster_words(savings) if capture is None else _capture_words(capture, receipt["settings"], plain=plain)
+    text = f"{twice}{seen}"
     accuracy = receipt.get("accuracy")
     if accuracy is None:
         return f"{text} The map is not judged yet: its accuracy is added once it is." if is_pending(receipt) else text
@@ -49,6 +52,15 @@ def headline(receipt: Receipt, looked_twice: float | None = None) -> str:
         f"{text} The map scores {format_points(accuracy['miou'])} of 100 against the truth{pixels}{coarse}"
         f"{detail}. {worst_class_words(accuracy, alone=whole)}"
     ).rstrip()
+
+
+def _raster_words(savings: Mapping[str, Any]) -> str:
+    """What reading and keeping a raster took beside all of its pixels."""
+    read, stored = (format_percent(savings[name]["ratio"]) for name in ("multiply_adds", "bytes_stored"))
+    return (
+        f"The raster's pixels were taken as they are: its map took {read} of the multiply-adds of reading every pixel, "
+        f"and {stored} of the bytes of keeping them."
+    )
 
 
 def _capture_words(capture: Mapping[str, Any], settings: Mapping[str, Any], *, plain: bool) -> str:
@@ -74,7 +86,7 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
     if field := found.get("field"):
         words.append(_field_words(field))
     if plan := found.get("plan"):
-        if plan["kind"] in ("full", "scan") and plan["reason"]:
+        if plan["kind"] in ("full", "scan", "raster") and plan["reason"]:
             words.append(_sentence(plan["reason"]))
         if plan["out_of_reach"]:
             words.append(f"{plan['out_of_reach']} places worth a second look lie beyond the mirror's range.")
@@ -103,7 +115,7 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
         )
     if scans := found.get("scans"):
         words.append(_scans_words(scans, read_whole="kept" not in found))
-    elif found.get("plan"):
+    elif plan and plan["kind"] != "raster":
         words.append(
             "The weights have no record of plain scans, so that seconds are told beside every line at full exposure; "
             "train --darkest-ms 3 makes one, by scenes kept for validation."
@@ -123,10 +135,16 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
 
 def _field_words(field: Mapping[str, Any]) -> str:
     """How large the field is and how finely it was seen; in metres and hectares where something says how large."""
-    across, down = field["view_deg"]
-    view = f"The field is {across:.3g} x {down:.3g} degrees of the view"
+    if field["view_deg"] is None:
+        width, height = field["size_px"]
+        view = f"The field is {format_count(width)} x {format_count(height)} px"
+    else:
+        across, down = field["view_deg"]
+        view = f"The field is {across:.3g} x {down:.3g} degrees of the view"
     if field["ground_pixel_m"] is None:
         return f"{view}."
+    if field["hectares_per_hour"] is None:  # a raster took no time
+        return f"{view}: {area_words(field['hectares'])} at {format_metres(field['ground_pixel_m'])} a pixel."
     away = "" if field["range_m"] is None else f", {format_metres(field['range_m']['median'])} away in the middle"
     pace = field["hectares_per_hour"]
     return (

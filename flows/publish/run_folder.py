@@ -30,6 +30,7 @@ from flows.tasks.memory import told_of_memory
 from flows.tasks.open_survey import STAGES, OpenSurvey, Products
 from flows.tasks.run import SurveyRun, now
 from flows.tasks.scan_choice import as_told
+from flows.tasks.seat_budget import BYTES_A_VALUE
 from flows.tasks.stages.accuracy import load_accuracy
 from flows.tasks.stages.attention import load_orientation, load_plan
 from flows.tasks.stages.capture import captured
@@ -105,7 +106,7 @@ def load_receipt(folder: Path) -> Receipt:
 
 def _publish(run: SurveyRun, draft: RunDraft, products: Products, plan: FinePlan, receipt: Receipt) -> Published:
     seats = len(run.grid.valid_seats())
-    looked_twice = None if run.plan.plain else float(seen_shares(run, products.of("cut_patches")).sum()) / seats
+    looked_twice = None if run.plan.plain else float(seen_shares(run, products.patches).sum()) / seats
     coarse = read_coarse(run, products)
     glance = quicklook_data(run, products, plan, receipt, coarse.colours)
     draw_quicklook(draft.folder / "quicklook.png", glance)
@@ -166,6 +167,8 @@ def asked_settings(run: SurveyRun) -> dict[str, object]:
 
 def _savings(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, Any]:
     """Everything done against the full scan; stored bytes of the full scan are predicted from the ratio seen here."""
+    if run.raster is not None:
+        return {"bytes_stored": _bytes_saved(run, products, plan), **_model_savings(run, plan)}
     bands = len(run.scene.wavelength_nm)
     done = [*run.plan.coarse, *plan.sweeps]
     entries = capture_savings(done, run.plan.full, run.camera, run.grid, cost=run.settings.cost, bands=bands)
@@ -174,13 +177,28 @@ def _savings(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, An
     like, kept = (plan.sweeps, stored[1]) if plan.sweeps else (run.plan.coarse, stored[0])
     of_these = capture_savings(like, run.plan.full, run.camera, run.grid, cost=run.settings.cost, bands=bands)
     full_stored = entries["bytes_raw"].full * kept / of_these["bytes_raw"].done
-    did, scan = work_done(run, plan.seats), work_of_map(run, run.grid.valid_seats())
-    config, valid = run.weights.config, len(run.grid.valid_seats())
-    cells, each = int(np.prod(run.grid.padded_shape)) // (config.patch * config.factor) ** 2, config.token_side**2
     return {
         **{name: entry.as_dict() for name, entry in entries.items()},
         "capture_s": _seconds_saved(run, run.plan.coarse_s + plan.seconds),
         "bytes_stored": SavingEntry(sum(stored), round(full_stored), "predicted").as_dict(),
+        **_model_savings(run, plan),
+    }
+
+
+def _bytes_saved(run: SurveyRun, products: Products, plan: FinePlan) -> dict[str, Any]:
+    """Stored bytes of a raster's means and patches beside those of all its patches, which would pack as these do."""
+    means, detail = (run.archive.stored_bytes(ref) for ref in (products.mosaic, products.patches))
+    valid, kept, bands = len(run.grid.valid_seats()), len(plan.seats), len(run.scene.wavelength_nm)
+    every = detail * valid / kept if kept else valid * run.grid.patch**2 * bands * BYTES_A_VALUE
+    return SavingEntry(means + detail, round(means + every), "predicted").as_dict()
+
+
+def _model_savings(run: SurveyRun, plan: FinePlan) -> dict[str, Any]:
+    """Tokens and multiply-adds of the map beside those of reading every patch."""
+    did, scan = work_done(run, plan.seats), work_of_map(run, run.grid.valid_seats())
+    config, valid = run.weights.config, len(run.grid.valid_seats())
+    cells, each = int(np.prod(run.grid.padded_shape)) // (config.patch * config.factor) ** 2, config.token_side**2
+    return {
         "tokens": SavingEntry(each * (cells + len(plan.seats)), each * (cells + valid), "predicted").as_dict(),
         "multiply_adds": {**SavingEntry(did.total, scan.total, "predicted").as_dict(), **asdict(did)},
     }
@@ -212,14 +230,16 @@ def quicklook_data(
     notes = [] if moment is None else [f"day {moment[0]}, {moment[1]:g} h"]
     if accuracy is not None and accuracy["miou"] is not None:
         notes.append(f"mIoU {100 * accuracy['miou']:.1f} %")
-    strips = sorted(captured(products.of("capture_coarse")), key=lambda cube: cube.sweep.strip_px)  # as they lie there
+    sweeps = [cube for ref in products.there("capture_coarse") for cube in captured(ref)]  # of a raster none
+    strips = sorted(sweeps, key=lambda cube: cube.sweep.strip_px)  # as they lie there
     return QuicklookData(
         survey=run.name,
         seed=run.settings.seed,
         about=_asked_words(run),
         policy=None if run.plan.plain and run.budget is None else run.settings.policy,
         scan=run.plan.plain,
-        raw=tuple(_calibrated(run, cube, chosen) for cube in strips),
+        raster=run.raster is not None,
+        raw=(coarse,) if run.raster is not None else tuple(_calibrated(run, cube, chosen) for cube in strips),
         raw_lines=sum(cube.sweep.lines for cube in strips),
         rectified=_both_scales(run, products, chosen, coarse),
         wavelength_nm=run.scene.wavelength_nm[chosen],
@@ -240,6 +260,8 @@ def quicklook_data(
 
 def _asked_words(run: SurveyRun) -> str:
     """How the field was looked at, in a few words."""
+    if run.raster is not None:
+        return "raster, taken as it is"
     if run.plan.plain:
         return scan_words(run.settings.scan_step or 1, run.settings.scan_exposure_ms or run.camera.exposure_ms)
     return f"budget {run.settings.budget:g}   ·   policy {run.settings.policy}"
@@ -265,7 +287,7 @@ def _both_scales(
     """The coarse mosaic at the scene's size with the fine patches laid in, (y, x, 3)."""
     s, p = run.grid.factor, run.grid.patch
     canvas = np.repeat(np.repeat(coarse, s, axis=0), s, axis=1)[: run.grid.height, : run.grid.width].copy()
-    store = open_patches(products.of("cut_patches").path / "patches.zarr")
+    store = open_patches(products.patches.path / "patches.zarr")
     for first in range(0, len(store.seats), SEATS_AT_ONCE):
         values = store.read(first, first + SEATS_AT_ONCE)[..., bands]
         for patch, (y, x) in zip(values, run.grid.seat_origin(store.seats[first : first + len(values)]), strict=True):
@@ -296,8 +318,9 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
         "score_per_second": plan.worth_per_second,
         "full_seconds": plan.full_seconds,
         "out_of_reach": plan.out_of_reach,
-        "orientation": load_orientation(products.of("compare_turned")),
     }
+    if run.raster is None:
+        told["orientation"] = load_orientation(products.of("compare_turned"))
     if plan.threshold is not None:  # what it left, and the score that was not worth more seconds
         told |= {
             "threshold": plan.threshold,
@@ -321,7 +344,7 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     passes = {"coarse": products.get("register_coarse"), "fine": products.get("register_fine")}
     pointing = {name: _pointing(ref) for name, ref in passes.items() if ref is not None}
     if "fine" in pointing:
-        pointing["fine"]["partly_seen"] = int(np.count_nonzero(seen_shares(run, products.of("cut_patches")) < 1))
+        pointing["fine"]["partly_seen"] = int(np.count_nonzero(seen_shares(run, products.patches) < 1))
     if pointing:
         found["pointing"] = {"prior_px": run.settings.pointing_px, **pointing}
     class_map = products.of("draw_map")
@@ -329,7 +352,8 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     posed = next((load_ground_map(ref.path / STORE) for ref in products.there("ground")), None)
     found |= find_ground(run, posed, drawn, BeliefStore(class_map.path / "belief.zarr")) | find_zones(run, drawn)
     found |= find_map(run, class_map, drawn)
-    troubled = {name: facts for name, facts in line_facts(products.of("rectify")).items() if any(facts.values())}
+    lines = {} if run.raster is not None else line_facts(products.mosaic)
+    troubled = {name: facts for name, facts in lines.items() if any(facts.values())}
     if troubled:
         found["lines"] = troubled
     return found
@@ -351,7 +375,7 @@ def _recording(run: SurveyRun, recorded: RecordedPasses, plan: FinePlan) -> dict
 
 def _stored_detail(run: SurveyRun, products: Products) -> int:
     """Bytes that coarse means and patches take as they are stored."""
-    return sum(run.archive.stored_bytes(products.of(stage)) for stage in ("rectify", "cut_patches"))
+    return sum(run.archive.stored_bytes(ref) for ref in (products.mosaic, products.patches))
 
 
 def _pointing(ref: StageRef) -> dict[str, Any]:

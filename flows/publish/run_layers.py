@@ -35,7 +35,7 @@ class CoarseRead:
 
 def read_coarse(run: SurveyRun, products: Products) -> CoarseRead:
     """Read the coarse mosaic once, never all bands of all rows at once."""
-    image = open_image(products.of("rectify").path / "mosaic.zarr", "values")
+    image = open_image(products.mosaic.path / "mosaic.zarr", "values")
     wavelength_nm = run.scene.wavelength_nm
     bands = list(choose_bands(wavelength_nm)[0])
     colours: list[NDArray[np.float32]] = []

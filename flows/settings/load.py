@@ -18,18 +18,23 @@ from pydantic import Field, PlainValidator, TypeAdapter, ValidationError
 from flows.settings.recorded_defaults import usual_of_recording
 from flows.settings.survey_settings import (
     BUILT_IN_SCENES,
+    OF_A_CAMERA,
     OF_A_PART,
+    OF_A_VIEW,
     OF_CHOOSING,
     OF_RECORDINGS,
     OF_TWO_PASSES,
     PATHS,
     PLAIN,
+    RASTER,
     RECORDED,
     REPLACED,
+    RIG,
     RIG_FIELD,
     SPARING,
     MapChoice,
     Settings,
+    source_of,
 )
 from flows.settings.values import LOOK_PART, LOOK_WHOLE, parse_moment, parse_text, to_whole, unit_guess
 from models.network.sizes import TRAINED_VGG_FROM, VGG_FROM
@@ -157,15 +162,50 @@ def load_settings(
             inner = table.get(head, {})
             table[head or key] = {**inner, tail: value} if head and isinstance(inner, Mapping) else value
             origin[key] = "flag"
-    given = {key for key, value in table.items() if value is not None}
-    for wrong in _contradictions(given, origin):
-        raise SettingsError(wrong)
+    if table.get("source") == SURVEY["source"].item.default:  # as if it were not said
+        del table["source"]
+    given = _given(table)
     recorded = of_this_version(usual_of_recording(table)) if "sweeps" in given else {}
     for name in TABLES:
         inner = table.get(name)
         if isinstance(inner, Mapping):
             table[name] = {**recorded.pop(name, {}), **inner}
-    return parse_settings({**_usual_policy(table), **(usual or {}), **recorded, **table}, origin)
+    asked = {**_usual_policy(table), **(usual or {}), **recorded, **table}
+    for wrong in (*_camera_of_a_map(asked, origin), *_contradictions(given, origin)):
+        raise SettingsError(wrong)
+    return parse_settings(asked, origin)
+
+
+def _is_usual(value: object, declared: Declared | None, origin: str | None) -> bool:
+    """Return whether a file, and no flag, says what is the default anyway."""
+    return declared is not None and origin != "flag" and declared.read(value, "") == declared.item.default
+
+
+def _given(table: Mapping[str, object]) -> set[str]:
+    return {key for key, value in table.items() if value is not None}
+
+
+def _camera_of_a_map(table: Mapping[str, object], origin: Mapping[str, str]) -> Iterator[str]:
+    """Settings that only a camera has, beside a scene whose pixels are taken as they are.
+
+    Those of a file that say what is the default anyway, as those of the example do, ask for nothing.
+    """
+    scene = table.get("scene") or SURVEY["scene"].item.default
+    if (table.get("source") or source_of(str(scene))) != RASTER:
+        return
+    view = OF_A_VIEW if table.get("pose") is not None else ()
+    for name in OF_A_CAMERA:
+        value = table.get(name)
+        items = value if name in TABLES and isinstance(value, Mapping) else {name: value}
+        declared, head = (TABLES[name], f"{name}.") if name in TABLES else (SURVEY, "")
+        for key, one in items.items():
+            full = key if key == name else head + key
+            if one is not None and full not in view and not _is_usual(one, declared.get(key), origin.get(full)):
+                yield (
+                    f"{place_of(full, origin.get(full))} is of a camera, and the scene {scene} is a raster"
+                    " whose pixels are taken as they are: leave it out, or give --source sim to have the simulated rig"
+                    " photograph the file"
+                )
 
 
 def _usual_policy(table: Mapping[str, object]) -> dict[str, object]:
@@ -316,8 +356,10 @@ def _scene_wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str
     if bands is not None and wavelengths is not None and len(bands) != len(wavelengths):
         place = place_of("wavelengths", origin.get("wavelengths"))
         yield f"{place} must have one value for each of the {len(bands)} bands, got {len(wavelengths)}"
-    if scene == RIG_FIELD and settings.source == "sim":
+    if scene == RIG_FIELD and settings.source not in (RIG, RECORDED):
         yield f"scene {RIG_FIELD!r} is what stands before a rig: give --source rig, or a file"
+    if settings.is_map and scene in BUILT_IN_SCENES:
+        yield f"source 'raster' takes the pixels of a file, and {scene} is drawn: give --source sim, or a file"
     if settings.size is not None and scene not in (*BUILT_IN_SCENES, RIG_FIELD):
         yield f"size is for built-in scenes ({', '.join(BUILT_IN_SCENES)}); {scene} has its own"
     for name, value in {"day": settings.day, "hour": settings.hour}.items():
@@ -401,8 +443,8 @@ def _sparing_wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[s
     given = [place_of(name, origin.get(name)) for name in SPARING if getattr(settings, name) is not None]
     if given and not settings.plain:
         yield (
-            f"{given[0]} is for a plain scan, of which a part is kept and read in detail: give --seconds or --scan-step"
-            " too; what a survey in two passes looks at in detail, its --budget says"
+            f"{given[0]} is for a raster or a plain scan, of which a part is kept and read in detail: give --seconds or"
+            " --scan-step too; what a survey in two passes looks at in detail, its --budget says"
         )
     if given and settings.look != LOOK_WHOLE:
         place = place_of("look", origin.get("look"))

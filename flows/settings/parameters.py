@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, create_model, mo
 
 from flows.settings.documents import about, shown
 from flows.settings.load import SURVEY, TABLES, Declared, anchor_paths, load_settings
-from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
+from flows.settings.survey_settings import AUTO, BUILT_IN_SCENES, Settings
 from pipeline.errors import PipelineError
 
 OF_LISTS = {"bands": list[int], "wavelengths": list[float], "size": list[int]}  # also as text: 0-3,7
@@ -83,7 +83,7 @@ class SurveySettings(_Declared):  # type: ignore[misc]
     def of(cls, settings: Settings) -> SurveySettings:
         """Return the parameters of settings; within this process they are these very settings, passwords too."""
         table = anchor_paths(settings.to_dict(), Path.cwd())
-        usual = Settings().to_dict()
+        usual = Settings().to_dict() | {"source": AUTO}  # another machine is told which it is
         given = {name: _changed(value, usual.get(name)) for name, value in table.items() if value != usual.get(name)}
         tables = {name: _model(name).model_construct(**value) for name, value in given.items() if name in TABLES}
         made: SurveySettings = cls.model_construct(**given | tables)

@@ -53,7 +53,6 @@ USUAL_SIZE = f"{FARM_SHAPE[1]}x{FARM_SHAPE[0]}"
 RIG_FIELD = "field"  # the scene of which only the rig, or a recording, knows more than size and bands
 OF_THE_MACHINE = ("scheduler", "workers", "device")  # what of that day need not be there today
 OF_A_PART = ("refresh", "doubt")  # of what a field that is remembered is looked at by
-RECORDED = "recorded"  # the source, and the uniform scan that takes a recording's own lines
 OF_RECORDINGS = ("sweeps", "pointing", "dark", "white", "scan")
 PLAIN = ("seconds", "bytes_raw", "goal", "scan_step", "scan")  # settings of which one asks for a plain scan
 SPARING = ("compute", "bytes_kept", "least_gain")  # by which a plain scan is kept and read in detail in part
@@ -63,6 +62,14 @@ PATHS = (
     *("scene", "labels", "sweeps", "pointing", "dark", "white", "out", "mask", "vgg", "weights"),
     *("zones.area", "zones.no_go", "zones.plots"),
 )
+AUTO, SIM, RIG, RASTER = "auto", "sim", "rig", "raster"  # where pixels come from
+RECORDED = "recorded"  # likewise, and the uniform scan that takes a recording's own lines
+# of a camera alone: tables, and settings beside them
+OF_A_CAMERA = (
+    *("camera", "optics", "mirror", "detector", "air", "sky", "cost", "rig", *PLAIN, "scan_exposure_ms"),
+    *("coarse_exposure_ms", "budget", "threshold", "effects", "tol", "kernel", "pointing_px", "look", *OF_A_PART),
+)
+OF_A_VIEW = ("camera.pitch_um", "camera.focal_length_mm")  # how large a pixel is seen, which a [pose] asks for
 ALL_OF_IT = "leave it out to keep and read all of the scan"
 INSTEAD = "leave it out for a survey in two passes"
 WORKERS = "one process or thread each; leave it out for one a core"
@@ -106,6 +113,13 @@ class ZoneChoice:
     )
 
 
+def source_of(scene: str) -> str:
+    """Return where the pixels of a scene come from by default; see the setting ``source``."""
+    if scene == RIG_FIELD:
+        return RIG
+    return SIM if scene in BUILT_IN_SCENES else RASTER
+
+
 def table(about: str, make: type[Any] | None) -> Any:
     """A table of settings that stand for a part of the rig or of the map; None where there is none by default."""
     metadata = {"description": about}
@@ -114,7 +128,10 @@ def table(about: str, make: type[Any] | None) -> Any:
 
 @dataclass(frozen=True)
 class Settings:
-    """All that one survey needs to know. Made by `load_settings` or `parse_settings`: they check; this does not."""
+    """All that one survey needs to know. Made by `load_settings` or `parse_settings`: they check; this does not.
+
+    The source ``auto`` becomes what it stands for, so that receipts hold that.
+    """
 
     name: Name | None = stated(None, "What the field is called; as its scene by default", example="north")
     visit: str | None = stated(
@@ -146,16 +163,20 @@ class Settings:
         example="2%",
     )
     scene: SceneName = stated(
-        "farm", "`farm` (built in; `farm@2`), or a file: PNG, JPEG, BMP, GeoTIFF, .npy, .npz, .mat, ENVI, Zarr"
+        "farm",
+        "`farm` (built in; `farm@2`), or a file: PNG, JPEG, BMP, GeoTIFF, .npy, .npz, .mat, ENVI, Zarr; as source "
+        "raster also a folder or a glob of georeferenced tiles",
     )
     labels: str | None = stated(
         None, "Class colours or numbers on the scene's pixels; accuracy is reported then", example="labels.png"
     )
     bands: Bands | None = stated(None, "Bands of the file (or of the farm's 270) to use, from 0: 0,1", example=(0, 1))
     wavelengths: Wavelengths | None = stated(None, "Their centre wavelengths: 660,800", "nm", example=(660.0, 800.0))
-    source: Literal["sim", "rig", "recorded"] = stated(
-        "sim",
-        "Who looks: the simulated rig, the one that the table [rig] names, or a recording: the sweeps of --sweeps",
+    source: Literal["auto", "sim", "rig", "raster", "recorded"] = stated(
+        "auto",
+        "Where pixels come from: sim (the simulated rig looks at the scene), rig (the one that the table [rig] names), "
+        "raster (the file is a map already: its pixels are taken as they are), recorded (the sweeps of --sweeps); auto "
+        "is recorded where there are sweeps, raster for files, sim for `farm`, rig for the scene `field`",
     )
     sweeps: str | None = stated(
         None,
@@ -210,22 +231,22 @@ class Settings:
     )
     compute: Compute | None = stated(
         None,
-        "Of a plain scan read in detail what promises most for so much of the multiply-adds of reading everything, "
-        "25%, or for so many, 4e9; the rest is read from its coarse means",
+        "Of a uniform scan or a raster read in detail what promises most for so much of the multiply-adds of reading "
+        "everything, 25%, or for so many, 4e9; the rest is read from its coarse means",
         example="25%",
         why=ALL_OF_IT,
     )
     bytes_kept: BytesKept | None = stated(
         None,
-        "Of a plain scan keep in detail what promises most within so much of the bytes of all its pixels and coarse "
-        "means, 40%, or within so many before compression, 500MB",
+        "Of a uniform scan or a raster keep in detail what promises most within so much of the bytes of all its pixels "
+        "and coarse means, 40%, or within so many before compression, 500MB",
         example="40%",
         why=ALL_OF_IT,
     )
     least_gain: float | None = stated(
         None,
-        "Of a plain scan keep and read in detail only seats that promise at least so much, for the policies gain and "
-        "entropy",
+        "Of a uniform scan or a raster keep and read in detail only seats that promise at least so much, for the "
+        "policies gain and entropy",
         "nat per px",
         0,
         100,
@@ -329,10 +350,19 @@ class Settings:
         ZoneChoice,
     )
 
+    def __post_init__(self) -> None:
+        if self.source == AUTO:
+            object.__setattr__(self, "source", source_of(self.scene) if self.sweeps is None else RECORDED)
+
     @property
     def plain(self) -> bool:
-        """Whether the field is scanned once, whole, in the place of a coarse and a fine pass."""
-        return any(getattr(self, name) is not None for name in PLAIN)
+        """Whether all of the field is there at once, scanned or as a raster, in the place of two passes."""
+        return self.is_map or any(getattr(self, name) is not None for name in PLAIN)
+
+    @property
+    def is_map(self) -> bool:
+        """Whether the scene is a raster whose pixels are taken as they are: no camera looks at it."""
+        return self.source == RASTER
 
     @property
     def sparing(self) -> bool:

@@ -56,7 +56,7 @@ class EmulateRequest:
 
 def emulated_settings(path: Path | None, flags: Mapping[str, object]) -> Settings:
     """Settings of what is emulated (SettingsError: one cannot be used); a built-in scene is small unless told."""
-    wanted = load_settings(path, flags)
+    wanted = load_settings(path, flags, usual={"source": "sim"})
     small = wanted.scene in BUILT_IN_SCENES and wanted.size is None
     return replace(wanted, size=USUAL_SIZE) if small else wanted
 

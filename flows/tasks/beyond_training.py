@@ -68,7 +68,9 @@ def _month(day: int) -> str:
 
 
 def _light(settings: Settings, trained: TrainedOn) -> list[str]:
-    """Exposures shorter than any that training showed."""
+    """Exposures shorter than any that training showed; a raster has none."""
+    if settings.is_map:
+        return []
     usual, least = settings.camera.exposure_ms, trained.exposure_ms[0]
     asked = {settings.scan_exposure_ms or usual} if settings.plain else {usual, settings.coarse_exposure_ms or usual}
     return [f"lines of {min(asked):g} ms (it saw {least:g} ms and more)"] if min(asked) < DARKER * least else []

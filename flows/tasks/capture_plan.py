@@ -37,6 +37,11 @@ class CapturePlan:
     margin_px: float  # by which sweeps begin earlier and end later
     plain: bool = False  # one scan of everything, read whole
 
+    @staticmethod
+    def of_map() -> CapturePlan:
+        """Nothing is captured of a raster: all of its pixels are there, and no second is spent on them."""
+        return CapturePlan("x", [], [], 0.0, 0.0, 0.0, 0.0, 0.0, plain=True)
+
 
 def plan_capture(
     settings: Settings, grid: SceneGrid, shown: NDArray[np.bool_] | None = None, recorded: RecordedPasses | None = None

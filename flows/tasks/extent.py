@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flows.settings.survey_settings import RASTER
 from flows.tasks.open_survey import STAGES
 from flows.tasks.reading_costs import SHARD, ReadingCosts
 from flows.tasks.run import SurveyRun
@@ -122,8 +123,7 @@ def work_done(run: SurveyRun, seats: NDArray[np.integer]) -> MultiplyAdds:
     Where everything is seen and read nothing is scored.
     """
     costs = reading_costs(run)
-    chosen = not run.plan.plain or run.budget is not None
-    done = costs.with_scores(seats, run.settings.policy) if chosen else costs.of_map(seats)
+    done = costs.with_scores(seats, run.settings.policy) if run.chooses else costs.of_map(seats)
     if run.prior is not None and run.reader is not None:
         recalled = run.reader.sizes.multiply_adds(run.grid.height * run.grid.width)
         done = replace(done, decode=done.decode + recalled)
@@ -241,9 +241,13 @@ class PastCosts:
     def _extent_then(self, record: Store) -> Extent:
         """How much a survey was, as far as a store and those that it rests on tell by their parameters."""
         below = self._below(record)
+        own = self._extent
+        rasters = [store.params for store in below if store.params.get("source") == RASTER]
+        if rasters:  # nothing was captured
+            grid = SceneGrid(**rasters[0]["grid"])
+            return replace(own, grid=grid, bands=rasters[0]["bands"], coarse_lines=0, plain=True)
         captures = {_is_fine(store): store for store in below if store.ref.stage == _stored_by("capture_coarse")}
         passes = [store for store in below if store.ref.stage == _stored_by("capture_fine") and _is_fine(store)]
-        own = self._extent
         if record.ref.stage == _stored_by("choose_effects"):  # looks at a few places of a scene, whatever its size
             return own
         if record.ref.stage == _stored_by(

@@ -22,6 +22,7 @@ from flows.tasks.stages.effects import choose_effects
 from flows.tasks.stages.maps import draw_map
 from flows.tasks.stages.on_ground import ground
 from flows.tasks.stages.placement import cut_patches, locate, rectify, register_coarse, register_fine
+from flows.tasks.stages.raster import average_raster, take_patches
 from pipeline.lazy import deferred
 from storage.archive.keys import StageRef
 from storage.archive.records import StageRecord
@@ -34,10 +35,11 @@ else:
 RIG_LIMIT = "rig"  # Prefect's global concurrency limit, where the server has one of that name
 
 OF_THE_SURVEY = (
-    *(choose_effects, capture_coarse, register_coarse, locate, rectify, attend, capture_fine, register_fine),
-    *(cut_patches, draw_map, compare_turned, ground, evaluate),
+    *(choose_effects, capture_coarse, register_coarse, locate, rectify, average_raster, attend),
+    *(capture_fine, register_fine, cut_patches, take_patches, draw_map, compare_turned, ground, evaluate),
 )
-JUDGED = ("rectify", "cut_patches", "draw_map", "choose_effects", "register_coarse")  # whose stores `evaluate` takes
+COARSE, DETAIL = ("rectify", "average_raster"), ("cut_patches", "take_patches")  # of a capture, of a raster
+JUDGED = (*COARSE, *DETAIL, "draw_map", "choose_effects", "register_coarse")  # whose stores `evaluate` takes
 STAGES: dict[str, Stage] = {one.name: one for one in OF_THE_SURVEY}
 TITLES = {"plan": "scene, weights and plan", **{name: one.title for name, one in STAGES.items()}}
 
@@ -75,6 +77,16 @@ class Products(dict[str, StageRef]):
         """Return the store of a stage that ran."""
         return self[stage]
 
+    @property
+    def mosaic(self) -> StageRef:
+        """Return the store of the coarse mosaic."""
+        return self.there(*COARSE)[0]
+
+    @property
+    def patches(self) -> StageRef:
+        """Return the store of the patches in detail."""
+        return self.there(*DETAIL)[0]
+
     def there(self, *stages: str) -> list[StageRef]:
         """Return the stores of those of these stages that ran."""
         return [self[name] for name in stages if name in self]
@@ -99,6 +111,11 @@ class OpenSurvey:
     def uniform(self) -> bool:
         """Return whether one scan of everything is all that is captured."""
         return self.run.plan.plain
+
+    @property
+    def is_map(self) -> bool:
+        """Return whether the scene is a raster whose pixels are taken as they are, so that nothing is captured."""
+        return self.run.raster is not None
 
     @property
     def registers(self) -> bool:

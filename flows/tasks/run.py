@@ -31,6 +31,7 @@ from flows.tasks.scene import (
     field_source,
     for_rig,
     judged_labels,
+    open_map,
     open_scene,
 )
 from flows.tasks.seat_budget import SeatBudget
@@ -58,7 +59,9 @@ from storage.archive.archive import Archive
 from storage.archive.keys import array_digest
 from storage.arrays.layout import AngularGrid, image_spec
 from storage.arrays.tile_work import MosaicWork, tile_budget
+from storage.rasters.raster_work import RasterPixels
 from storage.readers.raster_files import load_raster
+from storage.readers.scene_files import OpenScene
 from storage.remote.opening import is_archive, open_archive
 
 
@@ -133,6 +136,7 @@ class SurveyRun(CaptureRun):
     scans: ScanChoice
     zones: SurveyZones  # what the survey keeps to, and plots
     recorded: RecordedPasses | None = None  # the recording whose lines the passes take
+    raster: RasterPixels | None = None  # the pixels of a scene that is a map already: nothing is captured of it
     budget: SeatBudget | None = None  # of seats of a plain scan, where a part of them alone is kept and read
     look: LookChoice | None = None  # the part of a remembered field that is looked at, where one was chosen
     prior: Prior | None = None  # the run whose belief is gone on from
@@ -158,9 +162,14 @@ class SurveyRun(CaptureRun):
         return {"weights": self.weights_key, **({} if self.device == PROCESSOR else {"device": self.device})}
 
     @property
+    def chooses(self) -> bool:
+        """Whether patches are chosen by their scores; where all are seen and read there is nothing to choose."""
+        return not self.plan.plain or self.budget is not None
+
+    @property
     def controls(self) -> bool:
         """Whether other placements of seats are judged too; a plain scan that is read whole places none."""
-        return self.settings.controls and (not self.plan.plain or self.budget is not None)
+        return self.settings.controls and (self.chooses or self.raster is not None)
 
     @cached_property
     def labels(self) -> NDArray[np.uint8] | None:
@@ -217,7 +226,7 @@ def _run_by(
     refused = farm_refusal(settings)
     if refused is not None and not planning:
         raise SettingsError(refused)
-    scene, notes, label_notes = _scene_for(model, settings, recorded, planning=planning)
+    pixels, scene, notes, label_notes = _scene_for(model, settings, recorded, planning=planning)
     grid = SceneGrid(*scene.shape, described.config.patch, described.config.factor)
     zones = open_zones(settings, place_of_field(settings, scene), grid)
     outside = beyond_training(settings, scene, described, model.trained_on, path)
@@ -230,16 +239,22 @@ def _run_by(
         found = (None, ()) if archive is None else find_prior(archive, settings, name, grid, described.class_names)
     prior = None if found is None else found[0]
     settings, look, look_notes = choose_look(settings, prior, described, path, model.reader, grid, zones.shown)
-    passes = None if recorded is None else recorded.passes
-    bands = len(scene.wavelength_nm)
-    settings, scans = choose_plain_scan(settings, described, path, grid, bands, zones.shown, passes)
-    plan = plan_capture(settings, grid, zones.shown, passes)
+    plan, scans, raster = CapturePlan.of_map(), ScanChoice(), None
+    passes, bands = None if recorded is None else recorded.passes, len(scene.wavelength_nm)
+    if pixels is None:
+        settings, scans = choose_plain_scan(settings, described, path, grid, bands, zones.shown, passes)
+        plan = plan_capture(settings, grid, zones.shown, passes)
+    else:
+        raster = RasterPixels(pixels.read, pixels.missing, bands, grid)
     channels = 3 if model.vgg is None else model.vgg.channels
     costs = ReadingCosts(described.config, grid, bands, channels)
     budget = SeatBudget.asked(settings, costs, None if zones.shares is None else zones.shares > 0)
     simulated, planned = make_source(scene, settings), (*plan.coarse, *plan.full)
     source = field_source(scene, settings, simulated, planned) if recorded is None else recorded.field
-    check_memory(settings, simulated, grid, plan)
+    if raster is None:
+        check_memory(settings, simulated, grid, plan)
+    else:
+        raster.rows_at_once(settings.memory)  # refuses memory for not one row of patches
     archive = open_archive(settings.out) if archive is None else archive
     prior, prior_notes = found or find_prior(archive, settings, name, grid, described.class_names)
     if settings.prior != AUTO:  # what is meant when it is asked for again
@@ -260,6 +275,7 @@ def _run_by(
         recorded=passes,
         scans=scans,
         zones=zones,
+        raster=raster,
         budget=budget,
         look=look,
         prior=prior,
@@ -273,9 +289,18 @@ def _run_by(
 
 def _scene_for(
     model: SurveyModel, settings: Settings, recorded: OpenedRecording | None, *, planning: bool
-) -> tuple[RasterScene, tuple[str, ...], tuple[str, ...]]:
-    """Open a scene that the weights can read, drawn unless for ``planning``; what to say of it and of its labels."""
-    scene, notes = open_scene(settings, model.described.class_names) if recorded is None else recorded.scene()
+) -> tuple[OpenScene | None, RasterScene, tuple[str, ...], tuple[str, ...]]:
+    """Open a scene that the weights can read, drawn unless for ``planning``; what to say of it and of its labels.
+
+    The first value is the scene's file where its pixels are taken as they are.
+    """
+    pixels = None
+    if recorded is not None:
+        scene, notes = recorded.scene()
+    elif settings.is_map:
+        pixels, scene, notes = open_map(settings, model.described.class_names)
+    else:
+        scene, notes = open_scene(settings, model.described.class_names)
     if not planning:  # what the rig would find there: no stage's work
         scene.raster.drawn()
         scene.light()
@@ -283,7 +308,7 @@ def _scene_for(
     label_notes = check_labels(scene, model.described)
     if settings.mask is not None:
         check_mask(settings.mask, scene.shape)
-    return scene, notes, label_notes
+    return pixels, scene, notes, label_notes
 
 
 def make_source(scene: RasterScene, settings: Settings) -> SimulatedSource:

@@ -8,12 +8,12 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.settings.survey_settings import BUILT_IN_SCENES, RECORDED, RIG_FIELD, Settings
+from flows.settings.survey_settings import BUILT_IN_SCENES, RASTER, RECORDED, RIG, RIG_FIELD, Settings
 from flows.training.data import scene_of_file, unpack_mask
 from models.weights.files import Description
 from pipeline.errors import SceneError, SettingsError
@@ -25,9 +25,10 @@ from pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE, farm_scene, la
 from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Source
+from storage.rasters.raster_fields import is_glob, open_raster
 from storage.readers.cube_sources import machine_bytes
 from storage.readers.raster_files import load_raster, split_variable
-from storage.readers.scene_files import load_scene_file
+from storage.readers.scene_files import OpenScene, SceneFacts, load_scene_file
 
 if TYPE_CHECKING:
     import flows.tasks.rig_field as rig_field
@@ -43,7 +44,7 @@ SAME_HOUR = 0.5  # by which true solar time is at most off mean solar time, and 
 def check_scene_there(settings: Settings) -> None:
     """Refuse a scene file that is not there, before anything else is asked for (SceneError)."""
     path, _ = split_variable(settings.scene)
-    if settings.scene in (RIG_FIELD, *BUILT_IN_SCENES):
+    if settings.scene in (RIG_FIELD, *BUILT_IN_SCENES) or (settings.is_map and is_glob(settings.scene)):
         return
     try:
         there, what = path.exists(), "a link that leads nowhere," if path.is_symlink() else "no file"
@@ -74,19 +75,66 @@ def open_scene(settings: Settings, known: Sequence[str] | None = None) -> tuple[
         wavelengths=settings.wavelengths,
         labels_needed=False,
     )
+    file = _judged_by_known(file, known)
+    scene, notes = _placed_once(scene_of_file(file, settings.camera), file.provenance, settings)
+    return scene, (*notes, *_gap_note(scene, "were given their band's median"))
+
+
+def open_map(settings: Settings, known: Sequence[str] | None = None) -> tuple[OpenScene, RasterScene, tuple[str, ...]]:
+    """Open a raster whose pixels are taken as they are; its scene holds all but light, which no camera looks at.
+
+    Raises SceneError, WavelengthError: its files. Labels found by their name count as in `open_scene`.
+    """
+    file = open_raster(settings.scene, labels=settings.labels, bands=settings.bands, wavelengths=settings.wavelengths)
+    file = _judged_by_known(file, known)
+    missing = file.missing if file.missing.any() else None
+    labels, bands = file.labels, len(file.wavelength_nm)
+    if labels is not None and missing is not None:
+        labels = np.where(missing, np.uint8(UNLABELLED), labels)
+    scene = RasterScene(
+        name=file.name,
+        key=file.light_hash,
+        raster=SceneRaster.of(np.broadcast_to(np.float32(0), (*file.shape, 1)), labels),
+        light=Once.of(SceneLight(np.zeros((1, bands), np.float32), np.ones(bands, np.float32))),
+        panel=np.ones(bands, np.float32),
+        wavelength_nm=file.wavelength_nm,
+        fwhm_nm=file.fwhm_nm,
+        class_names=file.class_names,
+        class_colours=file.class_colours,
+        filled_px=file.filled_px,
+        missing=missing,
+        geobox=file.geobox,
+    )
+    scene, notes = _placed_once(scene, file.provenance, settings)
+    return file, scene, (*notes, *_gap_note(scene, "are as they are in the other bands"))
+
+
+Facts = TypeVar("Facts", bound=SceneFacts)
+
+
+def _judged_by_known(file: Facts, known: Sequence[str] | None) -> Facts:
+    """Leave labels out that were found by their name and have a class beside the ``known`` ones."""
     strange = [name for name in file.class_names if known is not None and name not in known]
-    if file.labels_found and strange:
-        told = f"of the class {strange[0]!r}, which the weights do not know: name its classes in a scene.toml to judge"
-        file = file.without_labels(f"the labels beside the scene are left out: they are {told} by them")
-    scene, notes = scene_of_file(file, settings.camera), file.provenance
-    if scene.geobox is not None and settings.pose is not None:  # one place a run
-        scene, notes = replace(scene, geobox=None), (*notes, POSE_WINS)
-    if not scene.filled_px:
+    if not (file.labels_found and strange):
+        return file
+    told = f"of the class {strange[0]!r}, which the weights do not know: name its classes in a scene.toml to judge"
+    return file.without_labels(f"the labels beside the scene are left out: they are {told} by them")
+
+
+def _placed_once(scene: RasterScene, notes: tuple[str, ...], settings: Settings) -> tuple[RasterScene, tuple[str, ...]]:
+    """Set the scene's own place aside where a pose says another, and say so."""
+    if scene.geobox is None or settings.pose is None:
         return scene, notes
+    return replace(scene, geobox=None), (*notes, POSE_WINS)
+
+
+def _gap_note(scene: RasterScene, became: str) -> tuple[str, ...]:
+    """Say what became of pixels without a value in some band."""
+    if not scene.filled_px:
+        return ()
     void = 0 if scene.missing is None else int(np.count_nonzero(scene.missing))
     unclassed = f"; {void} without most of their bands have no class in the map" if void else ""
-    gaps = f"{scene.filled_px} pixels without a value were given their band's median{unclassed}"
-    return scene, (*notes, gaps)
+    return (f"{scene.filled_px} pixels without a value {became}{unclassed}",)
 
 
 def _field_before_rig(settings: Settings) -> RasterScene:
@@ -253,11 +301,34 @@ class SimulatedField:
         return nullcontext(self.source)
 
 
+@dataclass(frozen=True)
+class TakenAsItIs:
+    """A raster, which no camera looks at: its pixels are read from the file."""
+
+    name = RASTER
+    simulates = False
+
+    def key(self, field: str) -> dict[str, Any]:
+        return {}
+
+    def saying(self, say: Callable[[str], None]) -> TakenAsItIs:
+        return self
+
+    def lit(self, chosen: Mapping[Effect, str], clock: Mapping[str, float]) -> TakenAsItIs:
+        return self
+
+    def opened(self, spool: Path) -> AbstractContextManager[Source]:
+        """Refuse to capture (SettingsError): a raster has no lines."""
+        raise SettingsError("a raster is not captured: its pixels are in its file; give --source sim for lines of it")
+
+
 def field_source(
     scene: RasterScene, settings: Settings, simulated: SimulatedSource, planned: Sequence[Sweep]
 ) -> FieldSource:
     """Give who looks, as the settings say; raises what `flows.tasks.rig_field.rig_field` does."""
-    if settings.source != "rig":
+    if settings.is_map:
+        return TakenAsItIs()
+    if settings.source != RIG:
         return SimulatedField(simulated)
     return rig_field.rig_field(scene, settings, planned)
 
@@ -269,6 +340,6 @@ def for_rig(settings: Settings) -> Settings:
     """
     if settings.source == RECORDED:
         return replace(settings, controls=False)
-    if settings.source != "rig":
+    if settings.source != RIG:
         return settings
     return replace(settings, visit=settings.visit or f"{datetime.now(UTC):%Y-%m-%d}", controls=False)

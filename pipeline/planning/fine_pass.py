@@ -32,7 +32,7 @@ class FinePlan:
     ``worth`` is the score that was bought. Seats that a sweep shows besides are in ``seats``; what they add may not be
     in ``worth``. ``kind`` says whether the sweeps are runs of lines, whose seats lie wholly in one of them, or those of
     the full scan, taken because it is cheaper or as cheap; with "scan" a plain scan has shown every seat
-    already; ``reason`` says so in a sentence. ``worth`` and
+    already, with "raster" all pixels were there; ``reason`` says so in a sentence. ``worth`` and
     ``wanted_worth`` are in a larger unit where a score is infinite, or the sum of all would be beyond float64.
     """
 
@@ -40,7 +40,7 @@ class FinePlan:
     seats: NDArray[np.intp]  # ascending
     seconds: float
     worth: float
-    kind: Literal["lines", "full", "scan"] = "lines"
+    kind: Literal["lines", "full", "scan", "raster"] = "lines"
     reason: str = ""
     wanted_worth: float = 0.0  # score of all seats that a line within the mirror's range shows
     full_seconds: float | None = None  # of the full scan with lines along the same axis; None beyond the mirror's range

@@ -52,6 +52,11 @@ class CubePart:
         return self.start + len(self.cube.values)
 
 
+def is_headwall_folder(folder: Path) -> bool:
+    """Return whether a folder holds parts of a cube as a Headwall camera names them."""
+    return any(_PART.fullmatch(entry.name) is not None for entry in folder.iterdir())
+
+
 def open_envi_source(path: Path) -> CubeSource:
     """Open one ENVI cube by its header or data file; the lines that it lost are its last (SceneError as there)."""
     header, data = find_envi_pair(path)

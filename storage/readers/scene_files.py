@@ -4,56 +4,60 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.readings import MOST_STEPS, MOST_VALUE, beyond_range, find_beyond
-from pipeline.simulator.scenes.scene import BRIGHT_PERCENTILE
 from storage.archive.staging import file_hash
-from storage.readers.cube_sources import BLOCK_LINES, Raster, machine_bytes, scene_lines
+from storage.readers.cube_sources import BLOCK_LINES
 from storage.readers.label_files import find_label
-from storage.readers.labels import Labels, load_frame_or_raster, load_labels
+from storage.readers.labels import Labels, Layout, load_frame_or_raster, load_labels
 from storage.readers.polygon_labels import is_polygon_file, load_polygon_labels
 from storage.readers.raster_files import split_variable
-from storage.readers.scan_files import known_bands, open_cube_source, reader_of
-from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings, settle_wavelengths
+from storage.readers.scan_files import reader_of
+from storage.readers.scene_rows import SceneRows, ValueCount, as_values, bands_text, load_scan, open_rows
+from storage.readers.scene_toml import (
+    SETTINGS_NAME,
+    BandWavelengths,
+    ClassValue,
+    SceneSettings,
+    find_scene_settings,
+    settle_wavelengths,
+)
 from storage.readers.zone_files import split_layer
 
 if TYPE_CHECKING:
     from odc.geo.geobox import GeoBox
 
-_LOOKED_AT = 1 << 20  # values, evenly spread, by which the range of a scene is told
+ReadRows = Callable[[int, int], NDArray[np.float32]]
 
 
-@dataclass(frozen=True)
-class SceneFile:
-    """A scene as its file gives it, on the file's own pixels."""
+@dataclass(frozen=True, kw_only=True)
+class SceneFacts:
+    """What a scene's file says beside its numbers."""
 
     name: str
     path: Path
-    values: NDArray[np.float32]  # (y, x, band), NaN where the file has none
     wavelength_nm: NDArray[np.float64]  # (band,)
     fwhm_nm: NDArray[np.float64] | None  # (band,)
     labels: NDArray[np.uint8] | None  # (y, x) class index, 255 = unlabelled
     class_names: tuple[str, ...]
     class_colours: NDArray[np.uint8]  # (class, 3)
     class_values: tuple[ClassValue, ...]  # what each class is in the label file: a number or a colour
-    content_hash: str  # of everything above
+    content_hash: str  # of everything above, and of the values
     light_hash: str  # of values and wavelengths alone: labels do not change what a camera sees
     provenance: tuple[str, ...]  # one sentence for each thing assumed or left out
     geobox: GeoBox | None = None  # where the pixels lie on the earth
     labels_found: bool = False  # by the file's name: nobody stated them
 
-    def without_labels(self, note: str) -> SceneFile:
+    def without_labels(self, note: str) -> Self:
         """The same scene as if it had no labels; the note says why."""
         return replace(
             self,
@@ -65,10 +69,27 @@ class SceneFile:
             provenance=(*self.provenance, note),
         )
 
-    def with_labels(self, labels: NDArray[np.uint8], note: str) -> SceneFile:
+    def with_labels(self, labels: NDArray[np.uint8], note: str) -> Self:
         """The same scene with other labels; hash and provenance say so."""
         digest = _labelled_hash(self.light_hash, self.class_names, self.class_values, labels)
         return replace(self, labels=labels, content_hash=digest, provenance=(*self.provenance, note))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneFile(SceneFacts):
+    """A scene as its file gives it, on the file's own pixels."""
+
+    values: NDArray[np.float32]  # (y, x, band), NaN where the file has none
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpenScene(SceneFacts):
+    """A scene file whose numbers are read some rows at a time, when they are asked for."""
+
+    shape: tuple[int, int]  # (y, x)
+    read: ReadRows  # from one row to before another: (y, x, band) float32, NaN where the file has no value
+    missing: NDArray[np.bool_]  # (y, x) pixels without a value in more than half of their bands
+    filled_px: int  # pixels without a value in a band
 
 
 def load_scene_file(
@@ -94,88 +115,142 @@ def load_scene_file(
     """
     file, variable = split_variable(path)
     raster, layout = load_frame_or_raster(path) if reader_of(path) == "raster" else (load_scan(path), None)
-    settings = find_scene_settings(file)
     cube = raster.three_axes(file)
-    chosen, bad_note = _chosen_bands(bands, settings, cube.shape[2], file, raster.bad_bands)
-    _refuse_bands_first(file, cube.shape, wavelengths or settings.wavelengths_nm)
-    light = settle_wavelengths(
-        file,
-        chosen,
-        cube.shape[2],
-        stated=wavelengths,
-        settings=settings,
-        assumed_nm=raster.assumed_nm,
-        known=raster.known,
-    )
-    nodata = raster.nodata if settings.nodata is None else settings.nodata
-    gaps, gap_notes = _gaps(raster)
-    values, notes = _as_float(cube, chosen, nodata, file, gaps)
-    shape = (cube.shape[0], cube.shape[1])
-    by_name = labels is None and settings.labels is None
-    label_note: tuple[str, ...]
-    if layout is not None and by_name:
-        found, label_note = layout.labels, (layout.label_note,)
-    else:
-        try:
-            found, label_note = _labels(file, shape, raster.geobox, labels, settings, classes or {})
-        except SceneError as error:
-            if labels_needed or not by_name:
-                raise
-            found, label_note = None, (f"the labels beside the scene are left out: {error}",)
-    count, widths = cube.shape[2], None if light.fwhm_nm is None else light.fwhm_nm.tolist()
-    some_bands = () if chosen == list(range(count)) else (f"bands {bands_text(chosen)} of {count}, counted from 0",)
-    stated: tuple[str, ...] = () if settings.nodata is None else (f"nodata {settings.nodata!r}",)
-    stated += () if gaps is None else (f"void {hashlib.sha256(np.packbits(gaps).tobytes()).hexdigest()}",)
-    stated += (raster.scaling,) if raster.scaling else ()
-    light_hash = _digest(_content_hash(file, raster), variable, chosen, light.centre_nm.tolist(), widths, *stated)
-    content_hash = light_hash
-    if found is not None:
-        content_hash = _labelled_hash(light_hash, found.names, found.values, found.index)
-    return SceneFile(
-        name=file.stem,
-        path=file,
-        values=values,
-        wavelength_nm=light.centre_nm,
-        fwhm_nm=light.fwhm_nm,
-        labels=None if found is None else found.index,
-        class_names=() if found is None else found.names,
-        class_colours=np.zeros((0, 3), np.uint8) if found is None else found.colours,
-        class_values=() if found is None else found.values,
-        content_hash=content_hash,
-        light_hash=light_hash,
-        provenance=(*some_bands, *bad_note, *raster.notes, light.origin, *gap_notes, *notes, *label_note),
-        geobox=raster.geobox,
-        labels_found=by_name and layout is None and found is not None,
-    )
+    rows = SceneRows.of(raster, cube)
+    stated = _Stated(labels, bands, wavelengths, classes or {}, labels_needed)
+    draft = _Draft.of(file, variable, rows, stated, layout)
+    count = draft.count()
+    values = count.take(cube, draft.gaps)
+    return SceneFile(values=values, **draft.facts(count))
 
 
-def load_scan(address: str | Path) -> Raster:
-    """Read a cube that comes in lines as one array, over the white panel where dark and white frames are known.
+def open_scene_file(
+    path: str | Path,
+    *,
+    labels: str | Path | None = None,
+    bands: Sequence[int] | None = None,
+    wavelengths: Sequence[float] | None = None,
+) -> OpenScene:
+    """Open a scene as `load_scene_file` reads it, whose numbers are looked through once and not kept.
 
-    Raises SceneError: the cube cannot be used, or this machine has not the memory for it.
+    GeoTIFF, ENVI, Zarr and .npy are read some rows at a time; images, .mat and .npz are whole in memory. Labels that
+    were found by their names and cannot be used are left out with a note. Raises what `load_scene_file` does.
     """
-    source = open_cube_source(address)
-    needed = 8 * math.prod(source.shape)  # as float32, and once more while the scene is made
-    there = machine_bytes()
-    if needed > there:
-        raise SceneError(
-            f"{address} is a cube of {source.shape}: as a scene it takes about {needed / 1e9:.0f} GB of memory, this "
-            f"machine has {there / 1e9:.0f}; cut a part out of it, or ingest it"
+    file, variable = split_variable(path)
+    rows, layout = open_rows(path)
+    draft = _Draft.of(file, variable, rows, _Stated(labels, bands, wavelengths, {}, False), layout)
+    count, height = draft.count(), rows.shape[0]
+    for first in range(0, height, BLOCK_LINES):
+        last = min(first + BLOCK_LINES, height)
+        count.take(rows.read(first, last), draft.gaps_of(first, last))
+
+    def read(first: int, last: int) -> NDArray[np.float32]:
+        return as_values(rows.read(first, last), draft.chosen, draft.nodata, draft.gaps_of(first, last))
+
+    facts = draft.facts(count)
+    return OpenScene(shape=rows.shape[:2], read=read, missing=count.missing, filled_px=count.filled_px, **facts)
+
+
+@dataclass(frozen=True)
+class _Stated:
+    """What was given beside the file."""
+
+    labels: str | Path | None
+    bands: Sequence[int] | None
+    wavelengths: Sequence[float] | None
+    classes: Mapping[str, ClassValue]
+    labels_needed: bool
+
+
+@dataclass(frozen=True)
+class _Draft:
+    """A scene file of which all is settled but what its numbers are."""
+
+    file: Path
+    variable: str | None
+    rows: SceneRows
+    stated: _Stated
+    layout: Layout | None
+    settings: SceneSettings
+    chosen: list[int]
+    light: BandWavelengths
+    nodata: float | None
+    gaps: NDArray[np.bool_] | None  # (y, x)
+    notes: tuple[str, ...]
+
+    @staticmethod
+    def of(file: Path, variable: str | None, rows: SceneRows, stated: _Stated, layout: Layout | None) -> _Draft:
+        """Settle bands, wavelengths and gaps. Raises what `load_scene_file` does of these."""
+        settings, about = find_scene_settings(file), rows.about
+        chosen, bad_note = _chosen_bands(stated.bands, settings, rows.shape[2], file, about.bad_bands)
+        _refuse_bands_first(file, rows.shape, stated.wavelengths or settings.wavelengths_nm)
+        light = settle_wavelengths(
+            file,
+            chosen,
+            rows.shape[2],
+            stated=stated.wavelengths,
+            settings=settings,
+            assumed_nm=about.assumed_nm,
+            known=about.known,
         )
-    starts = range(0, source.shape[0], BLOCK_LINES)
-    blocks = [scene_lines(source, start, min(start + BLOCK_LINES, source.shape[0])) for start in starts]
-    over = source.dark is not None and source.white is not None
-    notes = (*source.notes, "values are over the white panel") if over else source.notes
-    return Raster(
-        np.concatenate(blocks),
-        None,
-        None if over else source.nodata,
-        notes,
-        known=known_bands(source),
-        files=source.files,
-        geobox=source.geobox,
-        bad_bands=source.bad_bands,
-    )
+        nodata = about.nodata if settings.nodata is None else settings.nodata
+        gaps, gap_notes = _gaps(rows.void)
+        count = rows.shape[2]
+        some = () if chosen == list(range(count)) else (f"bands {bands_text(chosen)} of {count}, counted from 0",)
+        notes = (*some, *bad_note, *about.notes, light.origin, *gap_notes)
+        return _Draft(file, variable, rows, stated, layout, settings, chosen, light, nodata, gaps, notes)
+
+    def count(self) -> ValueCount:
+        """Begin to count what is missing."""
+        return ValueCount(self.file, self.chosen, self.nodata, self.rows.shape[:2])
+
+    def gaps_of(self, first: int, last: int) -> NDArray[np.bool_] | None:
+        """Gaps of some rows."""
+        return None if self.gaps is None else self.gaps[first:last]
+
+    def facts(self, count: ValueCount) -> dict[str, Any]:
+        """The fields of `SceneFacts`, once all numbers were counted (SceneError: some cannot be used, or labels)."""
+        notes = count.notes()
+        found, label_note, by_name = self._labels()
+        widths = None if self.light.fwhm_nm is None else self.light.fwhm_nm.tolist()
+        said: tuple[str, ...] = () if self.settings.nodata is None else (f"nodata {self.settings.nodata!r}",)
+        said += () if self.gaps is None else (f"void {hashlib.sha256(np.packbits(self.gaps).tobytes()).hexdigest()}",)
+        said += (self.rows.scaling,) if self.rows.scaling else ()
+        content = _content_hash(self.file, self.rows.files)
+        light_hash = _digest(content, self.variable, self.chosen, self.light.centre_nm.tolist(), widths, *said)
+        content_hash = light_hash
+        if found is not None:
+            content_hash = _labelled_hash(light_hash, found.names, found.values, found.index)
+        return {
+            "name": self.file.stem,
+            "path": self.file,
+            "wavelength_nm": self.light.centre_nm,
+            "fwhm_nm": self.light.fwhm_nm,
+            "labels": None if found is None else found.index,
+            "class_names": () if found is None else found.names,
+            "class_colours": np.zeros((0, 3), np.uint8) if found is None else found.colours,
+            "class_values": () if found is None else found.values,
+            "content_hash": content_hash,
+            "light_hash": light_hash,
+            "provenance": (*self.notes, *notes, *label_note),
+            "geobox": self.rows.about.geobox,
+            "labels_found": by_name and self.layout is None and found is not None,
+        }
+
+    def _labels(self) -> tuple[Labels | None, tuple[str, ...], bool]:
+        """Return labels, a note of them, and whether their file was found by its name alone."""
+        stated, shape = self.stated, self.rows.shape[:2]
+        by_name = stated.labels is None and self.settings.labels is None
+        if self.layout is not None and by_name:
+            return self.layout.labels, (self.layout.label_note,), by_name
+        try:
+            return *_labels(
+                self.file, shape, self.rows.about.geobox, stated.labels, self.settings, stated.classes
+            ), by_name
+        except SceneError as error:
+            if stated.labels_needed or not by_name:
+                raise
+            return None, (f"the labels beside the scene are left out: {error}",), by_name
 
 
 def _refuse_bands_first(path: Path, shape: tuple[int, ...], wavelengths: Sequence[float] | None) -> None:
@@ -188,9 +263,9 @@ def _refuse_bands_first(path: Path, shape: tuple[int, ...], wavelengths: Sequenc
         )
 
 
-def _content_hash(file: Path, raster: Raster) -> str:
+def _content_hash(file: Path, named: tuple[Path, ...]) -> str:
     """Of all files that the numbers came from; within a folder their names count, too."""
-    files = raster.files or (file,)
+    files = named or (file,)
     if files == (file,):
         return file_hash(file)
     is_folder = file.is_dir()
@@ -198,24 +273,13 @@ def _content_hash(file: Path, raster: Raster) -> str:
     return _digest(*((name, file_hash(entry)) for name, entry in zip(inside, files, strict=True)))
 
 
-def _gaps(raster: Raster) -> tuple[NDArray[np.bool_] | None, tuple[str, ...]]:
+def _gaps(void: NDArray[np.bool_] | None) -> tuple[NDArray[np.bool_] | None, tuple[str, ...]]:
     """(y, x) pixels that are transparent or masked, and a note; None where none is, or all are, which says nothing."""
-    if raster.void is None or not raster.void.any():
+    if void is None or not void.any():
         return None, ()
-    if raster.void.all():
+    if void.all():
         return None, ("every pixel is transparent or masked, which is not believed",)
-    return raster.void, (f"{int(raster.void.sum())} transparent or masked pixels have no value, and no class in a map",)
-
-
-def bands_text(bands: Sequence[int]) -> str:
-    """Band numbers as ``--bands`` takes them: ``0-3,7``."""
-    runs: list[list[int]] = []
-    for band in bands:
-        if runs and band == runs[-1][1] + 1:
-            runs[-1][1] = band
-        else:
-            runs.append([band, band])
-    return ",".join(str(first) if first == last else f"{first}-{last}" for first, last in runs)
+    return void, (f"{int(void.sum())} transparent or masked pixels have no value, and no class in a map",)
 
 
 def _chosen_bands(
@@ -240,77 +304,6 @@ def _chosen_bands(
     if len(set(chosen)) < len(chosen):
         raise SceneError(f"{where}: {list(chosen)} names a band twice; name each once")
     return [int(band) for band in chosen], ()
-
-
-def _as_float(
-    cube: NDArray[Any], chosen: list[int], nodata: float | None, path: Path, gaps: NDArray[np.bool_] | None
-) -> tuple[NDArray[np.float32], tuple[str, ...]]:
-    """Chosen bands as float32; gaps (y, x), the no-data value and infinities become NaN, and are counted.
-
-    Raises SceneError where another value is no reading, a band has no value anywhere, or no value is finite.
-    """
-    every = chosen == list(range(cube.shape[2]))
-    picked = cube if every else cube[..., chosen]
-    notes: list[str] = []
-    if gaps is not None:
-        picked = np.where(gaps[..., None], picked.dtype.type(0), picked)  # whatever lies under them is no value
-    with np.errstate(over="ignore"):
-        values = np.array(picked, np.float32, order="C")
-    if gaps is not None:
-        values[gaps] = np.nan
-    strange = beyond_range(picked)
-    if nodata is not None:
-        # Compared as numbers: -9999 in the numbers of the file would wrap to 55537 where they are uint16.
-        with np.errstate(over="ignore"):
-            void = picked == nodata if np.isfinite(nodata) else np.isnan(values)
-        values[void] = np.nan
-        notes.append(f"{int(void.sum())} samples have the file's no-data value {nodata:g}")
-        picked = picked if strange is None else np.where(void, picked.dtype.type(0), picked)
-    if strange is not None and (found := find_beyond(picked)) is not None:
-        raise SceneError(
-            f"{path} has {found.words(np.array(chosen))}, beyond the {MOST_VALUE:g} that readings reach; if it stands"
-            f" for no data, write nodata = {found.value!s} into a {SETTINGS_NAME} beside the file, else leave the band"
-            " out with --bands, or give the values in a larger unit"
-        )
-    infinite = np.isinf(values)
-    if infinite.any():
-        values[infinite] = np.nan
-        y, x, band = np.unravel_index(int(infinite.argmax()), infinite.shape)
-        place = f"y {y}, x {x}, band {chosen[int(band)]}"
-        notes.append(f"{int(infinite.sum())} infinite samples count as missing, the first at {place}")
-    missing = int(np.isnan(values).sum())
-    if missing == values.size:
-        raise SceneError(f"{path} holds no finite number in the bands used; choose others")
-    _check_empty(values, chosen, path)
-    if missing:
-        notes.append(f"{missing} of {values.size} samples are missing")
-    return values, (*notes, *_dark_note(values))
-
-
-def _check_empty(values: NDArray[np.float32], chosen: list[int], path: Path) -> None:
-    """Refuse bands without a value anywhere (SceneError, with the ``--bands`` that leaves them out)."""
-    empty = [band for place, band in enumerate(chosen) if np.isnan(values[..., place]).all()]
-    if empty:
-        rest = bands_text([band for band in chosen if band not in set(empty)])
-        raise SceneError(
-            f"{path} has no value anywhere in bands {bands_text(empty)} (from 0); take the others: --bands {rest}"
-        )
-
-
-def _dark_note(values: NDArray[np.float32]) -> tuple[str, ...]:
-    """Say where the bright end is so far above all else that hardly any light is left for it."""
-    some = values.reshape(-1)[:: max(1, values.size // _LOOKED_AT)]
-    lit = some[some > 0]  # no NaN
-    if not lit.size:
-        return ()
-    middle, bright = (float(value) for value in np.percentile(lit, (50, BRIGHT_PERCENTILE)))
-    if bright <= MOST_STEPS * middle:
-        return ()
-    return (
-        f"the brightest values, {bright:.3g}, are more than {MOST_STEPS} times the middle one, {middle:.3g}, and all"
-        f" else is dark beside them; if they stand for no data, write nodata = {float(lit.max())!r} into a"
-        f" {SETTINGS_NAME}",
-    )
 
 
 def label_file(scene: Path, settings: SceneSettings) -> tuple[Path | None, str]:

@@ -117,9 +117,11 @@ def _watched(moments: Moments) -> Iterator[None]:
 
 
 def _survey(stack: ExitStack, settings: Settings, moments: Moments) -> None:
+    from flows.survey import draw_class_map
+    from flows.tasks.observer import Observer
+    from flows.tasks.open_survey import OpenSurvey
     from flows.tasks.run import make_source, open_run
     from flows.tasks.stages.effects import chosen_effects
-    from flows.tasks.survey import StageRunner, survey
     from pipeline.rig.emulator.emulated_rig import EmulatedRig
     from tests.pipeline.rig.in_process import InProcessRig, ManualClock
 
@@ -133,9 +135,8 @@ def _survey(stack: ExitStack, settings: Settings, moments: Moments) -> None:
         if state != "running":
             moments.stages[stage] = now - begun[stage]
 
-    step = StageRunner(run, watch)
-    effects = step("choose_effects")
-    assert effects is not None
+    survey = OpenSurvey(run, Observer(watch))
+    effects = survey("choose_effects")
     source = make_source(run.scene, settings)
     rig = EmulatedRig(replace(source, chosen=chosen_effects(effects)), ManualClock(10.0))
     line = stack.enter_context(InProcessRig(rig))
@@ -145,7 +146,7 @@ def _survey(stack: ExitStack, settings: Settings, moments: Moments) -> None:
 
     stack.enter_context(patch("flows.tasks.rig_field.open_devices", open_devices))
     try:
-        survey(step)
+        draw_class_map(survey)
     except _AskedError:
         return
 

@@ -84,15 +84,17 @@ def _survey(archive: Path, side: int) -> dict[str, Cost]:
     from rich.console import Console
 
     from flows.publish.survey_command import run_survey
+    from flows.survey import draw_class_map
+    from flows.tasks.open_survey import OpenSurvey
     from flows.tasks.run import open_run
-    from flows.tasks.survey import StageRunner, survey
 
     settings = _settings(archive, side)
     run_survey(settings, Console(quiet=True))
-    runner = StageRunner(open_run(settings))
+    again = OpenSurvey(open_run(settings))
+    draw_class_map(again)
     stages = {}
-    for name, ref in survey(runner).items():
-        cost = None if ref is None else runner.run.archive.cost(ref)
+    for name, ref in again.products.items():
+        cost = again.run.archive.cost(ref)
         if cost is not None:
             stages[name] = cost
     return stages

@@ -157,6 +157,7 @@ def field_file(tmp_path: Path, scene_files: Path, weights: Path) -> Callable[...
     def write(stem: str = "north", lines: str = "", **changes: str | None) -> Path:
         values: dict[str, str | None] = {
             "scene": str(scene_files / "scene.png"),
+            "source": "sim",
             "weights": str(weights),
             "budget": "0.8",
             "out": str(tmp_path / "archive"),

@@ -32,7 +32,7 @@ USED = """
 import json, sys
 import spectralzoom
 from models.weights.files import load_weights
-run = spectralzoom.survey(scene="field.png", weights="mine.safetensors", budget=0.8, effects="none",
+run = spectralzoom.survey(scene="field.png", source="sim", weights="mine.safetensors", budget=0.8, effects="none",
     camera={"samples": 320}, out=sys.argv[1])
 farm = spectralzoom.plan(scene="farm", size="32x32", budget=0.9, bands=list(range(4, 270, 9)), out=sys.argv[1])
 print(json.dumps([spectralzoom.__version__, spectralzoom.__file__, str(run.report), len(farm["stages"])]))

@@ -101,7 +101,14 @@ KINDS: dict[str, Callable[[Path], tuple[Path, Affine]]] = {
 
 def survey(scene: Path, weights: Path, out: Path, **flags: Any) -> Published:
     """Survey the scene without effects, accuracy or controls."""
-    given = {"scene": str(scene), "weights": str(weights), "engine": "plain", "out": str(out), "budget": 0.8}
+    given = {
+        "scene": str(scene),
+        "source": "sim",
+        "weights": str(weights),
+        "engine": "plain",
+        "out": str(out),
+        "budget": 0.8,
+    }
     with without_effects():
         return run_survey(load_settings(None, {**given, "accuracy": False, "controls": False, **flags}), QUIET)
 
@@ -226,7 +233,13 @@ def test_a_pose_is_the_one_place_of_a_run(tmp_path: Path, weights: Path) -> None
     scene = write_geotiff(tmp_path / "a.tif", NORTH_UP)
     words = tmp_path / "posed.toml"
     words.write_text("[pose]\nlon_deg = 7.6\nlat_deg = 51.96\nheight_m = 30\nheading_deg = 20\ntilt_deg = 35\n")
-    flags = {"scene": str(scene), "weights": str(weights), "engine": "plain", "out": str(tmp_path / "archive")}
+    flags = {
+        "scene": str(scene),
+        "source": "sim",
+        "weights": str(weights),
+        "engine": "plain",
+        "out": str(tmp_path / "archive"),
+    }
     with without_effects():
         run = run_survey(load_settings(words, {**flags, "budget": 0.8, "accuracy": False, "controls": False}), QUIET)
     assert any("set aside: [pose] says where it lies" in note for note in run.receipt["settings"]["notes"])

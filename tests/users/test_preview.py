@@ -25,7 +25,13 @@ DOWN = {"pose.lon_deg": 7.6, "pose.lat_deg": 51.96, "pose.height_m": 100, "pose.
 
 def planned(scene_files: Path, weights: Path, out: Path, preview: Path | None = None, **flags: Any) -> dict[str, Any]:
     """What `plan --json` gives of the small picture."""
-    given = {"scene": str(scene_files / "scene.png"), "weights": str(weights), "out": str(out), "budget": "0.8"}
+    given = {
+        "scene": str(scene_files / "scene.png"),
+        "source": "sim",
+        "weights": str(weights),
+        "out": str(out),
+        "budget": "0.8",
+    }
     return plan_content(load_settings(None, given | flags), preview)
 
 

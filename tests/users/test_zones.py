@@ -51,7 +51,7 @@ def opened(scene_files: Path, weights: Path, tmp_path: Path) -> Opened:
     """Open a survey of the small picture with such settings, without running it."""
 
     def open_with(**given: Any) -> SurveyRun:
-        basic = {"scene": str(scene_files / "scene.png"), "weights": str(weights), "engine": "plain"}
+        basic = {"scene": str(scene_files / "scene.png"), "source": "sim", "weights": str(weights), "engine": "plain"}
         settings = parse_settings(basic | {name: value for name, value in given.items() if value is not None})
         return open_run(settings, planning=True, archive=Archive(tmp_path, writes=False))
 

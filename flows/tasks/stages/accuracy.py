@@ -48,17 +48,19 @@ from storage.archive.manifests import read_table
 from storage.archive.whole_files import to_json
 from storage.arrays.class_maps import load_class_map
 from storage.arrays.mosaics import open_patches
+from storage.rasters.raster_work import RasterPixels, patches_of
 
 RECORD = "accuracy.json"
 ACCURACY = Product("evaluate", version=9, files=(RECORD,), by_weights=True)
 
 
 @stage("evaluate", "accuracy (not part of the survey)", ACCURACY, unit="operations of a glance", size="surveys")
-def evaluate(
-    run: SurveyRun, mosaic: StageRef, patches: StageRef, class_map: StageRef, effects: StageRef, *pointing: StageRef
-) -> Wanted:
-    """Judge the map by the labels, and other placements, with the survey's effects; no part of the survey's cost."""
-    inputs = [mosaic, patches, class_map, effects, *pointing]
+def evaluate(run: SurveyRun, mosaic: StageRef, patches: StageRef, class_map: StageRef, *captures: StageRef) -> Wanted:
+    """Judge the map by the labels, and other placements, with the survey's effects; no part of the survey's cost.
+
+    ``captures`` are the effects of what was captured and where its sweeps lie; a raster has neither.
+    """
+    inputs, pointing = [mosaic, patches, class_map, *captures], captures[1:]
     for ref in inputs:
         _ = ref.key  # a plan stops here where one is not known yet: for its own key the labels have to be drawn
     off = _map_offset(run, pointing)
@@ -77,8 +79,10 @@ def evaluate(
         result["none"] = _figures(run, confusion(judged, none.classes, run.weights.config.classes))
         result |= {"all": {"miou": None, "per_class_iou": {}}, "gap_closed": None, "controls": {}}
         if run.controls:
-            source = source_with(_sure_source(run, off), effects)
-            result |= _controls(replace(run, simulated=source), seen, patches, judged, result)
+            captured = run
+            if run.raster is None:
+                captured = replace(run, simulated=source_with(_sure_source(run, off), captures[0]))
+            result |= _controls(captured, seen, patches, judged, result)
         (path / RECORD).write_text(to_json(result), encoding="utf-8")  # no NaN, which JSON does not know
 
     params = {
@@ -123,15 +127,7 @@ def _sure_source(run: SurveyRun, off: NDArray[np.float64]) -> SimulatedSource:
 def _controls(
     run: SurveyRun, seen: Glance, patches: StageRef, labels: NDArray[np.uint8], result: dict[str, Any]
 ) -> dict[str, Any]:
-    columns = columns_of_all_seats(
-        run.simulated,
-        run.plan.coarse if run.plan.plain else run.plan.full,
-        run.grid,
-        run.weights,
-        memory=run.settings.memory,
-        kernel=run.settings.kernel,
-        report=lambda done: run.report(0.6 * done),
-    )
+    columns = _columns(run)
     rows = 0
 
     def report(row: str) -> None:
@@ -158,6 +154,21 @@ def _controls(
         "controls_mode": _controls_mode(run, seen, controls),
         "segment_wall_s": _segment_seconds(run, seen, patches, columns),
     }
+
+
+def _columns(run: SurveyRun) -> NDArray[np.float32]:
+    """Columns of all seats, (seat, p, p, column), from a full scan, or from the raster itself."""
+
+    def report(done: float) -> None:
+        run.report(0.6 * done)
+
+    memory = run.settings.memory
+    if run.raster is not None:
+        return columns_of_raster(run.raster, run.weights, run.scene.wavelength_nm, memory=memory, report=report)
+    sweeps = run.plan.coarse if run.plan.plain else run.plan.full
+    return columns_of_all_seats(
+        run.simulated, sweeps, run.grid, run.weights, memory=memory, kernel=run.settings.kernel, report=report
+    )
 
 
 def _control_share(run: SurveyRun, patches: StageRef) -> float:
@@ -191,7 +202,8 @@ def _controls_mode(run: SurveyRun, seen: Glance, controls: Controls) -> dict[str
 def _segment_seconds(run: SurveyRun, seen: Glance, patches: StageRef, columns: NDArray[np.float32]) -> dict[str, float]:
     """Wall time of the model from spectral columns to the map, the better of two each [s].
 
-    As captured: glance, scores and map. With every seat there is nothing to choose: the map alone.
+    As captured: glance, scores where some are chosen, and map. With every seat there is nothing to choose: the map
+    alone.
     """
     (seats, own), settings = patch_columns(run, patches, seen), run.settings
     valid = run.grid.valid_seats()
@@ -200,7 +212,8 @@ def _segment_seconds(run: SurveyRun, seen: Glance, patches: StageRef, columns: N
 
     def look_choose_draw() -> None:
         looked = glance_of_columns(run.weights, seen.columns, run.grid)
-        score_seats(settings.policy, looked, seed=settings.seed, mask=run.mask, network=network)
+        if run.chooses:
+            score_seats(settings.policy, looked, seed=settings.seed, mask=run.mask, network=network)
         segment(run.weights, looked, own, seats)
 
     return {
@@ -235,6 +248,29 @@ def _figures(run: SurveyRun, counts: NDArray[np.int64]) -> dict[str, Any]:
 def load_accuracy(evaluated: StageRef) -> dict[str, Any]:
     """Read the figures of an evaluation."""
     return read_table(evaluated.path / RECORD)
+
+
+def columns_of_raster(
+    raster: RasterPixels,
+    weights: Weights,
+    wavelength_nm: NDArray[np.floating],
+    *,
+    memory: int,
+    report: Callable[[float], None] = lambda done: None,
+) -> NDArray[np.float32]:
+    """Read all pixels of a raster some rows at a time, and keep the normalised columns only.
+
+    Gives (seat, p, p, column) float32 of the padded grid; seats beyond the raster, and pixels without a value, are 0.
+    ``memory`` is in bytes.
+    """
+    p, valid, done = raster.grid.patch, raster.grid.valid_seats(), 0
+    columns = np.zeros((int(np.prod(raster.grid.seat_shape)), p, p, weights.basis.columns), np.float32)
+    for values, _ in patches_of(raster, valid, memory=memory):
+        seats = valid[done : done + len(values)]
+        columns[seats] = np.nan_to_num(weights.columns(values, wavelength_nm), nan=0.0)
+        done += len(values)
+        report(done / len(valid))
+    return columns
 
 
 MEMORY_SHARE = 32  # a band of seats may take this part of the memory

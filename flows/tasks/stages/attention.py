@@ -52,18 +52,21 @@ def attend(run: SurveyRun, mosaic: StageRef) -> Wanted:
         absent = [name for name in ("threshold", "spared_s") if content[name] is None]
         write_table(path / "plan.json", {name: value for name, value in content.items() if name not in absent})
 
-    params = {
-        **run.model_key,
-        "grid": asdict(run.grid),
-        "policy": settings.policy,
-        "seed": settings.seed if settings.policy in SEEDED_POLICIES else None,
-        "mask": None if run.mask is None else array_digest(run.mask),
+    captures = {
         "fine_s": run.plan.fine_s,
         "overlap_px": run.plan.overlap_px,
         "margin_px": run.plan.margin_px,
         "along": run.plan.along,
         "camera": asdict(run.camera),
         "cost": asdict(settings.cost),
+    }
+    params = {
+        **run.model_key,
+        "grid": asdict(run.grid),
+        "policy": settings.policy,
+        "seed": settings.seed if settings.policy in SEEDED_POLICIES else None,
+        "mask": None if run.mask is None else array_digest(run.mask),
+        **(captures if run.raster is None else {}),
         **(region_params(run.grid) if settings.policy in SEEING_POLICIES else {}),
         **({} if run.vgg is None else {"vgg": run.vgg.key}),
         **({} if settings.threshold is None else {"threshold": settings.threshold}),
@@ -145,14 +148,18 @@ def _scores_within_zones(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> N
 
 
 def _whole_field(run: SurveyRun) -> tuple[NDArray[np.float64], FinePlan]:
-    """No scores, and the plan of a plain scan: every seat is seen, and there is nothing to go back for."""
+    """No scores, and the plan of a plain scan or a raster: every seat is seen, and nothing to go back for."""
+    nothing = np.zeros(int(np.prod(run.grid.seat_shape)))
+    if run.raster is not None:
+        reason = "the pixels of the raster were taken as they are"
+        return nothing, _kept_seats(run, FinePlan([], run.grid.valid_seats(), 0.0, 0.0, "raster", reason))
     sweep = run.plan.coarse[0]
     words = scan_words(sweep.step, exposing(run.camera, sweep).exposure_ms)
     seats, what = run.grid.valid_seats(), "the field was"
     if run.settings.look != LOOK_WHOLE:
         seats, what = np.flatnonzero(seats_shown(run.plan.coarse, run.grid, run.camera)), "a part of the field was"
     plan = FinePlan([], seats, 0.0, 0.0, "scan", f"{what} scanned once: {words}")
-    return np.zeros(int(np.prod(run.grid.seat_shape))), _kept_seats(run, plan)
+    return nothing, _kept_seats(run, plan)
 
 
 def _scores(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> NDArray[np.float64]:

@@ -74,7 +74,7 @@ def test_the_same_survey_makes_the_same_patches(two_budgets: Path, archive: Arch
 def _settings(archive: Archive) -> Any:
     """What the first of the two surveys was asked for."""
     receipt = json.loads((archive.runs()[0] / "receipt.json").read_text())
-    given = {name: receipt["settings"][name] for name in ("scene", "labels", "weights", "budget", "engine")}
+    given = {name: receipt["settings"][name] for name in ("scene", "source", "labels", "weights", "budget", "engine")}
     return load_settings(None, {**given, "out": str(archive.root), "controls": False})
 
 

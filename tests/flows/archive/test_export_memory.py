@@ -87,7 +87,9 @@ def visited(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
         for name in ("CERTAIN", "SURE"):  # untrained weights are sure of nothing: what they say is taken for sure
             patch.setattr(remembered, name, 1e-6)
         for scene, visit, budget in zip(harvested(folder, request.param), VISITS, ("1", "0.8"), strict=True):
-            settings = load_settings(None, given | {"scene": str(scene), "visit": visit, "budget": budget})
+            settings = load_settings(
+                None, given | {"scene": str(scene), "source": "sim", "visit": visit, "budget": budget}
+            )
             posed = replace(settings, pose=POSE) if request.param == "posed" else settings
             runs.append(run_survey(posed, QUIET))
     answers = [run_export(archive, run.folder.name, out, envi=False, console=QUIET) for run in runs]

@@ -30,7 +30,12 @@ ON_REQUEST = ["register_coarse", "register_fine", "ground"]
 @pytest.fixture(scope="module")
 def settings(scene_files: Path, weights: Path) -> Settings:
     """Those of the small picture with labels, without an archive."""
-    flags = {"scene": scene_files / "scene.png", "labels": scene_files / "labels.png", "weights": weights}
+    flags = {
+        "scene": scene_files / "scene.png",
+        "source": "sim",
+        "labels": scene_files / "labels.png",
+        "weights": weights,
+    }
     given = {name: str(path) for name, path in flags.items()}
     return load_settings(None, given | {"engine": "plain", "budget": "0.8", "controls": False})
 

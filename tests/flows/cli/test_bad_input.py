@@ -125,7 +125,19 @@ REFUSED = {
 
 def survey_words(more: str, out: str = "archive") -> list[str]:
     """A survey that works, with flags added or put in the place of its own."""
-    words = ["--scene", "scene.png", "--weights", "w.safetensors", "--engine", "plain", "--out", out, "--no-controls"]
+    words = [
+        "--scene",
+        "scene.png",
+        "--source",
+        "sim",
+        "--weights",
+        "w.safetensors",
+        "--engine",
+        "plain",
+        "--out",
+        out,
+        "--no-controls",
+    ]
     given = more.split()
     for flag in given[::2]:
         if flag in words:

@@ -33,7 +33,7 @@ CAMERA = {"camera.samples": 160}  # as wide as the small picture: all of what el
 def scan(scene_files: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[CaptureRun, list[Sweep], StageRef]:
     """A coarse scan of the small picture, decided and not taken."""
     out = tmp_path_factory.mktemp("compared")
-    given = {"scene": str(scene_files / "scene.png"), "out": str(out), "effects": ASKED, **CAMERA}
+    given = {"scene": str(scene_files / "scene.png"), "source": "sim", "out": str(out), "effects": ASKED, **CAMERA}
     run, sweeps, _ = open_simulation(load_settings(None, given), coarse=True)
     return run, sweeps, choose(run)
 
@@ -102,7 +102,7 @@ def test_figures_are_beside_all_that_the_rig_has(
 
 def test_what_is_exact_differs_by_nothing(scene_files: Path, tmp_path: Path) -> None:
     """Neither in light nor in raw numbers."""
-    given = {"scene": str(scene_files / "scene.png"), "out": str(tmp_path), "effects": "all", **CAMERA}
+    given = {"scene": str(scene_files / "scene.png"), "source": "sim", "out": str(tmp_path), "effects": "all", **CAMERA}
     run, sweeps, _ = open_simulation(load_settings(None, given), coarse=True)
     same = compare_with_everything(run, sweeps, choose(run), lambda words: None)
     assert (same.measured, same.raw_unequal, same.raw_most_dn) == (0, 0, 0)
@@ -198,7 +198,7 @@ def key_of(run: CaptureRun) -> str:
 
 def opened(scene_files: Path, out: Path, **flags: Any) -> CaptureRun:
     """A simulation of the small picture."""
-    given = {"scene": str(scene_files / "scene.png"), "out": str(out), "effects": ASKED}
+    given = {"scene": str(scene_files / "scene.png"), "source": "sim", "out": str(out), "effects": ASKED}
     return open_simulation(load_settings(None, given | CAMERA | flags))[0]
 
 

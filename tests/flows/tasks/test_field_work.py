@@ -36,7 +36,13 @@ def surveyed(
     """A survey of scene.png, and the folder of its stages."""
     out = tmp_path_factory.mktemp("field") / "archive"
     surveyed_png(out)
-    flags = {"scene": str(scene_files / "scene.png"), "weights": str(weights), "out": str(out), "budget": "0.8"}
+    flags = {
+        "scene": str(scene_files / "scene.png"),
+        "source": "sim",
+        "weights": str(weights),
+        "out": str(out),
+        "budget": "0.8",
+    }
     return open_run(load_settings(None, flags)), out / "stages"
 
 

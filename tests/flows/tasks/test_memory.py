@@ -211,7 +211,13 @@ def test_visits_are_reprocessed_in_order(visited: Path, twice: Any, make_weights
 
 def test_a_plan_knows_what_is_remembered(visited: Path, scene_files: Path, weights: Path) -> None:
     """It is what the survey would do, and writes nothing."""
-    given = {"scene": str(scene_files / "scene.png"), "weights": str(weights), "out": str(visited), "scan_step": "2"}
+    given = {
+        "scene": str(scene_files / "scene.png"),
+        "source": "sim",
+        "weights": str(weights),
+        "out": str(visited),
+        "scan_step": "2",
+    }
     before = sorted(visited.rglob("*"))
     content = plan_content(load_settings(None, {**given, "name": "north", "visit": LATER, "prior": "latest"}))
     rows = {row["stage"]: row for row in content["stages"]}

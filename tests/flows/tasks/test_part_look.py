@@ -156,7 +156,13 @@ def test_of_what_is_sure_enough_nothing_is_looked_at(
     flags = {**PART, "visit": LAST, "weights": str(recorded)}
     asked = {
         **{name: value for name, value in flags.items() if value is not None},
-        **{"scene": str(scene_files / "scene.png"), "out": str(visited), "engine": "plain", "doubt": "50%"},
+        **{
+            "scene": str(scene_files / "scene.png"),
+            "source": "sim",
+            "out": str(visited),
+            "engine": "plain",
+            "doubt": "50%",
+        },
     }
     with pytest.raises(NothingToMend, match=f"the map of {runs[-1].name} stands"):
         survey_png(visited, **{**flags, "doubt": "50%"})

@@ -160,7 +160,13 @@ def test_a_mirror_off_the_plan_is_put_right_in_a_scan_too(survey_png: Survey, re
 
 def test_plan_shows_what_seconds_buy(scene_files: Path, recorded: Path, tmp_path: Path) -> None:
     """The frontier rises in seconds and expected mIoU; the scan that would be taken stands beside it."""
-    given = {"scene": str(scene_files / "scene.png"), "weights": str(recorded), "goal": "88", "out": str(tmp_path)}
+    given = {
+        "scene": str(scene_files / "scene.png"),
+        "source": "sim",
+        "weights": str(recorded),
+        "goal": "88",
+        "out": str(tmp_path),
+    }
     told = plan_content(load_settings(None, given))["scans"]
     seconds = [scan["seconds"] for scan in told["frontier"]]
     expected = [scan["expected_miou"] for scan in told["frontier"]]
@@ -201,7 +207,7 @@ def test_nothing_is_expected_of_a_scan_beyond_the_record(
     scene_files: Path, recorded: Path, tmp_path: Path, exposure_ms: str, told: bool
 ) -> None:
     """By hand any exposure may be taken; one beside those that were judged has no expectation."""
-    given = {"scene": str(scene_files / "scene.png"), "weights": str(recorded), "out": str(tmp_path)}
+    given = {"scene": str(scene_files / "scene.png"), "source": "sim", "weights": str(recorded), "out": str(tmp_path)}
     scan = {"scan_step": "2", "scan_exposure_ms": exposure_ms}
     assert (plan_content(load_settings(None, given | scan))["scans"]["taken"] is not None) == told
 

@@ -192,7 +192,12 @@ def test_a_budget_is_refused_before_anything_is_captured(survey_png: Survey, tmp
 
 def test_a_plan_tells_what_the_budgets_pay_for(scene_files: Path, tiny: Path, tmp_path: Path) -> None:
     """Before the first line: the most seats, and what they take."""
-    given_settings = {"scene": str(scene_files / "scene.png"), "weights": str(tiny), "out": str(tmp_path)}
+    given_settings = {
+        "scene": str(scene_files / "scene.png"),
+        "source": "sim",
+        "weights": str(tiny),
+        "out": str(tmp_path),
+    }
     content = plan_content(load_settings(None, {**given_settings, "scan_step": "1", "bytes_kept": "50%"}))
     assert 0.49 < content["kept"]["bytes"]["done"] / content["kept"]["bytes"]["everything"] <= 0.5
     assert f"detail: at most {content['kept']['seats']} of 192 seats" in kept_words(content["kept"])

@@ -149,7 +149,12 @@ def test_a_survey_says_so_until_they_are_sealed(
 ) -> None:
     """One note with the command; its stages keep their keys."""
     data = write_field(tmp_path / "data")
-    flags = {"scene": str(data / "images" / "001_image.png"), "weights": str(earlier), "out": str(tmp_path / "a")}
+    flags = {
+        "scene": str(data / "images" / "001_image.png"),
+        "source": "sim",
+        "weights": str(earlier),
+        "out": str(tmp_path / "a"),
+    }
     settings = load_settings(None, {**flags, "budget": 1})
     before = open_run(settings)
     assert [note for note in before.notes if SAID in note] == [f"w.safetensors {SAID}{earlier}"]

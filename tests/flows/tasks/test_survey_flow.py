@@ -289,7 +289,17 @@ def test_sigterm_in_a_stage(
         os.kill(os.getpid(), signal.SIGTERM)
         pytest.fail("SIGTERM was not heard")
 
-    words = ("survey", "--scene", scene_files / "scene.png", "--weights", weights, "--out", tmp_path / "archive")
+    words = (
+        "survey",
+        "--scene",
+        scene_files / "scene.png",
+        "--source",
+        "sim",
+        "--weights",
+        weights,
+        "--out",
+        tmp_path / "archive",
+    )
     act_instead(monkeypatch, "rectify", terminated)
     ended = command_line(*words)
     assert (ended.code, ended.out, ended.errors) == (143, "", [])

@@ -193,7 +193,12 @@ def test_without_validation_scenes_a_control_is_not_judged(folder: Path, out: Pa
 def test_a_survey_with_a_control_is_refused(folder: Path, out: Path):
     """Before the scene is opened: weights of a control make no survey."""
     train_weights(_request(folder, out, validation=0, preset="paper"))
-    flags = {"scene": str(folder / "images" / "001_image.png"), "weights": str(out), "out": str(out.parent / "a")}
+    flags = {
+        "scene": str(folder / "images" / "001_image.png"),
+        "source": "sim",
+        "weights": str(out),
+        "out": str(out.parent / "a"),
+    }
     for planning in (False, True):
         with pytest.raises(WeightsError, match=r"holds the control 'paper'.*a survey needs weights of two scales"):
             open_run(load_settings(None, flags), planning=planning)
@@ -205,7 +210,7 @@ def test_a_survey_says_that_a_scene_was_trained_on(folder: Path, out: Path) -> N
     notes = {}
     for number in ("001", "002"):
         scene = folder / "images" / f"{number}_image.png"
-        flags = {"scene": str(scene), "weights": str(out), "out": str(out.parent / "a"), "budget": 1}
+        flags = {"scene": str(scene), "source": "sim", "weights": str(out), "out": str(out.parent / "a"), "budget": 1}
         notes[number] = " ".join(open_run(load_settings(None, flags)).notes)
     assert "trained on this scene" in notes["001"]
     assert "trained on this scene" not in notes["002"]
@@ -222,7 +227,14 @@ def test_pixels_trained_on_are_not_judged(out: Path, tmp_path: Path) -> None:
     given = {"labels": str(tmp_path / "labels.npy"), "wavelengths": [500, 600, 700, 800]}
     choices = {**given, "train_mask": str(tmp_path / "mask.npy")}
     train_weights(_request(tmp_path / "cube.npy", out, choices=choices))
-    flags = {**given, "scene": str(tmp_path / "cube.npy"), "weights": str(out), "out": str(tmp_path / "a"), "budget": 1}
+    flags = {
+        **given,
+        "scene": str(tmp_path / "cube.npy"),
+        "source": "sim",
+        "weights": str(out),
+        "out": str(tmp_path / "a"),
+        "budget": 1,
+    }
     run = open_run(load_settings(None, flags))
     assert run.labels is not None
     assert (run.labels[:10] == 255).all()

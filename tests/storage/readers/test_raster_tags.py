@@ -20,7 +20,8 @@ from pipeline.errors import SceneError
 from pipeline.setting_fields import numbers_of
 from storage.readers.raster_tags import bad_bands
 from storage.readers.scan_files import open_cube_source, write_ingested_cube
-from storage.readers.scene_files import bands_text, load_scene_file
+from storage.readers.scene_files import load_scene_file
+from storage.readers.scene_rows import bands_text
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:Use `@` matmul:PendingDeprecationWarning", "ignore:Dataset has no geotransform"

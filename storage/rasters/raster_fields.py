@@ -1,0 +1,258 @@
+"""Rasters whose pixels are taken as they are: one file, or tiles of a folder or a glob placed side by side."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from affine import Affine
+from numpy.typing import NDArray
+
+from pipeline.errors import SceneError
+from pipeline.geometry.grid import UNLABELLED
+from pipeline.lazy import deferred
+from storage.readers.headwall_folders import is_headwall_folder
+from storage.readers.label_files import (
+    folders_within,
+    image_folder,
+    is_label_name,
+    listed_names,
+    match_folder,
+    scene_entries,
+)
+from storage.readers.labels import Labels, load_labels
+from storage.readers.raster_files import split_variable
+from storage.readers.scan_files import reader_of
+from storage.readers.scene_files import OpenScene, open_scene_file
+from storage.readers.scene_toml import find_scene_settings
+
+if TYPE_CHECKING:
+    import odc.geo.geobox as odc_geobox
+    from odc.geo.geobox import GeoBox
+else:
+    odc_geobox = deferred("odc.geo.geobox")
+
+WILD = "*?["
+OFF_GRID_PX = 0.02  # by which tiles of one grid may lie beside it: their places are written with rounded numbers
+SCALE = 1e-6  # by which pixels of one size may differ
+APART_NM = 0.1  # wavelengths of one band
+
+
+def open_raster(
+    address: str | Path,
+    *,
+    labels: str | Path | None = None,
+    bands: Sequence[int] | None = None,
+    wavelengths: Sequence[float] | None = None,
+) -> OpenScene:
+    """Open a file, or the tiles of a folder or a glob as one field, to be read some rows at a time.
+
+    Of tiles that overlap the first by name wins where it has a value; what no tile shows is missing. ``labels`` are on
+    the pixels of the whole field. Raises SceneError, WavelengthError: as `open_scene_file`, or the tiles do not lie on
+    one grid, do not say where they lie, or have other bands.
+    """
+    files = tiles_of(address)
+    if len(files) == 1:
+        return open_scene_file(files[0], labels=labels, bands=bands, wavelengths=wavelengths)
+    opened = [open_scene_file(file, bands=bands, wavelengths=wavelengths) for file in files]
+    return _side_by_side(Path(address), opened, labels)
+
+
+def is_glob(address: str | Path) -> bool:
+    """Return whether an address stands for files by a pattern; a file of that very name is meant as it is."""
+    return any(sign in str(address) for sign in WILD) and not split_variable(address)[0].exists()
+
+
+def tiles_of(address: str | Path) -> tuple[str, ...]:
+    """Return the files that an address stands for: itself, the images of a folder, or what a glob names, by name.
+
+    A folder that is itself a cube (Zarr, Sentinel-2, a Headwall camera) stands for itself. Label files are no tiles.
+    Raises SceneError: there is no image.
+    """
+    path, _ = split_variable(address)
+    if is_glob(address):
+        parts = Path(address).parts
+        fixed = next(number for number, part in enumerate(parts) if any(sign in part for sign in WILD))
+        named = sorted(Path(*parts[:fixed]).glob("/".join(parts[fixed:])))
+        beside = {entry for folder in {one.parent for one in named} for entry in scene_entries(folder)}
+        found = [one for one in named if one in beside and not is_label_name(one)]
+        if not found:
+            raise SceneError(f"--scene {address} names no image; check the pattern (seen from {Path.cwd()})")
+        return tuple(map(str, found))
+    if not path.is_dir() or reader_of(address) != "headwall" or is_headwall_folder(path):
+        return (str(address),)
+    images = match_folder(image_folder(path)).images
+    if not images:
+        raise SceneError(
+            f"{path} holds no image that is read; give a file, a folder or a glob of tiles{folders_within(path)}"
+        )
+    return tuple(map(str, images))
+
+
+@dataclass(frozen=True)
+class _Tile:
+    """A tile with the row and column of the field at which it begins."""
+
+    scene: OpenScene
+    row: int
+    column: int
+
+    @property
+    def place(self) -> tuple[slice, slice]:
+        height, width = self.scene.shape
+        return slice(self.row, self.row + height), slice(self.column, self.column + width)
+
+
+def _side_by_side(address: Path, opened: Sequence[OpenScene], labels: str | Path | None) -> OpenScene:
+    """Place tiles on the grid of the first, as one field."""
+    first = opened[0]
+    for other in opened[1:]:
+        _check_bands(first, other)
+    tiles, geobox = _placed(opened)
+    shape = (int(geobox.shape[0]), int(geobox.shape[1]))
+    missing, covered, filled = np.ones(shape, np.bool_), np.zeros(shape, np.bool_), sum(one.filled_px for one in opened)
+    shared = 0
+    for tile in tiles:
+        there = ~tile.scene.missing
+        shared += int(np.count_nonzero(there & ~missing[tile.place]))
+        missing[tile.place] &= ~there
+        covered[tile.place] = True
+    beside = int(np.count_nonzero(~covered))
+    notes = [f"{len(tiles)} tiles of one grid are one field: {listed_names([one.path for one in opened])}"]
+    notes += [f"of {shared} pixels that several tiles show, the first by name wins"] if shared else []
+    notes += [f"{beside} pixels lie between the tiles and have no value"] if beside else []
+    notes += list(dict.fromkeys(note for one in opened for note in one.provenance))
+    found = _merged_labels(tiles, shape, notes) if labels is None else _stated_labels(labels, shape, first)
+    places = [(tile.scene.light_hash, tile.row, tile.column) for tile in tiles]
+    light_hash = hashlib.sha256(json.dumps(places).encode()).hexdigest()
+    told = "" if found is None else hashlib.sha256(found.index.tobytes()).hexdigest()
+
+    def read(start: int, stop: int) -> NDArray[np.float32]:
+        return _rows_of(tiles, shape[1], len(first.wavelength_nm), start, stop)
+
+    return OpenScene(
+        name=_name_of(address),
+        path=address,
+        wavelength_nm=first.wavelength_nm,
+        fwhm_nm=first.fwhm_nm,
+        labels=None if found is None else found.index,
+        class_names=() if found is None else found.names,
+        class_colours=np.zeros((0, 3), np.uint8) if found is None else found.colours,
+        class_values=() if found is None else found.values,
+        content_hash=light_hash + told,
+        light_hash=light_hash,
+        provenance=tuple(notes),
+        geobox=geobox,
+        labels_found=found is not None and labels is None,
+        shape=shape,
+        read=read,
+        missing=missing,
+        filled_px=filled + beside,
+    )
+
+
+def _rows_of(tiles: Sequence[_Tile], width: int, bands: int, start: int, stop: int) -> NDArray[np.float32]:
+    """Read rows of the field, (y, x, band); the first tile with a value wins."""
+    out = np.full((stop - start, width, bands), np.nan, np.float32)
+    free = np.ones((stop - start, width), np.bool_)
+    for tile in tiles:
+        rows, columns = tile.place
+        above, below = max(start, rows.start), min(stop, rows.stop)
+        if above >= below:
+            continue
+        part = np.s_[above - start : below - start, columns]
+        there = ~tile.scene.missing[above - rows.start : below - rows.start] & free[part]
+        if there.any():
+            out[part][there] = tile.scene.read(above - rows.start, below - rows.start)[there]
+            free[part] &= ~there
+    return out
+
+
+def _check_bands(first: OpenScene, other: OpenScene) -> None:
+    """Refuse tiles of other bands (SceneError)."""
+    one, two = first.wavelength_nm, other.wavelength_nm
+    if len(one) != len(two) or not np.allclose(one, two, rtol=0, atol=APART_NM):
+        raise SceneError(
+            f"the tiles {first.path} and {other.path} have other bands, {len(one)} from {one[0]:.1f} nm on and "
+            f"{len(two)} from {two[0]:.1f} nm on: tiles of one field have the same; survey them one by one, or choose "
+            "alike bands with --bands"
+        )
+
+
+def _placed(opened: Sequence[OpenScene]) -> tuple[list[_Tile], GeoBox]:
+    """Find row and column of each tile, and the grid of them all (SceneError: they do not lie on one)."""
+    first, origins = opened[0], list[tuple[int, int]]()
+    for one in opened:
+        if one.geobox is None or one.geobox.crs is None:
+            raise SceneError(
+                f"{len(opened)} tiles are one field where they say how they lie side by side, and {one.path} has no "
+                "place on the earth: survey them one by one, or give them one (gdal_translate -a_srs -a_ullr)"
+            )
+        assert first.geobox is not None
+        if one.geobox.crs != first.geobox.crs:
+            raise SceneError(
+                f"the tiles {first.path} and {one.path} lie in {first.geobox.crs} and {one.geobox.crs}: tiles of one "
+                "field have one CRS; warp them onto one grid (gdalwarp -t_srs), or survey them one by one"
+            )
+        origins.append(_origin(first, one, first.geobox, one.geobox))
+    top, left = (min(origin[axis] for origin in origins) for axis in (0, 1))
+    tiles = [_Tile(one, row - top, column - left) for one, (row, column) in zip(opened, origins, strict=True)]
+    shape = max(tile.place[0].stop for tile in tiles), max(tile.place[1].stop for tile in tiles)
+    assert first.geobox is not None
+    return tiles, odc_geobox.GeoBox(shape, first.geobox.affine * Affine.translation(left, top), first.geobox.crs)
+
+
+def _origin(first: OpenScene, other: OpenScene, grid: GeoBox, own: GeoBox) -> tuple[int, int]:
+    """Row and column of a tile on the grid of the first (SceneError: other pixels, or pixels that lie between)."""
+    a, b, c, d, e, f = (~grid.affine * own.affine)[:6]
+    if max(abs(a - 1), abs(b), abs(d), abs(e - 1)) > SCALE:
+        sizes = [f"{abs(one.affine.a):g} x {abs(one.affine.e):g}" for one in (grid, own)]
+        raise SceneError(
+            f"the tiles {first.path} and {other.path} have pixels of {sizes[0]} and {sizes[1]}, or turned ones: tiles "
+            "of one field have the same; warp them onto one grid (gdalwarp -tr -tap), or survey them one by one"
+        )
+    row, column = round(f), round(c)
+    if max(abs(f - row), abs(c - column)) > OFF_GRID_PX:
+        raise SceneError(
+            f"the pixels of {other.path} lie {c - column:.2f} and {f - row:.2f} px (x, y) beside those of {first.path}:"
+            " tiles of one field lie on one grid; warp them onto one (gdalwarp -tr -tap), or survey them one by one"
+        )
+    return row, column
+
+
+def _merged_labels(tiles: Sequence[_Tile], shape: tuple[int, int], notes: list[str]) -> Labels | None:
+    """Lay the tiles' own labels side by side; None without any, or where classes differ, which a note says."""
+    labelled = [tile.scene for tile in tiles if tile.scene.labels is not None]
+    if not labelled:
+        return None
+    like = labelled[0]
+    if any((one.class_names, one.class_values) != (like.class_names, like.class_values) for one in labelled):
+        notes.append(
+            "the labels beside the tiles are left out: they have other classes from tile to tile; name all of them in a"
+            " table [classes] of the scene.toml beside the tiles"
+        )
+        return None
+    index, free = np.full(shape, UNLABELLED, np.uint8), np.ones(shape, np.bool_)
+    for tile in tiles:
+        there = free[tile.place] & ~tile.scene.missing
+        if tile.scene.labels is not None:
+            index[tile.place][there] = tile.scene.labels[there]
+        free[tile.place] &= ~there
+    return Labels(index, like.class_names, like.class_values, like.class_colours)
+
+
+def _stated_labels(address: str | Path, shape: tuple[int, int], first: OpenScene) -> Labels:
+    """Read labels on the pixels of the whole field (SceneError: they do not fit)."""
+    settings = find_scene_settings(first.path)
+    return load_labels(address, shape, classes=settings.classes or {}, unlabelled=settings.unlabelled)
+
+
+def _name_of(address: Path) -> str:
+    """Call a field by its folder."""
+    folder = address.parent if is_glob(address) else address
+    return "tiles" if is_glob(folder) else folder.resolve().name or "tiles"

@@ -1,0 +1,383 @@
+"""Surveys of rasters: their own pixels in every product, without a camera; read back by other readers."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rasterio
+import xarray
+from affine import Affine
+from numpy.typing import NDArray
+from PIL import Image
+from rich.console import Console
+
+from flows.archive.export_command import run_export
+from flows.archive.plan_command import plan_content, show_plan
+from flows.archive.product_choice import ProductFlags, choose_products
+from flows.publish.survey_command import run_survey
+from flows.settings.load import load_settings
+from flows.tasks.run import open_run
+from flows.tasks.stages.accuracy import columns_of_all_seats, columns_of_raster
+from pipeline.errors import PipelineError, SceneError, SettingsError
+from storage.archive.archive import Archive
+from storage.arrays.layout import KEPT_BITS
+from storage.arrays.mosaics import load_mosaic, open_patches
+from storage.rasters.raster_fields import open_raster
+from storage.remote.opening import verify_archive
+from tests.conftest import RGB_NM, Survey, WeightsMaker, patchy_scene
+
+QUIET = Console(quiet=True)
+ROUNDING = 2.0 ** -(KEPT_BITS + 1)  # of stored values, relative
+CORNER = Affine(0.5, 0, 500_000, 0, -0.5, 5_400_000)
+UTM = "EPSG:32632"
+Raster = Callable[..., Any]
+
+
+@pytest.fixture
+def surveyed(tmp_path: Path, weights: Path) -> Raster:
+    """Survey a file as a raster on the plain engine; keywords change flags."""
+
+    def survey(scene: object, **flags: Any) -> Any:
+        given = {"scene": str(scene), "weights": str(weights), "engine": "plain", "out": str(tmp_path / "archive")}
+        return run_survey(load_settings(None, given | flags), QUIET)
+
+    return survey
+
+
+def write_tif(path: Path, values: NDArray[Any], place: Affine | None = CORNER, **about: Any) -> Path:
+    """Write (y, x, band) values as GeoTIFF in UTM, or without a place."""
+    placed = {} if place is None else {"transform": place, "crs": UTM}
+    height, width, count = values.shape
+    size = {"height": height, "width": width, "count": count, "dtype": values.dtype.name}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+        with rasterio.open(path, "w", driver="GTiff", **size, **placed, **about) as file:
+            file.write(np.moveaxis(values, -1, 0))
+    return path
+
+
+def whole(published: Any, archive: Path, factor: int = 4) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Put the stored patches of a run together again, (y, x, band), with its coarse means."""
+    products = published.receipt["products"]
+    store = open_patches(archive / products["patches"])
+    mosaic = load_mosaic(archive / products["mosaic"]).values
+    place = xarray.open_zarr(archive / products["class_map"], consolidated=False)["classes"].shape
+    values, seen = store.read(0, len(store.seats)), np.asarray(store.group["valid"][...])
+    y, x = (np.asarray(store.group[name][...]) for name in ("seat_y", "seat_x"))
+    patch = values.shape[1]
+    image = np.full((place[0] + patch, place[1] + patch, values.shape[3]), np.nan, np.float32)
+    for one, valid, top, left in zip(values, seen, y, x, strict=True):
+        image[top : top + patch, left : left + patch] = np.where(valid[..., None], one, np.nan)
+    return image[: place[0], : place[1]], mosaic
+
+
+def means_of(values: NDArray[Any], factor: int = 4) -> NDArray[np.float64]:
+    """Work the coarse means out by hand, NaN left out; (y, x, band)."""
+    height, width, _ = values.shape
+    rows = [
+        [np.nanmean(values[y : y + factor, x : x + factor].reshape(-1, values.shape[2]).astype(float), axis=0)]
+        for y in range(0, height, factor)
+        for x in range(0, width, factor)
+    ]
+    return np.array(rows).reshape(-(-height // factor), -(-width // factor), values.shape[2])
+
+
+@pytest.mark.parametrize("shape", [(33, 47), (1, 40), (40, 1), (64, 96), (5, 3)], ids=str)
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float32], ids=lambda kind: kind.__name__)
+def test_what_is_stored_is_what_the_file_says(
+    surveyed: Raster, tmp_path: Path, kind: type[np.generic], shape: tuple[int, int]
+) -> None:
+    """Patches are the file's numbers to the rounding of stored values, and coarse values their means."""
+    values = patchy_scene(shape, 3, seed=4)[0].astype(kind)
+    write_tif(tmp_path / "field.tif", values)
+    published = surveyed(tmp_path / "field.tif", wavelengths="640,550,460")
+    image, mosaic = whole(published, tmp_path / "archive")
+    np.testing.assert_allclose(image, values, rtol=ROUNDING)
+    np.testing.assert_allclose(mosaic, means_of(values), rtol=2 * ROUNDING, atol=1e-6)
+
+
+def test_a_raster_of_one_band(surveyed: Raster, make_weights: WeightsMaker, tmp_path: Path) -> None:
+    """Weights for that band read it, and its pixels come back."""
+    values = patchy_scene((40, 56), 1, seed=2)[0]
+    np.save(tmp_path / "one.npy", values[..., 0])
+    one = make_weights((540.0, 550.0, 560.0))
+    published = surveyed(tmp_path / "one.npy", wavelengths="550", weights=str(one))
+    np.testing.assert_allclose(whole(published, tmp_path / "archive")[0], values, rtol=ROUNDING)
+
+
+def test_what_has_no_value_stays_without_one(surveyed: Raster, tmp_path: Path) -> None:
+    """A pixel without most of its bands has no class and no value; a single missing band is missing alone."""
+    values = patchy_scene((40, 56), 3, seed=3)[0]
+    values[8:20, 8:30] = -9999  # nothing is known
+    values[30, 40, 1] = -9999  # of one band
+    write_tif(tmp_path / "gaps.tif", values, nodata=-9999)
+    published = surveyed(tmp_path / "gaps.tif", wavelengths="640,550,460")
+    image, mosaic = whole(published, tmp_path / "archive")
+    expected = np.where(values == -9999, np.nan, values)
+    np.testing.assert_allclose(image, expected, rtol=ROUNDING)
+    assert np.isnan(mosaic[3, 4]).all()
+    assert np.isfinite(mosaic[7, 10]).all()
+    classes = xarray.open_zarr(tmp_path / "archive" / published.receipt["products"]["class_map"], consolidated=False)
+    assert (np.asarray(classes["classes"])[8:20, 8:30] == 255).all()
+    assert np.asarray(classes["classes"])[30, 40] != 255
+
+
+def test_a_simulated_scan_shows_the_same_but_for_its_noise(
+    survey_png: Survey, weights: Path, scene_files: Path
+) -> None:
+    """A raster's numbers are in the scale that a simulated scan is calibrated to."""
+    pixels = open_run(
+        load_settings(None, {"scene": str(scene_files / "scene.png"), "weights": str(weights), "out": "none"}),
+        planning=True,
+    )
+    given = {"scene": str(scene_files / "scene.png"), "source": "sim", "weights": str(weights), "out": "none"}
+    scanned = open_run(load_settings(None, given | {"scan_step": 1, "effects": "none"}))
+    assert pixels.raster is not None
+    own = columns_of_raster(pixels.raster, pixels.weights, pixels.scene.wavelength_nm, memory=2**30)
+    seen = columns_of_all_seats(
+        scanned.simulated, scanned.plan.coarse, scanned.grid, scanned.weights, memory=2**30, kernel="nearest"
+    )
+    valid = pixels.grid.valid_seats()
+    assert np.abs(own[valid] - seen[valid]).mean() < 0.02 * own[valid].std()
+
+
+def test_a_receipt_of_a_raster_tells_of_no_camera(surveyed: Raster, scene_files: Path, tmp_path: Path) -> None:
+    """No seconds, no lines: its savings are bytes kept and multiply-adds, against keeping and reading all pixels."""
+    published = surveyed(scene_files / "scene.png", labels=str(scene_files / "labels.png"), compute="60%")
+    receipt = published.receipt
+    assert receipt["source"] == receipt["settings"]["source"] == "raster"
+    assert set(receipt["savings"]) == {"bytes_stored", "tokens", "multiply_adds", "segment_wall_s"}
+    assert receipt["savings"]["multiply_adds"]["ratio"] <= 0.6
+    assert receipt["savings"]["bytes_stored"]["ratio"] < 1
+    assert receipt["field"]["camera_s"] is receipt["field"]["lines"] is receipt["field"]["view_deg"] is None
+    assert [row["name"] for row in receipt["stages"]] == [
+        *("average_raster", "attend", "take_patches", "draw_map", "evaluate")
+    ]
+    assert [found.problem for found in verify_archive(Archive.open(tmp_path / "archive"))] == [None] * 6
+
+
+def test_what_is_read_whole_scores_as_all_of_it(surveyed: Raster, scene_files: Path) -> None:
+    """Its accuracy is that of detail everywhere, beside none and other placements, all from the raster itself."""
+    accuracy = surveyed(scene_files / "scene.png", labels=str(scene_files / "labels.png")).receipt["accuracy"]
+    assert accuracy["miou"] == pytest.approx(accuracy["all"]["miou"])
+    assert accuracy["none"]["miou"] != accuracy["miou"]
+    assert {"gain", "random"} <= set(accuracy["controls"])
+
+
+def test_the_plan_says_what_the_survey_does(surveyed: Raster, scene_files: Path, weights: Path, tmp_path: Path) -> None:
+    """Stages are to be made, then stored; a camera is not spoken of."""
+    given = {"scene": str(scene_files / "scene.png"), "weights": str(weights), "out": str(tmp_path / "archive")}
+    before = plan_content(load_settings(None, given))
+    published = surveyed(scene_files / "scene.png")
+    after = plan_content(load_settings(None, given))
+    assert {row["state"] for row in before["stages"]} == {"to run"}
+    assert [row["stage"] for row in before["stages"]] == [row["name"] for row in published.receipt["stages"]]
+    assert {row["state"] for row in after["stages"]} == {"cached"}
+    shown = Console(width=200, file=StringIO())
+    show_plan(after, shown)
+    assert "camera: none; the pixels of the raster are taken as they are" in shown.file.getvalue()  # type: ignore[attr-defined]
+
+
+def test_an_export_has_the_rasters_own_pixels(surveyed: Raster, tmp_path: Path) -> None:
+    """Reflectance and NDVI are the file's by rasterio, on its grid and CRS; so are classes and confidence."""
+    values = (patchy_scene((50, 70), 3, seed=7)[0] / 255).astype(np.float32)
+    source = write_tif(tmp_path / "field.tif", values)
+    published = surveyed(source, wavelengths="670,550,800", weights=str(_weights_at(tmp_path)))
+    out = tmp_path / "out"
+    choice = choose_products(ProductFlags(reflectance=True, indices="NDVI"))
+    run_export(tmp_path / "archive", None, out, False, QUIET, choice)
+    folder = out / published.folder.name
+    with rasterio.open(folder / "reflectance.tif") as exported, rasterio.open(source) as own:
+        assert (exported.crs, exported.transform, exported.shape) == (own.crs, own.transform, own.shape)
+        np.testing.assert_allclose(exported.read(), own.read(), rtol=ROUNDING)
+        assert exported.tags()["pixels"] == "Pixels of the raster"
+    ndvi = (values[..., 2] - values[..., 0]) / (values[..., 2] + values[..., 0])
+    with rasterio.open(folder / "NDVI.tif") as exported:
+        assert np.sqrt(np.mean((exported.read(1) - ndvi) ** 2)) < ROUNDING
+    with rasterio.open(folder / "class_map.tif") as exported:
+        assert (exported.crs, exported.transform, exported.shape) == (own.crs, own.transform, own.shape)
+
+
+def _weights_at(folder: Path) -> Path:
+    from models.weights.files import save_weights
+    from tests.conftest import random_weights
+
+    path = folder / "w.safetensors"
+    save_weights(random_weights((550.0, 670.0, 800.0)), path)
+    return path
+
+
+def test_an_export_of_a_part_says_which_pixels_are_means(surveyed: Raster, tmp_path: Path) -> None:
+    """With a limit on bytes patches are the file's own pixels, the rest its means, and the image says so."""
+    values = patchy_scene((64, 96), 3, seed=5)[0]
+    source = write_tif(tmp_path / "field.tif", values)
+    published = surveyed(source, wavelengths="640,550,460", bytes_kept="50%")
+    choice = choose_products(ProductFlags(reflectance=True))
+    run_export(tmp_path / "archive", None, tmp_path / "out", False, QUIET, choice)
+    own = whole(published, tmp_path / "archive")[0]
+    coarse = np.repeat(np.repeat(means_of(values), 4, axis=0), 4, axis=1)[:64, :96]
+    with rasterio.open(tmp_path / "out" / published.folder.name / "reflectance.tif") as exported:
+        found = np.moveaxis(exported.read(), 0, -1)
+        assert "means of 4 x 4 px elsewhere" in exported.tags()["pixels"]
+    kept = np.isfinite(own)
+    assert 0.1 < kept.mean() < 0.9
+    np.testing.assert_allclose(found[kept], values[kept], rtol=ROUNDING)
+    np.testing.assert_allclose(found[~kept], coarse[~kept], rtol=2 * ROUNDING)
+
+
+def test_a_second_visit_goes_on_from_the_first(surveyed: Raster, scene_files: Path) -> None:
+    """What the raster of before left is remembered."""
+    surveyed(scene_files / "scene.png", visit="2026-06-01T10:00:00Z", prior="latest")
+    later = surveyed(scene_files / "scene.png", visit="2026-06-04T10:00:00Z", prior="latest", compute="60%")
+    assert later.receipt["memory"]["days"] == 3
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("seconds", 5),
+        ("budget", 0.5),
+        ("effects", "all"),
+        ("camera.samples", 64),
+        ("look", "0:0-4"),
+        ("pointing_px", 1),
+    ],
+)
+def test_a_setting_of_a_camera_is_refused(scene_files: Path, name: str, value: object) -> None:
+    """Beside a raster one message names it, and says how to have the simulated rig look at the file."""
+    flag = "--" + name.rpartition(".")[2].replace("_", "-")
+    with pytest.raises(SettingsError, match=rf"{flag} is of a camera, .* leave it out, or give --source sim"):
+        load_settings(None, {"scene": str(scene_files / "scene.png"), name: value})
+
+
+def test_what_a_file_says_of_a_camera_by_default_asks_for_nothing(tmp_path: Path) -> None:
+    """Settings written out with their defaults, as in the example, are those of a raster too."""
+    text = (Path(__file__).parents[3] / "survey.example.toml").read_text(encoding="utf-8")
+    (tmp_path / "mine.toml").write_text(text.replace('scene = "farm"', 'scene = "field.tif"'), encoding="utf-8")
+    assert load_settings(tmp_path / "mine.toml").source == "raster"
+
+
+@pytest.mark.parametrize(("scene", "source"), [("farm", "sim"), ("field.png", "raster")])
+def test_where_pixels_come_from_follows_from_the_scene(scene: str, source: str) -> None:
+    """The settings hold what auto stands for."""
+    assert load_settings(None, {"scene": scene}).source == source
+
+
+def test_a_raster_larger_than_its_memory(surveyed: Raster, tmp_path: Path) -> None:
+    """Its rows are read in blocks; where not one fits, one message says what to give."""
+    values = np.zeros((64, 4096, 3), np.uint8)
+    write_tif(tmp_path / "wide.tif", values + np.arange(64, dtype=np.uint8)[:, None, None])
+    with pytest.raises(SettingsError, match=r"exceeds --memory 512 MiB: 32 rows of a raster of 4096 px"):
+        surveyed(tmp_path / "wide.tif", wavelengths="640,550,460", memory="512MiB")
+
+
+def tiles_in(folder: Path, values: NDArray[Any], cut: int = 30, **about: Any) -> Path:
+    """Cut a raster into a left and a right tile, which overlap by 4 px."""
+    folder.mkdir()
+    write_tif(folder / "a.tif", values[:, :cut], **about)
+    write_tif(folder / "b.tif", values[:, cut - 4 :], CORNER * Affine.translation(cut - 4, 0), **about)
+    return folder
+
+
+@pytest.mark.parametrize("pattern", ["tiles", "tiles/*.tif"])
+def test_tiles_side_by_side_are_one_field(surveyed: Raster, tmp_path: Path, pattern: str) -> None:
+    """A folder or a glob of tiles gives the map of the whole raster, on its grid."""
+    values = patchy_scene((40, 64), 3, seed=6)[0]
+    tiles_in(tmp_path / "tiles", values)
+    published = surveyed(tmp_path / pattern, wavelengths="640,550,460")
+    np.testing.assert_allclose(whole(published, tmp_path / "archive")[0], values, rtol=ROUNDING)
+    assert published.receipt["survey"] == "tiles"
+    notes = " ".join(published.receipt["settings"]["notes"])
+    assert "2 tiles of one grid are one field: a.tif, b.tif" in notes
+    assert "of 160 pixels that several tiles show, the first by name wins" in notes
+    store = xarray.open_zarr(tmp_path / "archive" / published.receipt["products"]["class_map"], consolidated=False)
+    assert (float(store["x"][0]), float(store["y"][0])) == (500_000.25, 5_399_999.75)
+
+
+def test_a_tiles_gap_shows_the_tile_below_and_what_no_tile_shows_is_missing(surveyed: Raster, tmp_path: Path) -> None:
+    """The first tile wins where it has a value; between tiles there is no class."""
+    values = patchy_scene((40, 64), 3, seed=6)[0]
+    first = values[:, :30].copy()
+    first[:, 26:] = -1  # no data where the second shows the ground
+    (tmp_path / "tiles").mkdir()
+    write_tif(tmp_path / "tiles" / "a.tif", first[:20], nodata=-1)
+    write_tif(tmp_path / "tiles" / "b.tif", values[:, 26:], CORNER * Affine.translation(26, 0))
+    image = whole(surveyed(tmp_path / "tiles", wavelengths="640,550,460"), tmp_path / "archive")[0]
+    expected = values.copy()
+    expected[20:, :26] = np.nan
+    np.testing.assert_allclose(image, expected, rtol=ROUNDING)
+
+
+def _other_crs(folder: Path, values: NDArray[Any]) -> None:
+    with rasterio.open(
+        folder / "b.tif",
+        "w",
+        driver="GTiff",
+        height=8,
+        width=8,
+        count=3,
+        dtype="float32",
+        transform=CORNER,
+        crs="EPSG:32633",
+    ) as file:
+        file.write(np.moveaxis(values[:8, :8], -1, 0))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "match"),
+    [
+        (_other_crs, r"lie in EPSG:32632 and EPSG:32633: tiles of one field have one CRS"),
+        (lambda at, v: write_tif(at / "b.tif", v, CORNER * Affine.scale(2)), r"have pixels of 0.5 x 0.5 and 1 x 1"),
+        (lambda at, v: write_tif(at / "b.tif", v, CORNER * Affine.translation(8.4, 0)), r"lie 0.40 and 0.00 px"),
+        (lambda at, v: write_tif(at / "b.tif", v, None), r"has no place on the earth: survey them one by one"),
+    ],
+)
+def test_tiles_that_are_no_field_are_refused(
+    surveyed: Raster, tmp_path: Path, spoil: Callable[[Path, NDArray[Any]], object], match: str
+) -> None:
+    """Another CRS, pixel, grid or band, or no place: one message names the tiles and what to do."""
+    values = patchy_scene((16, 16), 3, seed=1)[0]
+    (tmp_path / "tiles").mkdir()
+    write_tif(tmp_path / "tiles" / "a.tif", values)
+    spoil(tmp_path / "tiles", values)
+    with pytest.raises(PipelineError, match=match):
+        surveyed(tmp_path / "tiles", wavelengths="640,550,460")
+
+
+def test_tiles_of_other_bands_are_refused(tmp_path: Path) -> None:
+    """A colour picture and a grey one are no field; the message names both."""
+    values = patchy_scene((16, 16), 3, seed=1)[0].astype(np.uint8)
+    write_tif(tmp_path / "a.tif", values, photometric="RGB")
+    write_tif(tmp_path / "b.tif", values[..., :1])
+    with pytest.raises(SceneError, match=r"a.tif and .*b.tif have other bands, 3 from 640.0 nm on and 1 from 550.0 nm"):
+        open_raster(tmp_path)
+
+
+def test_a_glob_without_a_file_is_refused(surveyed: Raster, tmp_path: Path) -> None:
+    """One message says so."""
+    with pytest.raises(SceneError, match=r"names no image; check the pattern"):
+        surveyed(tmp_path / "no" / "*.tif")
+
+
+def test_prefect_runs_the_stages_of_a_raster(
+    scene_files: Path, weights: Path, tmp_path: Path, prefect_home: Path
+) -> None:
+    """The same receipt comes of the Prefect engine."""
+    given = {"scene": str(scene_files / "scene.png"), "weights": str(weights), "out": str(tmp_path / "archive")}
+    published = run_survey(load_settings(None, given), QUIET)
+    assert [row["state"] for row in published.receipt["stages"]] == ["ran"] * 4
+
+
+def test_an_image_and_its_wavelengths(surveyed: Raster, tmp_path: Path) -> None:
+    """A picture of 8 bits comes back bit by bit: its numbers need no rounding."""
+    values = patchy_scene((24, 24), 3, seed=9)[0].astype(np.uint8)
+    Image.fromarray(values).save(tmp_path / "picture.png")
+    image = whole(surveyed(tmp_path / "picture.png"), tmp_path / "archive")[0]
+    np.testing.assert_array_equal(image, values)
+    assert len(RGB_NM) == image.shape[2]
