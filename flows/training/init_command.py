@@ -19,6 +19,7 @@ from flows.cli.app import AsJson, Switch, stderr
 from flows.terminal.processes import DONE, writing
 from flows.terminal.progress import StageProgress, put_out
 from flows.training.survey_draft import set_aside, show_survey_draft, write_survey_draft
+from flows.training.sweep_draft import draft_sweeps
 from pipeline.readings import MOST_VALUE
 from storage.archive.whole_files import write_whole
 from storage.readers.label_files import is_store, listed_names
@@ -26,7 +27,6 @@ from storage.readers.polygon_labels import is_polygon_file
 from storage.readers.raster_files import split_variable
 from storage.readers.scene_drafts import FoundClass, SceneDraft, draft_scene
 from storage.readers.scene_toml import SETTINGS_NAME
-from storage.readers.sweep_drafts import draft_sweeps
 
 TITLES = {"look": "looking at labels"}
 NO_READING = -999.0  # at and below it an edge is filled, not seen

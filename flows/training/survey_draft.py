@@ -13,9 +13,9 @@ from rich.console import Console
 from rich.markup import escape
 
 from flows.terminal.processes import writing
+from flows.training.sweep_draft import SweepsDraft
 from pipeline.errors import SettingsError
 from storage.archive.whole_files import write_whole
-from storage.readers.sweep_drafts import SweepsDraft
 
 SURVEY_NAME = "survey.toml"
 
