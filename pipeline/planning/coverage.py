@@ -54,7 +54,7 @@ def coarse_sweeps(
     if grid.factor > most:
         raise SettingsError(
             f"the coarse factor must be at most {most} for {camera.bits}-bit lines of {camera.samples} samples "
-            f"(samples are summed in 16 bits), got {grid.factor}"
+            f"(samples are summed in 16 bits), got {grid.factor}; take one uniform scan, or weights of a smaller factor"
         )
     covering = _cover(grid, camera, along, step=grid.factor, overlap_px=overlap_px)
     return [replace(sweep, exposure_ms=exposure_ms) for sweep in covering]

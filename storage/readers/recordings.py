@@ -10,7 +10,8 @@
 
 Beside a cube ``NAME`` of files are found, where no flag names them: ``NAME.pointing.csv`` (.parquet, .toml),
 ``NAME.dark.hdr``, ``NAME.white.hdr``, ``NAME.bad.hdr``, ``NAME.flat.hdr``, or ``dark*.hdr`` and ``white*.hdr`` for all
-cubes of the folder. The header of a white frame may say ``panel = {...}``, the value of the white reference per band,
+cubes of the folder. The header of an ENVI cube may say ``line axis = y``: lines lie along y of the field, and the scan
+goes along x. The header of a white frame may say ``panel = {...}``, the value of the white reference per band,
 and ``mirror at rest = 1`` where it was taken so.
 """
 
@@ -29,7 +30,7 @@ from pipeline.capture.straight_scans import covered_field, fit_sweep, flat_camer
 from pipeline.errors import ArchiveError, IncompleteStoreError, SceneError, SettingsError, WavelengthError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import STRAIGHT, Mounting
-from pipeline.geometry.scan import Sweep
+from pipeline.geometry.scan import Axis, Sweep
 from pipeline.rectify.detector import find_bad_elements
 from pipeline.rig.camera.camera_texts import listed_numbers
 from pipeline.source import References
@@ -491,7 +492,8 @@ def _sweeps_of(
         own = np.arange(source.shape[0])
         if pointing.part is not None:
             own = np.flatnonzero(np.array(pointing.part) == name)
-        scan = fit_sweep(pointing.position[own], camera, name=name, samples=source.shape[1], valid=valid[own])
+        position, samples = pointing.position[own], source.shape[1]
+        scan = fit_sweep(position, camera, name=name, samples=samples, along=_line_axis(cube), valid=valid[own])
         exposed = float(np.median(exposure_ms[own]))
         sweep: Sweep = replace(scan.sweep, exposure_ms=None if exposed == camera.exposure_ms else exposed)
         if abs(scan.distance_px - sweep.step) > 1e-3 * sweep.step:
@@ -508,6 +510,16 @@ def _sweeps_of(
             )
         )
     return sweeps
+
+
+def _line_axis(cube: RecordedFile) -> Axis:
+    """The axis of the field that lines lie along: as an ENVI header says, else x."""
+    if reader_of(cube.path) != "envi":
+        return "x"
+    said = load_envi_header(find_envi_pair(cube.path)[0]).fields.get("line axis", "x").strip()
+    if said not in ("x", "y"):
+        raise SceneError(f"{cube.path} says line axis = {said!r}, expected x or y; correct the header")
+    return "y" if said == "y" else "x"
 
 
 def _line_reader(source: CubeSource, own: NDArray[np.intp]) -> Callable[[NDArray[np.intp]], NDArray[np.uint16]]:

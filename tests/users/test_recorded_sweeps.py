@@ -41,6 +41,7 @@ NARROW = {"camera.samples": 80}  # two strips for the field
 PASSES: dict[str, dict[str, Any]] = {
     "two passes": {"budget": 0.8, "policy": "entropy"},
     "every line": {"scan_step": 1},
+    "lines down the field": {"scan_step": 1, "camera.samples": 96},
     "every second line, shorter": {"scan_step": 2, "scan_exposure_ms": 25},
 }
 
@@ -93,6 +94,8 @@ def test_sweeps_of_the_rig_give_its_map(
     expected = digest_of_map(tmp_path / "rig", published.receipt)
     assert len(np.unique(load_class_map(tmp_path / "rig" / published.receipt["products"]["class_map"]).classes)) > 1
     folder = write_sweeps(tmp_path / "rig", published, tmp_path / "sweeps")
+    along = {open_raw_cube(path).sweep.along for path in (tmp_path / "rig").glob("stages/capture/*/*.zarr")}
+    assert along == ({"y"} if "camera.samples" in asked else {"x"})
     plan = asked if "budget" in asked else {}
     size = f"{SIZE[0]}x{SIZE[1]}"
     of_files = survey_sweeps(tmp_path / "files", folder, weights=str(weights), size=size, **plan)

@@ -209,7 +209,7 @@ def compare_turned(run: SurveyRun, mosaic: StageRef, attention: StageRef) -> Wan
         rows = find_rows(mosaic_brightness(mosaic.path / "mosaic.zarr"))
         turned = compare_orientations(
             run.grid,
-            run.camera,
+            replace(run.camera, bits=8),  # seconds and seats alone, and no sample is summed
             settings.cost,
             run.plan.along,
             scores,
