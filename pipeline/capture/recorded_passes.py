@@ -12,9 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.capture.recorded import RecordedSource, RecordedSweep
-from pipeline.errors import NotRecordedError, SceneError
+from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Axis, Sweep
+
+MOST_CUT_LINES, MOST_CUT_PX = 3, 2.0  # by which a plan may reach beyond a recording: lines that a kernel reads, turns
 
 
 @dataclass(frozen=True)
@@ -43,11 +45,14 @@ class RecordedPasses:
         return sweeps
 
     def served(self, sweeps: Sequence[Sweep]) -> list[Sweep] | None:
-        """Give planned sweeps without ends that were never taken; None where a line between is missing."""
+        """Give planned sweeps without the ends beyond the field that were never taken; None where more is missing."""
         found = []
         for sweep in sweeps:
             cut = self.source.cut_to_recorded(sweep)
             if cut is None or not self.source.serves(cut):
+                return None
+            before = round((cut.start_px - sweep.start_px) / sweep.step)
+            if max(before, sweep.lines - before - cut.lines) > MOST_CUT_LINES + MOST_CUT_PX / sweep.step:
                 return None
             found.append(replace(cut, exposure_ms=self._exposure_ms(cut)))
         return found
@@ -62,13 +67,10 @@ class RecordedPasses:
 
         Raises NotRecordedError: neither the planned strips nor the recorded ones have the lines.
         """
-        found = self.served(planned) or self.served(self._on_recorded_strips(planned))
+        found = self.served(planned) or self.served(self._on_recorded_strips(planned)) or []
         if not found:
-            for sweep in planned:  # names the first line that is missing
-                self.source.pick(self.source.cut_to_recorded(sweep) or sweep)
-            raise NotRecordedError(
-                f"the recording has no strip for sweep {planned[0].name}; plan sweeps on the recording's own strips"
-            )
+            for sweep in planned:
+                self.source.pick(sweep)  # names the first line that is missing
         return found
 
     def strips(self, start_px: float) -> list[Sweep]:

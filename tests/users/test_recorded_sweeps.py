@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 from rich.console import Console
 
 import storage.readers.recordings
@@ -20,11 +21,15 @@ from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
 from flows.publish.run_folder import Published, load_receipt
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
+from pipeline.errors import SceneError, SettingsError
+from pipeline.geometry.scan import Sweep
+from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import RasterScene, raster_from_values
+from pipeline.simulator.simulated import SimulatedSource
 from storage.archive.archive import Archive
 from storage.archive.keys import array_digest
 from storage.arrays.class_maps import load_class_map
-from storage.arrays.cubes import open_raw_cube
+from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
 from storage.arrays.mosaics import load_mosaic
 from storage.export.recorded_files import write_recorded_files
 from storage.remote.opening import verify_archive
@@ -450,3 +455,55 @@ def test_a_recording_whose_files_moved_is_reprocessed(
     again = load_receipt(Archive.open(archive).runs()[-1])
     fresh = survey_sweeps(tmp_path / "b", tmp_path / "elsewhere" / "scan.hdr", weights=str(other))
     assert digest_of_map(archive, again) == digest_of_map(tmp_path / "b", fresh.receipt)
+
+
+def test_labels_judge_the_map_of_a_recording(
+    tmp_path: Path, pushbroom: tuple[Path, NDArray[np.uint16]], weights: Path
+) -> None:
+    """Labels on the field's pixels give accuracy; those of another size are refused."""
+    folder, _ = pushbroom
+    Image.fromarray(patchy_scene((96, 64), 3, 3)[1]).save(tmp_path / "labels.png")
+    labels = str(tmp_path / "labels.png")
+    published = survey_sweeps(tmp_path / "a", folder / "scan.hdr", weights=str(weights), labels=labels)
+    assert 0 < published.receipt["accuracy"]["overall_accuracy"] < 1
+    Image.fromarray(patchy_scene((90, 64), 3, 3)[1]).save(tmp_path / "labels.png")
+    with pytest.raises(SceneError, match="are 90 x 64 px, the scene is 96 x 64 px"):
+        survey_sweeps(tmp_path / "b", folder / "scan.hdr", weights=str(weights), labels=labels)
+
+
+def test_strips_of_ones_own_are_surveyed_in_two_passes(tmp_path: Path, weights: Path) -> None:
+    """A recording whose strips lie where no plan would put them: both passes go along these strips."""
+    own = [Sweep(f"mine-{at}", "fine", "x", at, -52.5, 106) for at in (-35.0, 4.0, 38.0)]
+    camera = load_settings(None, dict(NARROW)).camera
+    source = SimulatedSource(field(), Rig(camera), seed=3)
+    for sweep in own:
+        header = SweepHeader(sweep, source.references(sweep), source.wavelength_nm, None, "sim")
+        with RawCubeWriter(tmp_path / "raw" / f"{sweep.name}.zarr", header) as cube:
+            cube.write(source.lines(sweep))
+    for path in sorted((tmp_path / "raw").glob("*.zarr")):
+        write_recorded_files(open_raw_cube(path), tmp_path / "files")
+    asked = {"weights": str(weights), "size": "120x96", "budget": 0.7, "policy": "entropy"}
+    published = survey_sweeps(tmp_path / "a", tmp_path / "files", **asked)
+    raw = {
+        path.stem: open_raw_cube(path).sweep
+        for product in ("raw_coarse", "raw_fine")
+        for path in (tmp_path / "a" / published.receipt["products"][product]).glob("*.zarr")
+    }
+    assert {round(sweep.strip_px) for sweep in raw.values() if sweep.step == 4} == {-35, 4, 38}
+    assert {round(sweep.strip_px) for sweep in raw.values()} == {-35, 4, 38}
+    assert published.receipt["recording"]["lines_read"] < 318
+    assert np.isfinite(load_mosaic(tmp_path / "a" / published.receipt["products"]["mosaic"]).values).mean() > 0.99
+
+
+def test_numbers_of_sixteen_bits_are_surveyed_and_found_again(tmp_path: Path, weights: Path) -> None:
+    """The camera of the receipt has the bits and the period of the recording, and can be asked for again."""
+    values = (patchy_scene((96, 64), 3, 3)[0] * 200 + 60).astype(np.uint16)
+    folder = write_pushbroom(tmp_path / "drone", values)
+    table(folder, "time,position_px", [f"{3.5 * line},{line}" for line in range(96)])
+    published = survey_sweeps(tmp_path / "a", folder / "scan.hdr", weights=str(weights))
+    camera = published.receipt["settings"]["camera"]
+    assert (camera["bits"], camera["exposure_ms"] + camera["readout_ms"]) == (16, 3500)
+    assert run_reprocess(ReprocessRequest(tmp_path / "a"), QUIET) == 0
+    assert len(Archive.open(tmp_path / "a").runs()) == 1
+    with pytest.raises(SettingsError, match=r"at most 1 for 16-bit lines .*take one uniform scan"):
+        survey_sweeps(tmp_path / "b", folder / "scan.hdr", weights=str(weights), budget=0.6)
