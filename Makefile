@@ -64,7 +64,8 @@ faults: $(BIN)/.ok
 
 SOAK ?=
 
-# Under half an hour: a day of 72 surveys with kills, cables and full disks, and Prefect's scheduler (SOAK="day --quick").
+# Under an hour: a day of 72 surveys with kills, cables and full disks, and a week on Prefect's schedules
+# (SOAK="day --quick").
 soak: $(BIN)/.ok
 	OMP_NUM_THREADS=1 $(BIN)/python tests/soak $(SOAK)
 

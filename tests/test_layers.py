@@ -150,7 +150,7 @@ def test_every_file_has_a_user() -> None:
     known = {module_name(path) for path in source() if path.name != "__init__.py"}
     used = set[str]().union(*(imported_files(path, tree, known) for path, tree in source().items()))
     named = {node.value for tree in source().values() for node in nodes(tree) if isinstance(node, ast.Constant)}
-    assert known - used - named == {"flows.cli.main", "flows.schedule.prefect_flows"}  # of the script, of deployments
+    assert known - used - named == {"flows.cli.main"}  # of the script
 
 
 def test_files_say_at_their_heads_what_they_need() -> None:

@@ -32,7 +32,7 @@ VERBS = {  # by what is typed: the module of the function, loaded once it is ask
     "ingest": "flows.archive.ingest_command",
     "reprocess": "flows.archive.reprocess_command",
     "serve": "flows.schedule.serve_command",
-    "report": "flows.schedule.history",
+    "report": "flows.archive.history",
     "init": "flows.training.init_command",
     "train": "flows.cli.model_verbs",
     "evaluate": "flows.cli.model_verbs",

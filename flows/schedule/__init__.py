@@ -1,1 +1,1 @@
-"""Surveys on a schedule: due times and their ledger, one survey a rig, Prefect's server and its watcher, histories."""
+"""Fields on a schedule: deployments of the survey, served by Prefect."""

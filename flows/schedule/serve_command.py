@@ -1,39 +1,67 @@
-"""What `spectralzoom serve` does: check everything, then survey fields on a schedule until it is stopped."""
+"""Serve fields by Prefect: check every field, then have its schedules, limits and runner survey them until stopped."""
 
 from __future__ import annotations
 
-import math
+import asyncio
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from dataclasses import replace
-from datetime import datetime, timedelta
+import re
+import signal
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, cast
+from zoneinfo import ZoneInfo
 
-from rich.console import Console
+import tzlocal
 from rich.markup import escape
 
-from flows.cli.app import stderr
-from flows.schedule.due_runs import Outcome, ScheduleNews, Survey, Tell, notice_address, run_all, send_notice, together
-from flows.schedule.field_schedule import FieldSchedule
-from flows.schedule.rig_lock import RigLock, hold_place
-from flows.schedule.served import ServedField, ServeRequest, load_field
-from flows.schedule.server import serve_prefect
-from flows.schedule.times import SystemWallClock, Timetable, WallClock, parse_timetable
+from flows.cli.app import removed, stderr
+from flows.settings.load import load_settings
+from flows.settings.survey_settings import Settings
+from flows.tasks.local_server import ServerUnavailable, check_answers, local_server, quiet_environment
+from flows.tasks.open_survey import RIG_LIMIT
 from flows.tasks.run import open_run
 from flows.terminal.processes import DONE, terminable
-from pipeline.errors import ArchiveError, PipelineError, RigError, SettingsError
+from pipeline.errors import ArchiveError, PipelineError, SettingsError
 from pipeline.lazy import deferred
-from storage.archive.staging import take_lock
+from storage.archive.staging import read_toml, take_lock
 from storage.remote.object_stores import is_remote
+from storage.remote.opening import open_archive
 
 if TYPE_CHECKING:
-    import flows.publish.survey_command as survey_command
-else:
-    survey_command = deferred("flows.publish.survey_command")
+    import prefect.client.orchestration as prefect_client
+    import prefect.client.schemas.filters as prefect_filters
+    import prefect.client.schemas.objects as prefect_objects
+    import prefect.client.schemas.schedules as prefect_schedules
+    import prefect.runner as prefect_runner
+    import prefect.states as prefect_states
+    import prefect.types.entrypoint as prefect_entrypoint
 
-LOOK_AGAIN = timedelta(seconds=30)  # a clock that jumps, or a run that died, is seen after this at the latest
+    import flows.archive.reprocess_flow as reprocess_flow
+    import flows.survey as survey_flow
+else:
+    prefect_client = deferred("prefect.client.orchestration")
+    prefect_filters = deferred("prefect.client.schemas.filters")
+    prefect_objects = deferred("prefect.client.schemas.objects")
+    prefect_schedules = deferred("prefect.client.schemas.schedules")
+    prefect_runner = deferred("prefect.runner")
+    prefect_states = deferred("prefect.states")
+    prefect_entrypoint = deferred("prefect.types.entrypoint")
+    reprocess_flow = deferred("flows.archive.reprocess_flow")
+    survey_flow = deferred("flows.survey")
+
+removed.update(
+    late="Prefect begins a run late rather than never, and cancels one that is due while the field's last still runs",
+    notify="Prefect tells of failed runs by an automation: prefect automation create --from-file automation.yaml",
+)
+EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+UNITS_S = {"s": 1, "m": 60, "h": 3600, "d": 86400}
+LEAST, MOST = timedelta(minutes=1), timedelta(days=366)
+AGAIN_S = 2.0  # between two tries to reach a server that has gone
 
 
 def serve(
@@ -42,18 +70,15 @@ def serve(
     every: str | None = None,
     timezone: str | None = None,
     out: str | None = None,
-    limit: int = 1,
-    late: float = 0.5,
-    engine: Literal["prefect", "plain"] = "prefect",
+    limit: int | None = None,
     port: int = 4200,
-    notify: str | None = None,
 ) -> int:
-    """Survey fields on a schedule, one after another, until stopped; every due run is done, skipped by rule, or failed.
+    """Survey fields on a schedule until stopped, by Prefect: a run of a field is a visit named by its due time.
 
     Parameters
     ----------
     fields
-        A settings file for each field, in turn.
+        A settings file for each field.
     cron
         When all of them are due: minute hour day month weekday, such as '0 6-20 * * *'.
     every
@@ -63,138 +88,222 @@ def serve(
     out
         Archive for all fields, a folder or s3://bucket/prefix; by default that of each field's settings.
     limit
-        Surveys at a time, by Prefect; of one rig it is always one.
-    late
-        Share of the time to the next due one after which a run may not begin any more: it is skipped.
-    engine
-        `prefect`, with pages to look at, or `plain`, in this process alone.
+        Surveys at a time; by default one of each field. Of one rig it is always one.
     port
         Of Prefect's pages on this machine; a server that PREFECT_API_URL names is used instead.
-    notify
-        Address that is told of failed and skipped runs, a POST of JSON, or a file that holds it: what stands on the
-        command line is in the process list. SPECTRALZOOM_NOTIFY in the environment does as well. By default nobody.
     """
-    timetable = parse_timetable(cron, every, timezone)
-    if not (math.isfinite(late) and 0 < late <= 1):
-        raise SettingsError(f"--late {late}: expected a share of the interval, above 0 and at most 1")
-    if limit < 1:
-        raise SettingsError(f"--limit {limit}: expected 1 or more surveys at a time")
-    address = notice_address(notify)
-    archive = out if out is None or is_remote(out) else str(Path(out).absolute())
-    served = load_fields(fields, archive)
-    request = ServeRequest(
-        fields=served, timetable=timetable, late=late, limit=limit, port=port, out=archive, notify=address
-    )
-    with alone_on(served), _stopped_cleanly(_tell):
-        if engine == "prefect":
-            serve_prefect(request, _tell)
-        else:
-            _tell(request.headline)
-            by_name = {one.name: replace(one, settings=replace(one.settings, engine="plain")) for one in served}
-            serve_plain(
-                request.schedules(),
-                {one.name: one.lock() for one in served},
-                lambda name, due: survey_field(by_name[name], due, timetable, stderr),
-                _tell,
-                note=lambda outcome: send_notice(address, outcome, by_name[outcome.field].settings.out),
-            )
+    if limit is not None and limit < 1:
+        raise SettingsError(
+            f"--limit {limit}: expected 1 or more surveys at a time; leave it out for one of each field"
+        )
+    schedule = schedule_of(cron, every, timezone)
+    served = load_fields(fields, out)
+    archives = {one.settings.out: open_archive(one.settings.out).root for one in served}
+    home = next(iter(archives.values())) / ".prefect"
+    with ExitStack() as held:
+        held.enter_context(_stopped_with_a_sentence())
+        for name, root in archives.items():
+            held.enter_context(_alone_on(name, root))
+        pages = held.enter_context(_server(home, port))
+        held.enter_context(_own_temporary_folder())
+        wanted = cron or f"every {every}"
+        _say(f"serving {', '.join(one.name for one in served)}, {wanted}; stop with Ctrl-C, the same command goes on")
+        _say(f"Prefect's pages: {pages}")
+        _serve(served, schedule, limit or len(served) + 1)
     return DONE
 
 
-def survey_field(one: ServedField, due: datetime, timetable: Timetable, console: Console) -> Path:
-    """Survey a field for a due time; gives the folder of the published run."""
-    return survey_command.run_survey(one.settings_of(due, timetable), console).folder
+@dataclass(frozen=True)
+class ServedField:
+    """A field: its name, its settings file and what the file says."""
 
+    name: str
+    file: Path
+    settings: Settings
 
-def _tell(words: str) -> None:
-    stderr.print(escape(words), soft_wrap=True)
+    def deployment(self, schedule: Any) -> Any:
+        """Return the field's deployment of the flow `survey`; a run that is due while one runs is cancelled."""
+        return survey_flow.survey.to_deployment(
+            self.name,
+            schedule=schedule,
+            paused=False,
+            parameters={
+                "settings": {"settings_file": str(self.file), "name": self.name, "out": str(self.settings.out)}
+            },
+            concurrency_limit=prefect_objects.ConcurrencyLimitConfig(
+                limit=1, collision_strategy=prefect_objects.ConcurrencyLimitStrategy.CANCEL_NEW
+            ),
+            tags=[self.settings.source, self.name],
+            description=f"Surveys of {self.name} by {self.file}.",
+            version="1",
+            entrypoint_type=prefect_entrypoint.EntrypointType.MODULE_PATH,
+        )
 
 
 def load_fields(files: Sequence[Path], out: str | None = None) -> list[ServedField]:
-    """Settings of every field, in turn, each seen to be surveyable; nothing is captured (PipelineError names it)."""
+    """Return the fields, each planned to see that it can be surveyed; no device is asked, nothing is captured.
+
+    Raises PipelineError: the first that cannot be used, with its file.
+    """
     if not files:
         raise SettingsError("no fields: give the settings file of one or more, such as serve north.toml --every 30m")
-    fields = [load_field(file, out) for file in files]
-    for number, one in enumerate(fields):
-        same = [other for other in fields[:number] if other.name == one.name]
-        if same:
+    fields: dict[str, ServedField] = {}
+    for file in files:
+        settings = load_settings(file, {"out": out})
+        if not is_remote(settings.out):
+            settings = replace(settings, out=str(Path(settings.out).absolute()))
+        if "scene" not in read_toml(file) and settings.source != "rig":
             raise SettingsError(
-                f'{same[0].file} and {one.file} are both called {one.name}: give one of them another name = "..."'
+                f"{file} says neither scene nor source = 'rig': nothing to look at; give the field's scene, or its rig"
+            )
+        name = settings.name or re.sub(r"[^A-Za-z0-9_.-]+", "-", file.stem).strip("-.") or "field"
+        if name in fields:
+            raise SettingsError(
+                f'{fields[name].file} and {file} are both called {name}: give one of them another name = "..."'
             )
         try:
-            open_run(replace(one.settings, name=one.name), planning=True)  # no device is asked before its first survey
+            open_run(replace(settings, name=name), planning=True)
         except PipelineError as error:
-            raise type(error)(f"{one.file}: {error}") from error
-    return fields
+            raise type(error)(f"{file}: {error}") from error
+        fields[name] = ServedField(name, file.absolute(), settings)
+    return list(fields.values())
+
+
+def schedule_of(cron: str | None, every: str | None, timezone: str | None = None) -> Any:
+    """Return Prefect's schedule for a cron line in a time zone (or this machine's) or an interval (SettingsError)."""
+    if (cron is None) == (every is None):
+        got = "neither" if cron is None else "both"
+        raise SettingsError(f"a schedule needs --cron or --every, got {got}; such as --every 30m or --cron '0 6 * * *'")
+    try:
+        zone = str(ZoneInfo(timezone or tzlocal.get_localzone_name()))
+    except (KeyError, ValueError, OSError):
+        raise SettingsError(f"--timezone {timezone!r} is no time zone; expected such as Europe/Berlin") from None
+    if every is not None:
+        found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([smhd])\s*", every)
+        span = timedelta(seconds=min(float(found[1]) * UNITS_S[found[2]], 1e9)) if found else timedelta()
+        if not LEAST <= span <= MOST:
+            raise SettingsError(f"--every {every!r}: expected a number and s, m, h or d, from 1m to 366d, such as 30m")
+        return prefect_schedules.IntervalSchedule(interval=span, anchor_date=EPOCH, timezone="UTC")
+    try:
+        if len(str(cron).split()) != 5:
+            raise ValueError
+        return prefect_schedules.CronSchedule(cron=str(cron), timezone=zone)
+    except ValueError:
+        raise SettingsError(
+            f"--cron {cron!r}: expected five fields, minute hour day month weekday, such as '0 6 * * *'"
+        ) from None
 
 
 @contextmanager
-def alone_on(fields: Sequence[ServedField]) -> Iterator[None]:
-    """Keep another serve off these fields' archives (ArchiveError) and rigs (RigError) while the block runs."""
-    roots: Mapping[Path, str] = {one.archive: str(one.settings.out) for one in fields}
-    rigs = {one.lock().of_servers(): one.settings.rig.port for one in fields if one.settings.source == "rig"}
-    with ExitStack() as held:
-        for root, name in roots.items():
-            release = take_lock(root / ".locks" / "serve.lock", wait=False)
-            if release is None:
-                raise ArchiveError(
-                    f"another serve works on the archive {name}: give all its fields to that one, or end it first"
-                )
-            held.callback(release)
-        for place, port in rigs.items():
-            release = hold_place(place, f"a serve (process {os.getpid()})")
-            if release is None:
-                raise RigError(
-                    f"another serve uses the rig at {port}: give all its fields to that one, or end it first"
-                )
-            held.callback(release)
-        yield
-
-
-@contextmanager
-def _stopped_cleanly(tell: Tell) -> Iterator[None]:
-    """Let Ctrl-C, and a service manager's SIGTERM, be the way to stop: the schedule is closed, and that is no error."""
+def _stopped_with_a_sentence() -> Iterator[None]:
+    """Take Ctrl-C, and a service manager's SIGTERM, as the way to stop: it is no error."""
     try:
         with terminable():
             yield
     except KeyboardInterrupt:
-        tell("stopped: nothing is due any more; the same command serves again, and resumes what was interrupted")
+        _say("stopped: nothing is due any more; the same command serves again")
 
 
-def serve_plain(
-    schedules: Mapping[str, FieldSchedule],
-    locks: Mapping[str, RigLock],
-    survey: Survey,
-    tell: Tell,
-    *,
-    clock: WallClock | None = None,
-    note: Callable[[Outcome], object] = lambda outcome: None,
-    until: datetime | None = None,
-) -> None:
-    """Serve until ``until`` or interrupted, then close. PipelineError: a ledger cannot be written at the start."""
-    watch, news = clock or SystemWallClock(), ScheduleNews(schedules, lambda name, error: tell(f"{name}: {error}"))
-    with ExitStack() as opened:
-        for name, schedule in schedules.items():
-            opened.callback(_close, name, schedule, tell)
-            schedule.open()
-        while until is None or watch.now() < until:
-            outcomes = run_all(schedules, lambda name: locks[name], survey, tell)
-            ran = {(outcome.field, outcome.due) for outcome in outcomes if outcome.ending}
-            fresh = news.fresh()
-            for outcome in fresh:  # also what was skipped, or found dead
-                if (outcome.field, outcome.due) not in ran:
-                    tell(outcome.words())
-            for outcome in together(fresh):
-                note(outcome)
-            if not any(outcome.ending for outcome in outcomes):  # else others may have become due meanwhile
-                now = watch.now()
-                due = [schedule.timetable.next_after(now) for schedule in schedules.values()]
-                watch.sleep(min([LOOK_AGAIN, *(one - now for one in due if one is not None)]).total_seconds())
-
-
-def _close(name: str, schedule: FieldSchedule, tell: Tell) -> None:
-    """Close a schedule; one that cannot be closed keeps the others from nothing."""
+@contextmanager
+def _alone_on(name: str, root: Path) -> Iterator[None]:
+    """Keep another serve off an archive (ArchiveError) while the block runs."""
+    release = take_lock(root / ".locks" / "serve.lock", wait=False)
+    if release is None:
+        raise ArchiveError(f"another serve works on the archive {name}: give all its fields to that one, or end it")
     try:
-        schedule.close()
-    except PipelineError as error:
-        tell(f"{name}: {error}")
+        yield
+    finally:
+        release()
+
+
+@contextmanager
+def _server(home: Path, port: int) -> Iterator[str]:
+    """Have a server on this machine, or use the one that PREFECT_API_URL names; gives where its pages are.
+
+    Raises SettingsError: the one that is named does not answer, or the port is taken.
+    """
+    try:
+        with quiet_environment(home), ExitStack() as held:
+            if "PREFECT_API_URL" in os.environ:
+                check_answers(os.environ["PREFECT_API_URL"])
+                yield os.environ["PREFECT_API_URL"].rstrip("/").removesuffix("/api")
+            else:
+                api = held.enter_context(local_server(home, port, schedules=True))
+                yield f"{api.removesuffix('/api')}; the password is in {home / 'password'}"
+    except ServerUnavailable as error:
+        raise SettingsError(f"{error}: start it, or unset PREFECT_API_URL and have one started here") from error
+
+
+@contextmanager
+def _own_temporary_folder() -> Iterator[None]:
+    """Have temporary files of this process in a folder that is this user's alone.
+
+    Prefect's runner keeps what it starts in /tmp/runner_storage. That folder belongs to the first user who ever ran
+    one: that one could exchange it, and no other can run one.
+    """
+    usual = tempfile.tempdir
+    with tempfile.TemporaryDirectory(prefix="spectralzoom-runner-", ignore_cleanup_errors=True) as own:
+        tempfile.tempdir = own
+        try:
+            yield
+        finally:
+            tempfile.tempdir = usual
+
+
+def _serve(fields: Sequence[ServedField], schedule: Any, limit: int) -> None:
+    """Serve the fields and the reprocessing of their archives until interrupted, also across a server that goes."""
+    surveys = [one.deployment(schedule) for one in fields]
+    outs = dict.fromkeys(str(one.settings.out) for one in fields)
+    again = [reprocess_flow.deployment(out, number) for number, out in enumerate(outs, 1)]
+    _prepare([one.name for one in fields])
+    while True:
+        try:
+            asyncio.run(_run([*surveys, *again], limit))
+        except Exception as error:  # Prefect's runner gives up after three tries
+            _say(f"Prefect's server does not answer ({type(error).__name__}); serving goes on when it does")
+            _wait_for_server()
+
+
+async def _run(deployments: Sequence[Any], limit: int) -> None:
+    """Have Prefect's runner begin what is due, until it is interrupted."""
+    runner = prefect_runner.Runner(pause_on_shutdown=True, limit=limit)
+    for one in deployments:
+        await runner.aadd_deployment(one)
+    running = asyncio.ensure_future(runner.start())
+    await asyncio.sleep(0)  # here it takes SIGTERM for itself, and would end without having paused the schedules
+    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+    await running
+
+
+def _prepare(fields: Sequence[str]) -> None:
+    """Have one rig in Prefect's limits, and end what an earlier serve left.
+
+    What was due while nothing was served is cancelled, since its time is over; what ran then has crashed.
+    """
+    filters, kind = cast(Any, prefect_filters), prefect_objects.StateType
+    named = filters.DeploymentFilter(name=filters.DeploymentFilterName(any_=list(fields)))
+    left = filters.FlowRunFilter(
+        state=filters.FlowRunFilterState(
+            type=filters.FlowRunFilterStateType(any_=[kind.SCHEDULED, kind.PENDING, kind.RUNNING])
+        ),
+        expected_start_time=filters.FlowRunFilterExpectedStartTime(before_=datetime.now(UTC)),
+    )
+    missed: Any = prefect_states.Cancelled(message="nothing served the schedule when it was due")
+    crashed: Any = prefect_states.Crashed(message="the process that ran it is gone")
+    with prefect_client.get_client(sync_client=True) as client:
+        client.upsert_global_concurrency_limit_by_name(RIG_LIMIT, 1)
+        for run in client.read_flow_runs(deployment_filter=named, flow_run_filter=left):
+            waited = run.state is not None and run.state.is_scheduled()
+            client.set_flow_run_state(run.id, missed if waited else crashed, force=True)
+
+
+def _wait_for_server() -> None:
+    while True:
+        with suppress(ServerUnavailable):
+            check_answers(os.environ["PREFECT_API_URL"])
+            return
+        time.sleep(AGAIN_S)
+
+
+def _say(words: str) -> None:
+    stderr.print(escape(words), soft_wrap=True)

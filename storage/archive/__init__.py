@@ -1,1 +1,1 @@
-"""The archive: keys, manifests, staging, runs, lineage and the ledger of due runs."""
+"""The archive: keys, manifests, staging, runs and lineage."""

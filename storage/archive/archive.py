@@ -5,7 +5,6 @@
     stages/<stage>/<key>/     what a stage made, with manifest.json
     runs/<run id>/            receipt.json, report.html, quicklook.png
     spool/<key>/              lines of a capture under way
-    schedule/<field>.jsonl    what became of every due run of a field
     .aside/<stage>/<key>/     what a repair under way puts back where it cannot be remade
     .locks/                   held while something is made
 

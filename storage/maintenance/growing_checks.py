@@ -1,4 +1,4 @@
-"""Reading again what grows in an archive: spools of captures under way, the rig's files beside them, and ledgers.
+"""Reading again what grows in an archive: spools of captures under way, and the rig's files beside them.
 
 Nothing is changed. What a crash leaves torn at the end of a file is no damage: whoever goes on cuts it off.
 """
@@ -11,7 +11,6 @@ from pathlib import Path
 
 from pipeline.json_lines import read_checked
 from pipeline.rig.capture import JOURNAL
-from storage.archive.ledger import FOLDER, SUFFIX
 from storage.archive.staging import NotPlainError, kind_of, plain_reader, read_plain
 from storage.arrays.fetched_files import SUMS, first_unlike
 from storage.arrays.spool import envi_header, line_words
@@ -23,15 +22,11 @@ _AGAIN = "asked for again when the capture goes on"
 
 
 def growing_problems(root: Path) -> Iterator[tuple[str, str]]:
-    """Give address and problem of each spool and ledger of an archive that is not as it was written."""
+    """Give address and problem of each spool of an archive that is not as it was written."""
     for folder in _inside(root / SPOOLS):
         if kind_of(folder) == "a folder":
             for problem in _spool_folder(folder):
                 yield f"{SPOOLS}/{folder.name}", problem
-    for path in _inside(root / FOLDER):
-        if path.name.endswith(SUFFIX):
-            for problem in _told(lambda path: _line_problems(path, "", "; the other lines are read"), path):
-                yield f"{FOLDER}/{path.name}", problem
 
 
 def _inside(folder: Path) -> list[Path]:
@@ -44,7 +39,7 @@ def _spool_folder(folder: Path) -> Iterator[str]:
             yield from _told(spool_problems, path)
         for file in _inside(path):
             if file.name == JOURNAL:
-                found = _told(lambda file: _line_problems(file, f"{file.name}: ", ", and counts for nothing"), file)
+                found = _told(_line_problems, file)
                 yield from (f"{path.name}/{one}" for one in found)
             elif file.name.endswith(SUMS) and (at := first_unlike(path / file.name.removesuffix(SUMS))) is not None:
                 name = f"{path.name}/{file.name.removesuffix(SUMS)}"
@@ -64,10 +59,10 @@ def _told(problems: Callable[[Path], Iterator[str]], path: Path) -> list[str]:
     return found
 
 
-def _line_problems(path: Path, before: str, after: str) -> Iterator[str]:
+def _line_problems(path: Path) -> Iterator[str]:
     for line in read_checked(read_plain(path)):
         if line.state == "changed":
-            yield f"{before}line {line.number} has changed since it was written{after}"
+            yield f"{path.name}: line {line.number} has changed since it was written, and counts for nothing"
 
 
 def spool_problems(path: Path) -> Iterator[str]:

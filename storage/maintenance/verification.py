@@ -20,7 +20,6 @@ from numcodecs.errors import UnknownCodecError  # type: ignore[import-untyped]
 from numcodecs.registry import codec_registry  # type: ignore[import-untyped]
 
 from storage.archive.keys import without_manifest
-from storage.archive.ledger import FOLDER
 from storage.archive.lineage import Catalogue
 from storage.archive.manifests import (
     broken_files,
@@ -170,7 +169,7 @@ class Finding:
     """What ``verify`` says of one store or run; ``problem`` is None where every byte is as published.
 
     ``missing``: something names or rests on a store that is not there. ``stray``: what is no part of the archive.
-    ``growing``: something of a spool or a ledger that cannot be believed; the rest of it is used.
+    ``growing``: something of a spool that cannot be believed; the rest of it is used.
     ``unreadable``: whole, but in a codec that is not installed.
     """
 
@@ -215,16 +214,15 @@ def verify_everything(
 
 
 def verify_growing(root: Path) -> Iterator[Finding]:
-    """Findings about spools, ledgers and what lies beside them; none where all is as it was written."""
+    """Findings about spools and what lies beside them; none where all is as it was written."""
     yield from (Finding(uri, problem, "growing") for uri, problem in growing_problems(root))
-    for name in (SPOOLS, FOLDER):
-        if kind_of(root / name) not in (None, "a folder"):
-            yield Finding(name, f"is {kind_of(root / name)}, expected a folder; take it out of the archive", "stray")
-        for place, folders, files in os.walk(root / name):
-            for path in (Path(place, one) for one in (*folders, *files)):
-                if (kind := kind_of(path)) not in (None, "a file", "a folder"):
-                    uri = path.relative_to(root).as_posix()
-                    yield Finding(uri, f"is {kind}, expected a file; take it out of the archive", "stray")
+    if kind_of(root / SPOOLS) not in (None, "a folder"):
+        yield Finding(SPOOLS, f"is {kind_of(root / SPOOLS)}, expected a folder; take it out of the archive", "stray")
+    for place, folders, files in os.walk(root / SPOOLS):
+        for path in (Path(place, one) for one in (*folders, *files)):
+            if (kind := kind_of(path)) not in (None, "a file", "a folder"):
+                uri = path.relative_to(root).as_posix()
+                yield Finding(uri, f"is {kind}, expected a file; take it out of the archive", "stray")
 
 
 def _changed_since(catalogue: Catalogue, uri: str) -> bool:

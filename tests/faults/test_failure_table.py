@@ -82,11 +82,6 @@ def test_bit_flips_in_a_spool(tmp_path: Path, name: str) -> None:
     assert found.told >= found.flips - 1  # the end of the last line is no part of it
 
 
-def test_bit_flips_in_a_ledger(tmp_path: Path) -> None:
-    """Told by verify; one line at most counts for nothing, and none says anything else."""
-    assert growing_files.flip_ledger(150, tmp_path, seed=2).wrong == []
-
-
 def test_spool_at_a_cameras_pace(tmp_path: Path) -> None:
     """Two seconds of the paper's line; how fast the machine is has no part in it, only that nothing is lost."""
     pace = lost_lines.keep_pace(tmp_path, 2.0)

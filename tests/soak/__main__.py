@@ -23,10 +23,9 @@ from tests.faults.fault_table import rows_of, run_table  # noqa: E402
 PARTS = {
     "survey-rig": rows_of("tests.soak.rig_beside_simulation"),
     "day": rows_of("tests.soak.day_of_surveys"),
-    "scheduler": rows_of("tests.soak.prefect_schedule"),
-    "loaded": rows_of("tests.soak.loaded_schedule"),
+    "schedule": rows_of("tests.soak.served_week"),
 }
-SOAK = ("day", "scheduler", "loaded")  # where no part is named
+SOAK = ("day", "schedule")  # where no part is named
 HEADINGS = ("what", "how", "times", "demanded", "found", "met", "s")
 
 

@@ -1,8 +1,7 @@
 """A day of 72 real surveys over three fields in turn, with kills, pulled cables and full disks.
 
-The surveys go through an emulated rig behind a pty and sockets, and into an archive on a small disk (a tmpfs). One
-process serves, by a clock turned by hand; where it is to be killed, another process serves the same ledgers for that
-round, and is killed for good.
+The surveys go through an emulated rig behind a pty and sockets, and into an archive on a small disk (a tmpfs). Each is
+a visit of its due time, in this process; where one is to be killed, another process begins it, and this one again.
 """
 
 from __future__ import annotations
@@ -19,28 +18,27 @@ import time
 from collections import Counter, defaultdict
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-from flows.schedule.field_schedule import moment_words
+from pipeline.errors import PipelineError
 from storage.archive.archive import Archive
 from tests.faults.disk_full import can_mount, small_disk
 from tests.faults.fault_table import Clock, Row
 from tests.faults.nursery import ROOT
-from tests.flows.schedule.schedule_days import NOON, HandClock
-from tests.soak.accounts import Account, Leftovers, Look, clear, problems_of
-from tests.soak.pulled_rig import LINK, RigProcess
+from tests.soak.leftovers import Leftovers, Look, clear, problems_of
+from tests.soak.pulled_rig import LINK, RigControl, RigProcess
 from tests.soak.resident_memory import Growth, resident_bytes
-from tests.soak.serving import FIELDS, Serving, scene_settings, write_fields
+from tests.soak.serving import FIELDS, scene_settings, survey_due, write_fields
 
+Due = tuple[str, datetime]  # field and due time
+NOON = datetime(2026, 6, 1, 12, tzinfo=UTC)
 HOURS, QUICK_HOURS = 24, 4
 TROUBLES = {"kill": 10, "mirror": 3, "camera": 2, "disk": 2}
 QUICK_TROUBLES = {"kill": 1, "mirror": 1, "camera": 1, "disk": 1}
 DISK_BYTES = 1 << 30
 LEFT_BYTES = (1_500_000, 2_600_000)  # of a full disk: lines of the coarse sweep, and of a fine one, go beyond
 SPEED = 4.0  # of the rig's clock, at 100 lines a second
-AGAIN_S = (5.0, 300.0, 900.0, 4000.0)  # after a kill, until somebody serves again
-LOOK_S = 300.0
 LONGEST_LIFE_S = 4.0  # of a survey that is killed
 DEVICES = {"mirror": f"/{LINK}", "camera": "127.0.0.1:"}  # as a reason names them
 CABLE = ("went away", "no connection to", "no answer", "hung up")
@@ -49,116 +47,85 @@ FULL = "disk is full"
 
 @dataclass
 class Day:
-    """What happens, by the number of the run that begins, and what became of it."""
+    """What happens, by the number of the survey that begins, and what became of it."""
 
-    serving: Serving
+    folder: Path
     disk: Path
+    rig: RigControl
     chance: random.Random
     plan: dict[int, str]
-    struck: dict[str, list[tuple[str, datetime]]] = field(default_factory=lambda: defaultdict(list))  # trouble -> runs
+    endings: dict[Due, str] = field(default_factory=dict)  # "" of a survey that is done, else why it failed
+    struck: dict[str, list[Due]] = field(default_factory=lambda: defaultdict(list))  # trouble -> surveys
     samples: list[int] = field(default_factory=list)  # resident memory of this process after each of its surveys
-    told: list[str] = field(default_factory=list)
     spools: dict[str, Look] = field(default_factory=dict)  # name -> the look that it appeared in
-    look: tuple[str, datetime] = ("", NOON)  # field and due time of the survey under way, or of the last
-    armed: str | None = None
 
     def __post_init__(self) -> None:
         self.planned = tuple(self.plan.values())
 
-    def tell(self, words: str) -> None:
-        """Keep a line, and show it."""
-        self.told.append(words)
-        print(f"  {self.serving.clock.now():%d %H:%M} {words}", file=sys.stderr, flush=True)
+    @property
+    def archive(self) -> Path:
+        """Folder of the archive."""
+        return self.disk / "archive"
 
-    def live(self, until: datetime) -> None:
-        """Serve until a moment."""
-        self.serving.before, self.serving.after = self.before, self.after
-        while self.serving.clock.now() < until:
-            self.free_disk()
-            self._put_off()
-            if self.serving.is_waiting() and (number := self._next_kill()) is not None:
-                self.kill(number)
-            else:
-                self.serving.run(self.tell)
-            self.serving.clock.sleep(LOOK_S)
-        self.free_disk()
+    def live(self, hours: int) -> None:
+        """Survey the fields in turn, every hour."""
+        dues = [(name, NOON + timedelta(hours=hour)) for hour in range(hours) for name in FIELDS]
+        for number, due in enumerate(dues, 1):
+            trouble = self.plan.pop(number, None)
+            self.rig.ask("look", due[0])
+            if trouble == "kill" and not self.kill(due):
+                self._later(number, trouble)
+            if trouble in DEVICES:
+                self.rig.ask("pull", trouble, self.chance.randint(1, 8))
+            if trouble == "disk":
+                self._fill(LEFT_BYTES[len(self.struck["disk"]) % len(LEFT_BYTES)])
+                self.struck["disk"].append(due)
+            self.endings[due] = self.survey(due)
+            if trouble in DEVICES:
+                if self.rig.ask("plug"):
+                    self.struck[trouble].append(due)
+                else:  # the survey had no line to take any more: another one will
+                    self._later(number, trouble)
+            (self.disk / "ballast").unlink(missing_ok=True)
+            print(f"  {due[0]} {due[1]:%H:%M} {self.endings[due] or 'done'}", file=sys.stderr, flush=True)
 
-    def before(self, name: str, due: datetime) -> None:
-        """As a survey begins: what is planned for its number."""
-        self.look, trouble = (name, due), self.plan.pop(self.serving.begun(), None)
-        if trouble in ("mirror", "camera"):
-            self.serving.rig.ask("pull", trouble, self.chance.randint(1, 8))
-        elif trouble == "disk":
-            self._fill(LEFT_BYTES[len(self.struck["disk"]) % len(LEFT_BYTES)])
-            self.struck["disk"].append(self.look)
-        elif trouble == "kill":  # for a process that may be killed
-            self._later("kill")
-        self.armed = trouble
+    def survey(self, due: Due) -> str:
+        """Survey in this process; gives why it failed, nothing where it did not."""
+        try:
+            survey_due(self.folder, *due)
+        except PipelineError as error:
+            return str(error) or type(error).__name__
+        finally:
+            self.samples.append(resident_bytes())
+            self._look_at_spools(*due)
+        return ""
 
-    def after(self) -> None:
-        """As a survey has ended: cables are put in again, and the process is looked at."""
-        self.samples.append(resident_bytes())
-        self._look_at_spools(*self.look)
-        if self.armed in ("mirror", "camera"):
-            if self.serving.rig.ask("plug"):
-                self.struck[self.armed].append(self.look)
-            else:  # the survey had no line to take any more: another one will
-                self._later(self.armed)
-        self.armed = None
-
-    def kill(self, number: int) -> None:
-        """Have this round served by another process, and kill it in the ``number``-th run of all."""
-        now = self.serving.clock.now().isoformat()
-        words = [sys.executable, "-m", "tests.soak.serving", str(self.serving.folder), now]
+    def kill(self, due: Due) -> bool:
+        """Kill a process within this survey; False where it had ended before."""
+        words = [sys.executable, "-m", "tests.soak.serving", str(self.folder), due[0], due[1].isoformat()]
+        known, begun = len(Archive.open(self.archive).runs()), set((self.archive / "spool").glob("*"))
         child = subprocess.Popen(words, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         try:
-            while child.poll() is None and self.serving.begun() < number:
+            while child.poll() is None and set((self.archive / "spool").glob("*")) <= begun:  # until it captures
                 time.sleep(0.01)
-            life_s = self.chance.uniform(0.0, LONGEST_LIFE_S)
             with suppress(subprocess.TimeoutExpired):
-                child.wait(life_s)
+                child.wait(self.chance.uniform(0.0, LONGEST_LIFE_S))
         finally:
             child.kill()
             code = child.wait()
-        broken = [(name, due) for name, one in self.serving.schedules.items() for due in one.state().open]
-        for look in broken:
-            self._look_at_spools(*look)
-        if code == -signal.SIGKILL and broken:
-            self.struck["kill"].append(broken[0])
-            self.tell(f"the process that serves is killed {life_s:.2f} s into a run of {broken[0][0]}")
-        else:
-            self.tell(f"the process that was to be killed was between runs, or had ended ({code})")
-            self._later("kill")
-        self.serving.clock.sleep(self.chance.choice(AGAIN_S))
-        for schedule in self.serving.schedules.values():
-            schedule.open()
-
-    def free_disk(self) -> None:
-        """Make room on the disk."""
-        (self.disk / "ballast").unlink(missing_ok=True)
-
-    def _next_kill(self) -> int | None:
-        next_one = self.serving.begun() + 1
-        for number in range(next_one, next_one + len(self.serving.fields)):
-            if self.plan.get(number) == "kill":
-                del self.plan[number]
-                return number
-            if number in self.plan:  # that is for this process
-                return None
-        return None
+        self._look_at_spools(*due)
+        if code != -signal.SIGKILL or len(Archive.open(self.archive).runs()) > known:
+            return False
+        print(f"  {due[0]} {due[1]:%H:%M} is killed", file=sys.stderr, flush=True)
+        self.struck["kill"].append(due)
+        return True
 
     def _look_at_spools(self, name: str, due: datetime) -> None:
-        for path in (self.serving.archive / "spool").glob("*"):
-            self.spools.setdefault(path.name, (FIELDS[name], moment_words(due)))
+        for path in (self.archive / "spool").glob("*"):
+            self.spools.setdefault(path.name, look_of(name, due))
 
-    def _put_off(self) -> None:
-        """Have what was planned for runs that a process to be killed got through meanwhile happen later."""
-        for number in sorted(self.plan):
-            if number <= self.serving.begun():
-                self._later(self.plan.pop(number))
-
-    def _later(self, trouble: str) -> None:
-        number = self.serving.begun() + 1
+    def _later(self, number: int, trouble: str) -> None:
+        number += 1
         while number in self.plan:
             number += 1
         self.plan[number] = trouble
@@ -182,61 +149,65 @@ def _rows(quick: bool) -> list[Row]:
     logging.disable(logging.ERROR)  # the drivers' words on every reset and every cable
     clock = Clock()
     with tempfile.TemporaryDirectory(prefix="soak-day-") as name, small_disk(Path(name) / "disk", DISK_BYTES) as disk:
-        day, account = _live(Path(name), disk, quick)
-        archive = Archive.open(day.serving.archive)
+        day = _live(Path(name), disk, quick)
+        archive = Archive.open(day.archive)
         before = problems_of(archive)
-        left = clear(archive, {(FIELDS[name], visit) for name, visit in account.failed}, day.spools)
-        return judged(day, account, left, (before, problems_of(archive)), clock.seconds, quick=quick)
+        failed = {look_of(*due) for due, why in day.endings.items() if why}
+        left = clear(archive, failed, day.spools)
+        return judged(day, left, (before, problems_of(archive)), clock.seconds, quick=quick)
 
 
-def _live(folder: Path, disk: Path, quick: bool) -> tuple[Day, Account]:
+def _live(folder: Path, disk: Path, quick: bool) -> Day:
     hours, troubles = (QUICK_HOURS, QUICK_TROUBLES) if quick else (HOURS, TROUBLES)
     kinds = [kind for kind, count in troubles.items() for _ in range(count)]
     chance = random.Random(3)
     with RigProcess(folder, scene_settings(), SPEED) as rig:
         write_fields(folder, disk / "archive", rig.table)
-        serving = Serving.of(folder, HandClock())
-        numbers = chance.sample(range(2, len(serving.fields) * hours * 5 // 6), len(kinds))
-        day = Day(serving, disk, chance, dict(zip(numbers, kinds, strict=True)))
-        for schedule in serving.schedules.values():
-            schedule.open()
-        day.live(NOON + timedelta(hours=hours, minutes=30))
-    account = Account()
-    for name, schedule in serving.schedules.items():
-        schedule.close()
-        account.add(name, schedule.ledger.lines(), schedule.timetable.due_between(NOON, NOON + timedelta(hours=hours)))
-        account.wrong += [f"{name} {due:%H:%M:%S} is still open" for due in schedule.state().open]
-    return day, account
+        Archive.open(disk / "archive")
+        numbers = chance.sample(range(2, len(FIELDS) * hours * 5 // 6), len(kinds))
+        day = Day(folder, disk, RigControl(folder), chance, dict(zip(numbers, kinds, strict=True)))
+        day.live(hours)
+    return day
+
+
+def look_of(name: str, due: datetime) -> Look:
+    """The seed of a field's scene and the name of the visit of a due time."""
+    return FIELDS[name], due.isoformat().replace("+00:00", "Z")
 
 
 def judged(
-    day: Day, account: Account, left: Leftovers, problems: tuple[list[str], list[str]], seconds: float, *, quick: bool
+    day: Day, left: Leftovers, problems: tuple[list[str], list[str]], seconds: float, *, quick: bool
 ) -> list[Row]:
     """A row for each demand, and whether it was met."""
     wanted, grown, struck = Counter(day.planned), Growth.of(day.samples), day.struck
-    disks, refused = account.failed_by(FULL), sum(FULL in words for words in day.told)
-    again, gone = account.after_kills(struck["kill"])
-    named = {which: sum(account.names(*run, name, CABLE) for run in struck[which]) for which, name in DEVICES.items()}
+    failed = {due: why for due, why in day.endings.items() if why}
+    again = sum(not day.endings[due] for due in struck["kill"])
+    full = sum(FULL in failed.get(due, "") for due in struck["disk"])
+    named = {
+        which: sum(name in failed.get(due, "") and any(word in failed[due] for word in CABLE) for due in struck[which])
+        for which, name in DEVICES.items()
+    }
     pulls = {which: len(struck[which]) for which in DEVICES}
+    unexplained = failed.keys() - {due for dues in struck.values() for due in dues}
     first = next((one for part in problems for one in part), "")
     whole = f"{len(problems[0])} problems before gc, {len(problems[1])} after{': ' + first if first else ''}"
     return [
         Row(
             "a day of surveys",
-            "three fields in turn through an emulated rig, by a clock turned by hand",
-            account.due,
-            "each due run done, skipped by rule, or failed with a reason",
-            account.words(),
-            not account.wrong,
+            "three fields in turn through an emulated rig, as visits of their due times",
+            len(day.endings),
+            "each done, or failed by what was done to it",
+            f"{len(day.endings) - len(failed)} done, {len(failed)} failed, {len(unexplained)} of them by nothing",
+            not unexplained,
             seconds,
         ),
         Row(
             "kills",
-            "SIGKILL of the process that serves, within a survey",
+            "SIGKILL of the process that surveys",
             len(struck["kill"]),
-            "begun again under the same due time, or failed once the next was due",
-            f"of the runs that were killed {again} begun again, {gone} failed for it",
-            again + gone == len(struck["kill"]) == wanted["kill"],
+            "the same visit, begun again, is done",
+            f"{again} of those that were killed",
+            again == len(struck["kill"]) == wanted["kill"],
             0.0,
         ),
         Row(
@@ -252,9 +223,9 @@ def judged(
             "full disks",
             "the archive's disk (a tmpfs) filled up as a survey begins",
             len(struck["disk"]),
-            "failed, or told and resumed, in words that say so",
-            f"{disks} failed by it, told {refused} times",
-            refused >= len(struck["disk"]) == wanted["disk"],
+            "failed, in words that say so",
+            f"{full} failed by it",
+            full == len(struck["disk"]) == wanted["disk"],
             0.0,
         ),
         Row("the archive", "verify, before and after gc", 2, "whole", whole, not first, 0.0),
@@ -269,7 +240,7 @@ def judged(
         ),
         Row(
             "memory",
-            "resident, after each survey of the process that serves",
+            "resident, after each survey of this process",
             len(day.samples),
             "not judged: too few" if quick else "last quarter within 5 % of the second",
             grown.words(),

@@ -1,6 +1,6 @@
-"""Three fields that one emulated rig looks at, served by a clock turned by hand: in this process, or in one to kill.
+"""Three fields that one emulated rig looks at, and one visit of one of them: in this process, or in one to kill.
 
-``python -m tests.soak.serving FOLDER MOMENT`` runs what is due at the moment, as a process of its own.
+``python -m tests.soak.serving FOLDER FIELD MOMENT`` surveys a field for its due time.
 """
 
 from __future__ import annotations
@@ -8,26 +8,18 @@ from __future__ import annotations
 import logging
 import sys
 import tomllib
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from flows.schedule.due_runs import Outcome, run_all
-from flows.schedule.field_schedule import FieldSchedule
-from flows.schedule.serve_command import load_fields, survey_field
-from flows.schedule.served import ServedField
-from flows.schedule.times import parse_timetable
-from storage.archive.ledger import ledgers
-from tests.flows.schedule.schedule_days import HandClock
-from tests.soak.pulled_rig import RigControl
+from flows.publish.survey_command import run_survey
+from flows.settings.load import load_settings
+from flows.settings.parameters import at_due_time
 
 FIELDS = {"north": 1, "south": 2, "west": 3}  # with the seeds of their scenes
-EVERY, LATE = "1h", 0.5
-SURVEY_S = 400.0  # of the hand clock
 BANDS = ",".join(map(str, range(8, 264, 16)))  # 16 of the farm's 270
 SCENE: dict[str, Any] = {
     "scene": "farm",
@@ -36,10 +28,6 @@ SCENE: dict[str, Any] = {
     "day": 172,
     "camera": {"exposure_ms": 9.0, "readout_ms": 1.0},
 }
-TIMETABLE = parse_timetable(None, EVERY, "UTC")
-QUIET = Console(quiet=True)
-
-Trouble = Callable[[str, datetime], None]
 
 
 def scene_settings() -> dict[str, dict[str, Any]]:
@@ -73,53 +61,11 @@ def _toml(value: object) -> str:
     return str(value).lower() if isinstance(value, bool) else f'"{value}"' if isinstance(value, str) else str(value)
 
 
-@dataclass
-class Serving:
-    """What serves the fields whose settings lie in a folder."""
-
-    folder: Path
-    fields: Mapping[str, ServedField]
-    schedules: Mapping[str, FieldSchedule]
-    clock: HandClock
-    rig: RigControl
-    before: Trouble = field(default=lambda name, due: None)  # called as a survey begins
-    after: Callable[[], None] = field(default=lambda: None)  # and as it has ended, well or not
-
-    @classmethod
-    def of(cls, folder: Path, clock: HandClock) -> Serving:
-        """Serve the settings of a folder."""
-        fields = {one.name: one for one in load_fields([folder / f"{name}.toml" for name in FIELDS])}
-        schedules = {name: one.schedule(TIMETABLE, LATE, clock) for name, one in fields.items()}
-        return cls(folder, fields, schedules, clock, RigControl(folder))
-
-    @property
-    def archive(self) -> Path:
-        """Folder of the archive."""
-        return next(iter(self.fields.values())).archive
-
-    def run(self, tell: Callable[[str], None]) -> list[Outcome]:
-        """Run what is due now."""
-        return run_all(self.schedules, lambda name: self.fields[name].lock(), self.survey, tell)
-
-    def survey(self, name: str, due: datetime) -> Path:
-        """Survey a field for a due time, through the rig."""
-        try:
-            self.before(name, due)
-            self.rig.ask("look", name)
-            self.clock.sleep(SURVEY_S)
-            return survey_field(self.fields[name], due, TIMETABLE, QUIET)
-        finally:
-            self.after()
-
-    def begun(self) -> int:
-        """How many runs have begun so far, each attempt counted."""
-        return sum(line["event"] == "begun" for one in ledgers(self.archive) for line in one.lines())
-
-    def is_waiting(self) -> bool:
-        """Whether anything is to be run now."""
-        return any(one.pending() or one.state().open for one in self.schedules.values())
+def survey_due(folder: Path, name: str, due: datetime) -> Path:
+    """Survey a field for a due time; gives the folder of the published run."""
+    return run_survey(at_due_time(load_settings(folder / f"{name}.toml"), due), Console(quiet=True)).folder
 
 
 if __name__ == "__main__":
     logging.disable(logging.ERROR)
-    Serving.of(Path(sys.argv[1]), HandClock(datetime.fromisoformat(sys.argv[2]))).run(lambda words: None)
+    survey_due(Path(sys.argv[1]), sys.argv[2], datetime.fromisoformat(sys.argv[3]))

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from flows.archive.history import read_histories, render_history
 from flows.publish.page_data import NOTHING
-from flows.schedule.history import read_histories, render_history
 from storage.archive.archive import Archive
 from storage.arrays.class_maps import load_class_map
 from storage.arrays.mosaics import load_mosaic

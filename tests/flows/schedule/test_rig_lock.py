@@ -12,11 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from flows.schedule import rig_lock as schedule_lock
-from flows.schedule.rig_lock import RigLock, rig_lock
 from flows.settings.survey_settings import Settings
+from flows.tasks import rig_lock as rig_locks
+from flows.tasks.rig_lock import RigLock, rig_lock
 from pipeline.errors import ArchiveError, RigError
-from storage.archive.ledger import Ledger
 from storage.archive.staging import take_lock
 
 ROOT = Path(__file__).parents[3]
@@ -26,7 +25,7 @@ import os, sys
 from dataclasses import replace
 from pathlib import Path
 os.access = lambda *given, **named: False  # /run/lock is for others
-from flows.schedule.rig_lock import rig_lock
+from flows.tasks.rig_lock import rig_lock
 from flows.settings.survey_settings import Settings
 settings = Settings()
 lock = rig_lock(replace(settings, source="rig", rig=replace(settings.rig, port=sys.argv[1])), Path())
@@ -105,18 +104,18 @@ def test_a_rig_that_cannot_be_locked_is_not_used(monkeypatch: pytest.MonkeyPatch
     def refuse(*_: object) -> None:
         raise PermissionError(1, "Operation not permitted")
 
-    monkeypatch.setattr(schedule_lock.socket, "socket", refuse)
+    monkeypatch.setattr(rig_locks.socket, "socket", refuse)
     with pytest.raises(RigError, match=r"cannot lock the rig .*: Operation not permitted; .* goes on without"):
         lock_of().take()
 
 
 def test_a_system_without_such_names_uses_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Elsewhere than on Linux a file at a fixed place is the lock, whatever TMPDIR says, and links are refused."""
-    monkeypatch.setattr(schedule_lock.sys, "platform", "darwin")
+    monkeypatch.setattr(rig_locks.sys, "platform", "darwin")
     place = lock_of("/dev/cu.usb").place
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     assert lock_of("/dev/cu.usb").place == place == Path("/tmp/spectralzoom-rig-dev-cu.usb.lock")
-    monkeypatch.setattr(schedule_lock, "FIXED_FOLDER", tmp_path)
+    monkeypatch.setattr(rig_locks, "FIXED_FOLDER", tmp_path)
     lock, other = lock_of("/dev/cu.usb"), lock_of("/dev/cu.usb")
     assert lock.take("a survey")
     assert not other.take()
@@ -143,20 +142,17 @@ def test_what_a_lock_points_at_is_left_alone(tmp_path: Path, kind: str) -> None:
     assert not target.exists() or target.read_text() == "bytes"
 
 
-def test_locks_and_ledgers_of_an_archive_follow_no_link(tmp_path: Path) -> None:
-    """Neither a lock, nor the folder of locks, nor a field's ledger is used through a link; a FIFO is no lock file."""
+def test_locks_of_an_archive_follow_no_link(tmp_path: Path) -> None:
+    """Neither a lock nor the folder of locks is used through a link; a FIFO is no lock file."""
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
-    for name in ("linked", "piped", "schedule"):
+    for name in ("linked", "piped"):
         (tmp_path / name).mkdir()
     (tmp_path / "linked" / ".locks").symlink_to(elsewhere)
     (tmp_path / "piped" / ".locks").mkdir()
     os.mkfifo(tmp_path / "piped" / ".locks" / "use.lock")
-    (tmp_path / "schedule" / "north.jsonl").symlink_to(elsewhere / "north")
     with pytest.raises(ArchiveError, match=r"\.locks is a link, expected a folder of its own"):
         take_lock(tmp_path / "linked" / ".locks" / "use.lock")
     with pytest.raises(ArchiveError, match=r"use\.lock is no file, expected a lock file"):
         take_lock(tmp_path / "piped" / ".locks" / "use.lock")
-    with pytest.raises(ArchiveError, match="it is a link, expected a file; take it out"):
-        Ledger(tmp_path, "north").append({})
     assert list(elsewhere.iterdir()) == []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import shutil
 import tempfile
 import time
@@ -29,9 +30,8 @@ from tests.flows.conftest import Ended, problems
 pytestmark = pytest.mark.usefixtures("no_effects")
 
 RECORDED_S = 30.0  # in which a server has heard of a task that ended
-OF_THIS = [
-    name for name in STAGES if name not in ("register_coarse", "register_fine", "ground")
-]  # a survey in two passes
+NOT_HERE = ("register_coarse", "register_fine", "ground", "average_raster", "take_patches")
+OF_THIS = [name for name in STAGES if name not in NOT_HERE]  # a survey in two passes by a mirror that is believed
 CAPTURES = ("capture_coarse", "capture_fine")
 NO_REPLY = "no reply from the camera after 2 s; is it on?"
 FULL_DISK = "cannot write to the archive: no space left; make room"
@@ -242,3 +242,42 @@ def test_a_stage_that_fails_by_prefect(
     assert (len(tried), failed.run_count) == (tries, tries)
     assert tasks[f"{after}-scene"].id in [given.id for given in failed.task_inputs["inputs"]]
     assert problems(tmp_path) == []
+
+
+def test_a_served_field_of_which_a_stage_fails(
+    server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, field_file: Callable[..., Path]
+) -> None:
+    """The flow ends Failed with the stage's words alone, and no run is published."""
+    from flows.settings.parameters import SurveySettings
+    from flows.survey import survey
+
+    out, file = tmp_path / "archive", field_file("north")
+    with monkeypatch.context() as broken:
+        broken.setitem(STAGES, "cut_patches", failing("cut_patches", refusal("cut_patches")))
+        state = survey(SurveySettings(settings_file=str(file), name="north"), return_state=True)
+    assert (state.is_failed(), FULL_DISK in str(state.message)) == (True, True)
+    assert (Archive.open(out).runs(), problems(out)) == ([], [])
+
+
+def test_a_reprocessing_of_which_a_stage_fails(
+    server: str, walk: Walk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It ends Failed and says where the reason stands; the next one makes what was missing, and completes."""
+    from flows.archive.reprocess_flow import reprocess
+
+    out = Path(shutil.copytree(walk.undisturbed, tmp_path / "archive"))
+    archive = Archive.open(out)
+    (missing,) = archive.refs("segment")
+    archive.discard(missing)
+    with monkeypatch.context() as broken:
+        broken.setitem(STAGES, "draw_map", failing("draw_map", refusal("draw_map")))
+        state = reprocess(archive=str(out), return_state=True)
+    run, _ = newest_run("reprocess", 0)
+    assert (state.is_failed(), run.name, run.state.message) == (True, f"reprocess-{out}", state.message)
+    assert "no field could be reprocessed; reprocess-TIME.json beside the archive says why" in state.message
+    (summary,) = tmp_path.glob("reprocess-*.json")
+    assert [row["message"] for row in json.loads(summary.read_text())["fields"]] == [FULL_DISK]
+    assert archive.find("segment", missing.key) is None
+    state = reprocess(archive=str(out), return_state=True)
+    assert (state.is_completed(), problems(out)) == (True, [])
+    np.testing.assert_array_equal(class_map(out), class_map(walk.undisturbed))

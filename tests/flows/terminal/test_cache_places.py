@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from flows.schedule.prefect_flows import own_temporary_folder
+from flows.schedule.serve_command import _own_temporary_folder
 from flows.terminal.processes import place_caches, place_pages
 from pipeline.errors import SettingsError
 
@@ -110,7 +110,7 @@ def test_prefect_writes_where_that_is_possible(
     }
     from prefect.runner import Runner
 
-    with own_temporary_folder():
+    with _own_temporary_folder():
         place = Path(Runner()._tmp_dir)
         assert stat.S_IMODE(place.parents[1].stat().st_mode) == 0o700
     assert place.is_relative_to(temporary)

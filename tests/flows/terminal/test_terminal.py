@@ -17,8 +17,8 @@ from rich.progress import Progress
 from rich.table import Table
 from rich.tree import Tree
 
+from flows.archive.history import FieldHistory, render_history, render_index
 from flows.publish.report import render_markdown
-from flows.schedule.history import FieldHistory, render_history, render_index
 from flows.terminal.figures import three_digits
 from flows.terminal.progress import StageProgress, Terminal
 from pipeline.errors import is_visible

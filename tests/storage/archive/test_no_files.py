@@ -106,7 +106,7 @@ def test_a_copied_run_is_told(archive: Archive) -> None:
     assert str(found.problem).endswith(f"is that of runs/{small.run.name}; give it its name back")
 
 
-@pytest.mark.parametrize("name", ["stages", "stages/rectify", "runs", "spool", "schedule", ".locks"])
+@pytest.mark.parametrize("name", ["stages", "stages/rectify", "runs", "spool", ".locks"])
 def test_a_linked_part_is_refused_at_the_door(tmp_path: Path, name: str) -> None:
     """One message with what to do; that the archive is itself reached by a link is no matter."""
     small_survey(Archive.open(tmp_path / "archive"))

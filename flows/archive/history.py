@@ -1,4 +1,4 @@
-"""What `spectralzoom report` does: histories of fields (runs and ledgers, oldest first) as pages with charts."""
+"""Write histories of fields, their runs from the oldest on, as pages with charts: `spectralzoom report`."""
 
 from __future__ import annotations
 
@@ -13,19 +13,25 @@ from urllib.parse import quote
 
 from rich.markup import escape
 
+from flows.archive.field_visits import (
+    Chart,
+    VisitPicture,
+    line_chart,
+    look_of,
+    moment_words,
+    read_moment,
+    visit_pictures,
+)
 from flows.archive.stale_runs import called
 from flows.cli.app import ArchiveName, AsJson, OutFile, check_outside, stderr
 from flows.publish.receipt import areas_on_ground
 from flows.publish.report import render_page
-from flows.schedule.field_schedule import ENDINGS, moment_words, read_moment
-from flows.schedule.field_visits import Chart, VisitPicture, line_chart, look_of, visit_pictures
 from flows.tasks.scores import score_of
 from flows.terminal.figures import DASH, LEAST_HECTARES, area_words, counted, format_percent, known_number
 from flows.terminal.processes import DONE
 from flows.terminal.progress import print_json
 from pipeline.errors import ArchiveError, SettingsError
 from storage.archive.archive import Archive
-from storage.archive.ledger import Ledger, ledgers
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run
 from storage.archive.whole_files import write_whole
@@ -35,61 +41,36 @@ from storage.remote.opening import open_archive
 
 @dataclass(frozen=True)
 class FieldHistory:
-    """What is known of one field. ``events``: endings and passed-over times of its ledger; ``runs``: rows by run."""
+    """The runs of one field, as rows, and pictures of its visits."""
 
     field: str
     archive: str
     runs: Sequence[Mapping[str, Any]]
-    events: Sequence[Mapping[str, Any]]
     visits: Sequence[VisitPicture] = ()
 
-    @property
-    def counts(self) -> dict[str, int]:
-        found = dict.fromkeys(ENDINGS, 0)
-        for event in self.events:
-            if event["event"] == "passed":
-                found["skipped"] += event.get("count") or 0
-            else:
-                found[event["event"]] += 1
-        return found
-
     def to_dict(self) -> dict[str, Any]:
-        return {
-            "field": self.field,
-            "archive": self.archive,
-            "counts": self.counts,
-            "runs": list(self.runs),
-            "events": list(self.events),
-        }
+        """Return what is written as JSON."""
+        return {"field": self.field, "archive": self.archive, "runs": list(self.runs)}
 
 
 def read_histories(archive: Archive, field: str | None = None) -> list[FieldHistory]:
-    """The histories of all fields by name, or of one. Raises ArchiveError: no field is called so."""
+    """Return the histories of all fields by name, or of one. Raises ArchiveError: no field is called so."""
     catalogue = Catalogue.read(archive.root)
-    kept = {ledger.field: ledger for ledger in ledgers(archive.root)}
-    names = sorted({*kept, *(called(run) for run in catalogue.runs)})
+    names = sorted({called(run) for run in catalogue.runs})
     if field is not None and field not in names:
         near = difflib.get_close_matches(field, names, n=1)
         hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(names) or 'none'}"
         raise ArchiveError(f"no field of {archive.name} is called {field!r}; {hint}")
     wanted = names if field is None else [field]
-    return [_history(archive, catalogue, name, kept.get(name)) for name in wanted]
+    return [_history(archive, catalogue, name) for name in wanted]
 
 
-def _history(archive: Archive, catalogue: Catalogue, name: str, ledger: Ledger | None) -> FieldHistory:
-    lines = [] if ledger is None else ledger.lines()
-    events = [line for line in lines if line.get("event") in (*ENDINGS, "passed")]
-    by_run = {line["run"]: line for line in events if isinstance(line.get("run"), str) and not _looked_at_nothing(line)}
-    own = [run for run in catalogue.runs if run.uri in by_run or called(run) == name]
-    rows = [_row(archive, catalogue, run, by_run.get(run.uri, {})) for run in own]
+def _history(archive: Archive, catalogue: Catalogue, name: str) -> FieldHistory:
+    own = [run for run in catalogue.runs if called(run) == name]
+    rows = [_row(archive, catalogue, run) for run in own]
     found = sorted(zip(own, rows, strict=True), key=lambda one: day_of(one[1]) or 0.0)
-    looked = [(run, _called(row)) for run, row in found]
-    return FieldHistory(name, archive.name, [row for _, row in found], events, visit_pictures(archive, looked))
-
-
-def _looked_at_nothing(event: Mapping[str, Any]) -> bool:
-    """Whether a visit left it at the map that was there: its run is an earlier one, and it says why."""
-    return event.get("event") == "done" and bool(event.get("reason"))
+    visits = visit_pictures(archive, [(run, _called(row)) for run, row in found])
+    return FieldHistory(name, archive.name, [row for _, row in found], visits)
 
 
 def _called(row: Mapping[str, Any]) -> str:
@@ -99,7 +80,7 @@ def _called(row: Mapping[str, Any]) -> str:
     return when if not visit or read_moment(visit) is not None else f"{visit}, {when}"
 
 
-def _row(archive: Archive, catalogue: Catalogue, run: Run, line: Mapping[str, Any]) -> dict[str, Any]:
+def _row(archive: Archive, catalogue: Catalogue, run: Run) -> dict[str, Any]:
     receipt = run.receipt
     savings = found if isinstance(found := receipt.get("savings"), Mapping) else {}
     shares, unit = _covered(archive, catalogue, run)
@@ -112,10 +93,8 @@ def _row(archive: Archive, catalogue: Catalogue, run: Run, line: Mapping[str, An
     return {
         "run": run.uri,
         "created": run.created,
-        "due": line.get("due"),
         "visit": run.settings.get("visit"),
-        "looked": None if (at := look_of(run, line.get("due"))) is None else moment_words(at),
-        "attempts": line.get("attempts"),
+        "looked": None if (at := look_of(run)) is None else moment_words(at),
         "capture_seconds": _seconds(savings),
         **score_of(receipt),
         "savings": {
@@ -168,7 +147,7 @@ Rows = Sequence[Mapping[str, Any]]
 
 
 def report(archive: ArchiveName, *, field: str | None = None, out: OutFile, as_json: AsJson = False) -> int:
-    """Write a field's history as one page that opens from disk: dates, class areas, savings, failures.
+    """Write a field's history as one page that opens from disk: dates, class areas, savings.
 
     Parameters
     ----------
@@ -204,27 +183,23 @@ def report(archive: ArchiveName, *, field: str | None = None, out: OutFile, as_j
 
 def render_history(history: FieldHistory, runs_at: str) -> str:
     """The page; ``runs_at`` is the way from it to the archive's folder, empty where there is none."""
-    counts = ", ".join(f"{count} {word}" for word, count in history.counts.items())
-    troubles = [event for event in history.events if event["event"] != "done" or _looked_at_nothing(event)]
     return render_page(
         "history.html",
         PLAYER_SCRIPTS if history.visits else (),
         kicker="SpectralZoom field",
         title=history.field,
-        lead=f"{counted(len(history.runs), 'run')} in the archive. Of what was due on schedule: {counts}.",
+        lead=f"{counted(len(history.runs), 'run')} in the archive.",
         about=f"{history.archive}; times in UTC",
         areas=_areas(history.runs),
         savings=_savings(history.runs),
         visits=[asdict(one) for one in history.visits],
-        troubles=[_trouble(event) for event in reversed(troubles[-MOST_ROWS:])],
-        older_troubles=len(troubles) - MOST_ROWS,
         runs=[_run(row, runs_at) for row in reversed(history.runs[-MOST_ROWS:])],
         older_runs=len(history.runs) - MOST_ROWS,
     )
 
 
 def render_index(histories: Sequence[FieldHistory], archive: str, pages: Mapping[str, str]) -> str:
-    """All fields of an archive, with what became of their runs; ``pages`` are the files of their histories."""
+    """Return a page of all fields of an archive; ``pages`` are the files of their histories."""
     return render_page(
         "fields.html",
         kicker="SpectralZoom archive",
@@ -237,10 +212,6 @@ def render_index(histories: Sequence[FieldHistory], archive: str, pages: Mapping
                 "page": pages[one.field],
                 "runs": len(one.runs),
                 "newest": _short(max((str(row["created"]) for row in one.runs), default="")) or DASH,
-                "counts": list(one.counts.values()),
-                "trouble": next(
-                    (line.get("reason") or "" for line in reversed(one.events) if line["event"] != "done"), ""
-                ),
             }
             for one in histories
         ],
@@ -318,26 +289,14 @@ def _summed_seconds(runs: Rows) -> dict[str, list[tuple[float, float]]]:
     return {label: found for label, found in points.items() if found}
 
 
-def _trouble(event: Mapping[str, Any]) -> dict[str, str]:
-    what, due = str(event["event"]), _short(str(event.get("due", "")))
-    if what == "done":
-        what = "nothing looked at"
-    if what == "passed":
-        what = f"{'very many' if event.get('count') is None else event['count']} skipped"
-        due = f"{_short(str(event.get('after', '')))} to {_short(str(event.get('until', '')))}"
-    return {"due": due, "what": what, "why": str(event.get("reason", ""))}
-
-
 def _run(row: Mapping[str, Any], runs_at: str) -> dict[str, Any]:
     largest = sorted(row["areas"].items(), key=lambda item: -item[1])[:3]
     show = area_words if row["unit"] == "ha" else format_percent
-    again = f" (attempt {row['attempts']})" if (row["attempts"] or 1) > 1 else ""
     name = quote(str(row["run"]).removeprefix("runs/"), errors="surrogateescape")
     return {
         "looked": _short(str(row.get("looked") or "")) or DASH,
         "published": _short(str(row["created"])),
         "report": f"{runs_at}/runs/{name}/report.html" if runs_at else "",
-        "due": (_short(str(row["due"] or "")) or DASH) + again,
         "capture_s": row["savings"]["capture_s"],
         **{score: row[score] for score in SCORES},
         "areas": ", ".join(f"{name.replace('_', ' ')} {show(area)}" for name, area in largest if area),

@@ -1,19 +1,17 @@
-"""A field's history: rows of runs and ledger, a page that loads nothing, an index with links that lead somewhere."""
+"""A field's history: rows of its runs, a page that loads nothing, an index with links that lead somewhere."""
 
 from __future__ import annotations
 
 import json
 import re
-import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from flows.schedule.field_visits import COLOURS, line_chart, look_of
-from flows.schedule.history import FieldHistory, _summed_seconds, read_histories, render_history, render_index, way_to
+from flows.archive.field_visits import COLOURS, line_chart, look_of
+from flows.archive.history import FieldHistory, _summed_seconds, read_histories, render_history, render_index, way_to
 from storage.archive.archive import Archive
-from storage.archive.ledger import Ledger
 from storage.archive.records import Run
 from storage.arrays.class_maps import load_class_map
 from tests.flows.conftest import Page
@@ -25,54 +23,22 @@ BAD = '<script>alert("1")</script>&'
 
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory: pytest.TempPathFactory, survey_png: Any) -> Path:
-    """Two surveys of one field, one of another, and a ledger that knows the first and three troubles."""
+    """Two surveys of one field, by their due times or other names, and one of another."""
     root = tmp_path_factory.mktemp("history") / "archive"
-    first = survey_png(root, name="north", visit="a").folder
     survey_png(root, name="north", visit=f"b {BAD}")
+    survey_png(root, name="north", visit="2026-06-01T10:00:00Z")
     survey_png(root, name="south")
-    ledger = Ledger(root, "north")
-    due = {"at": "2026-06-01T10:00:20Z", "due": "2026-06-01T10:00:00Z"}
-    ledger.append({"event": "begun", **due, "attempt": 1})
-    ledger.append({"event": "done", **due, "attempts": 2, "run": f"runs/{first.name}", "seconds": 3.0})
-    ledger.append({"event": "failed", **due, "due": "2026-06-01T11:00:00Z", "reason": f"no reply {BAD}"})
-    ledger.append({"event": "skipped", **due, "due": "2026-06-01T12:00:00Z", "reason": "the rig was in use"})
-    ledger.append(
-        {
-            "event": "passed",
-            "at": due["at"],
-            "after": "2026-06-01T12:00:00Z",
-            "until": "2026-07-01T12:00:00Z",
-            "count": 720,
-            "reason": "asleep",
-        }
-    )
     return root
 
 
-def test_a_visit_that_looked_at_nothing_has_no_run_of_its_own(archive: Path, tmp_path: Path) -> None:
-    """It is counted as done and told with its reason; the run whose map stands keeps its own date."""
-    shutil.copytree(archive, root := tmp_path / "archive")
-    run = read_histories(Archive.open(root), "north")[0].runs[0]["run"]
-    later = {"at": "2026-06-02T10:00:20Z", "due": "2026-06-02T10:00:00Z", "reason": "nothing is looked at: 1.2%"}
-    Ledger(root, "north").append({"event": "done", **later, "run": run, "seconds": 0.0})
-    (north,) = read_histories(Archive.open(root), "north")
-    assert north.counts["done"] == 2
-    assert [row["due"] for row in north.runs] == ["2026-06-01T10:00:00Z", None]
-    page = render_history(north, "")
-    assert "nothing looked at" in page
-    assert "nothing is looked at: 1.2%" in page
-
-
-def test_runs_and_ledger_are_one_history(archive: Path) -> None:
-    """Runs on schedule and by hand are counted; shares add up; what is brown on the map is brown on the page."""
+def test_runs_are_one_history(archive: Path) -> None:
+    """Visits stand by their due times; shares add up; what is brown on the map is brown on the page."""
     north, south = read_histories(Archive.open(archive))
     assert (north.field, south.field) == ("north", "south")
-    assert north.counts == {"done": 1, "skipped": 721, "failed": 1}
-    assert [row["due"] for row in north.runs] == ["2026-06-01T10:00:00Z", None]
+    assert [row["visit"] for row in north.runs] == ["2026-06-01T10:00:00Z", f"b {BAD}"]
+    assert north.runs[0]["looked"] == "2026-06-01T10:00:00Z"
     assert sum(north.runs[0]["areas"].values()) == pytest.approx(1.0)
     assert north.runs[0]["miou"] is not None
-    assert south.counts == {"done": 0, "skipped": 0, "failed": 0}
-    (north, _) = read_histories(Archive.open(archive))
     receipt = json.loads((archive / north.runs[0]["run"] / "receipt.json").read_text())
     shown = load_class_map(archive / receipt["products"]["class_map"])
     wanted = {name: "#" + bytes(map(int, rgb)).hex() for name, rgb in zip(shown.names, shown.colours, strict=True)}
@@ -99,7 +65,7 @@ def test_pages_load_nothing_and_lead_to_reports(archive: Path, command_line: Any
     assert not re.search(r"https?://|@import|url\(", text.partition("<script>")[0])
     assert len(found.links) == 2
     assert all((page.parent / link).is_file() for link in found.links)
-    assert all(words in text for words in ("720 skipped", "no reply", "Share of the map", "attempt 2", "<svg"))
+    assert all(words in text for words in ("2026-06-01 10:00", "Share of the map", "<svg"))
     page = tmp_path / "index.html"
     ended = command_line("report", archive, "-o", page)
     assert ended.code == 0, ended.err
@@ -126,7 +92,7 @@ def test_a_report_that_cannot_be_written(
 
 
 def test_charts_and_pages_of_little(tmp_path: Path) -> None:
-    """One point is drawn too, the same points alike; a schedule that has just begun has a page; links are relative."""
+    """One point is drawn too, the same points alike; a field without a run has a page; links are relative."""
     series = {"soil": [(0.0, 1.0), (86400.0, 0.5)], "crop": [(0.0, 0.2)]}
     chart, again = line_chart(series, "Share", "%"), line_chart(series, "Share", "%")
     assert chart.drawing == again.drawing
@@ -135,7 +101,7 @@ def test_charts_and_pages_of_little(tmp_path: Path) -> None:
     assert all(chart.drawing.count(f"fill: none; stroke: {colour}") == 1 for colour in chart.legend.values())
     assert ">100 %<" in chart.drawing
     assert not re.search(r"https?:|url\(|<style", chart.drawing)
-    page = render_history(FieldHistory("new", "archive", [], []), "")
+    page = render_history(FieldHistory("new", "archive", []), "")
     Page(page)
     assert "nothing to draw yet" in page
     Page(render_index([], "archive", {}))
@@ -165,22 +131,21 @@ def test_whatever_a_receipt_claims_is_drawn_or_left_out(points: list[tuple[float
 
 
 @pytest.mark.parametrize(
-    ("settings", "due", "looked"),
+    ("settings", "looked"),
     [
-        ({"visit": "2026-06-21T09:30:00Z", "scene": "farm", "day": 130}, "2026-07-01T00:00:00Z", "2026-06-21 09:30"),
-        ({"visit": "second", "scene": "farm", "day": 130}, "2026-07-01T00:00:00Z", "2026-07-01 00:00"),
-        ({"visit": "second", "scene": "farm", "day": 130}, None, "2026-05-10 11:00"),
-        ({"scene": "farm", "day": 172, "hour": 13.5}, None, "2026-06-21 13:30"),
-        ({"scene": "field.png", "day": 130}, None, "2026-11-22 08:00"),
-        ({"scene": "farm", "day": None}, None, "2026-11-22 08:00"),
-        ({"scene": "farm", "day": 10**9}, None, "2026-11-22 08:00"),
+        ({"visit": "2026-06-21T09:30:00Z", "scene": "farm", "day": 130}, "2026-06-21 09:30"),
+        ({"visit": "second", "scene": "farm", "day": 130}, "2026-05-10 11:00"),
+        ({"scene": "farm", "day": 172, "hour": 13.5}, "2026-06-21 13:30"),
+        ({"scene": "field.png", "day": 130}, "2026-11-22 08:00"),
+        ({"scene": "farm", "day": None}, "2026-11-22 08:00"),
+        ({"scene": "farm", "day": 10**9}, "2026-11-22 08:00"),
     ],
 )
-def test_a_look_has_the_date_of_the_look(settings: dict[str, Any], due: str | None, looked: str) -> None:
-    """By its visit's name, by what was due, by the farm's day; the clock is asked last, when the survey began."""
+def test_a_look_has_the_date_of_the_look(settings: dict[str, Any], looked: str) -> None:
+    """By its visit's name, by the farm's day; the clock is asked last, when the survey began."""
     receipt = {"settings": settings, "started": "2026-11-22T08:00:00Z"}
     run = Run(Path("x"), {"created": "2026-11-23T00:00:00Z"}, receipt, None, frozenset())
-    found = look_of(run, due)
+    found = look_of(run)
     assert found is not None
     assert f"{found:%Y-%m-%d %H:%M}" == looked
 
@@ -189,12 +154,12 @@ def test_rare_classes_have_a_scale_of_their_own() -> None:
     """A class of two thousandths fills its chart as one of half the field does; all charts have the same dates."""
     moments = ("2026-05-10T00:00:00Z", "2026-06-21T00:00:00Z")
     rows = [
-        {"run": "runs/x", "created": at, "looked": at, "due": None, "attempts": 1, "unit": "share", "colours": {},
+        {"run": "runs/x", "created": at, "looked": at, "unit": "share", "colours": {},
          "areas": {"soil": 0.5, "weed": weed}, "savings": {"capture_s": 0.5}, "miou": None, "overall_accuracy": None,
          "capture_seconds": {"done": None, "full": None}}
         for at, weed in zip(moments, (0.001, 0.002), strict=True)
     ]  # fmt: skip
-    page = render_history(FieldHistory("north", "archive", rows, []), "")
+    page = render_history(FieldHistory("north", "archive", rows), "")
     weed = page.partition('aria-label="weed"')[2].partition("</svg>")[0]
     assert ">0.2 %<" in weed
     assert ">0.2 %<" not in page.partition('aria-label="soil"')[2].partition("</svg>")[0]

@@ -26,7 +26,6 @@ from flows.publish.change_pictures import CHANGED_SHARE
 from flows.publish.page_data import in_base64, indexed_png
 from flows.publish.panels import UNLABELLED_COLOUR, class_palette
 from flows.publish.receipt_words import days_words
-from flows.schedule.field_schedule import read_moment
 from flows.settings.survey_settings import BUILT_IN_SCENES
 from flows.terminal.figures import format_percent, format_points, format_seconds, known_number
 from pipeline.errors import visible
@@ -51,13 +50,27 @@ _DAYS = (-719_160.0, 2_932_890.0)  # since 1970, of years 1 to 9999: what dates 
 Points = Sequence[tuple[float, float]]  # seconds since 1970, value
 
 
-def look_of(run: Run, due: object) -> datetime | None:
-    """The moment that a run's visit is called by, else when it was ``due``, else the day that its farm was drawn on.
+def read_moment(value: object) -> datetime | None:
+    """Return a moment that was written in ISO 8601, in UTC; None where it is none."""
+    try:
+        found = datetime.fromisoformat(value) if isinstance(value, str) else None
+    except ValueError:
+        return None
+    return None if found is None else found.replace(tzinfo=found.tzinfo or UTC).astimezone(UTC)
+
+
+def moment_words(moment: datetime) -> str:
+    """Return a moment in ISO 8601 and UTC."""
+    return moment.astimezone(UTC).isoformat().replace("+00:00", "Z")
+
+
+def look_of(run: Run) -> datetime | None:
+    """Return the moment that a run's visit is called by, else the day that its farm was drawn on.
 
     Of others when they began, or were published. The day is of the year in which the run was published. None where
     nothing of that can be read.
     """
-    named = next((at for at in map(read_moment, (run.settings.get("visit"), due)) if at is not None), None)
+    named = read_moment(run.settings.get("visit"))
     if named is not None:
         return named
     began = next((at for at in map(read_moment, (run.receipt.get("started"), run.created)) if at is not None), None)

@@ -1,0 +1,50 @@
+"""The reprocessing of an archive as a Prefect flow, for a deployment beside the surveys of its fields.
+
+No ``from __future__ import annotations`` here: Prefect reads the signatures.
+"""
+
+from pathlib import Path
+from typing import Any
+
+from prefect import flow
+from prefect.client.schemas.objects import ConcurrencyLimitConfig, ConcurrencyLimitStrategy
+from prefect.types.entrypoint import EntrypointType
+
+from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
+from flows.terminal.processes import FAILED, PARTLY
+from flows.terminal.progress import on_stderr
+from pipeline.errors import ArchiveError
+
+
+@flow(name="reprocess", flow_run_name="reprocess-{archive}", persist_result=False)
+def reprocess(
+    archive: str,
+    since: str | None = None,
+    stage: str | None = None,
+    field: str | None = None,
+    failed: bool = False,
+    weights: str | None = None,
+    dry_run: bool = False,
+) -> str:
+    """Survey every field of an archive again: what it holds is found, only what has changed is made anew.
+
+    The parameters are those of the command `spectralzoom reprocess`. Returns how it ended. Raises PipelineError: the
+    archive or a parameter cannot be used, or no field could be reprocessed.
+    """
+    named = None if weights is None else Path(weights)
+    code = run_reprocess(ReprocessRequest(archive, since, stage, field, failed, named, dry_run), on_stderr())
+    if code == FAILED:
+        raise ArchiveError("no field could be reprocessed; reprocess-TIME.json beside the archive says why")
+    return "some fields failed; reprocess-TIME.json beside the archive says why" if code == PARTLY else "done"
+
+
+def deployment(archive: str, number: int = 1) -> Any:
+    """Return a deployment of the flow for one archive, run on request, one at a time."""
+    return reprocess.to_deployment(
+        "archive" if number == 1 else f"archive-{number}",
+        parameters={"archive": archive},
+        concurrency_limit=ConcurrencyLimitConfig(limit=1, collision_strategy=ConcurrencyLimitStrategy.CANCEL_NEW),
+        description=f"Surveys of {archive} again, with newer weights or stages; on request.",
+        version="1",
+        entrypoint_type=EntrypointType.MODULE_PATH,
+    )

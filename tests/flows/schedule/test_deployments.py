@@ -1,0 +1,354 @@
+"""Deployments of the survey on a real Prefect server: parameters, due times, limits, two machines, files, a kill."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import copy_context
+from dataclasses import replace
+from datetime import UTC, datetime
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from queue import Queue
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import yaml
+
+from flows.schedule.serve_command import _prepare, load_fields, schedule_of
+from flows.settings.load import load_settings
+from flows.tasks.local_server import local_server
+from flows.tasks.open_survey import RIG_LIMIT, OpenSurvey
+from storage.archive.archive import Archive
+from storage.archive.records import read_run
+from storage.parallel.crew import THREADS
+from tests.soak.served_week import free_port, server_process
+
+ROOT = Path(__file__).parents[3]
+PATIENCE_S = 300.0
+DUE = datetime(2026, 6, 1, 4, tzinfo=UTC)
+SERVES = """
+import sys
+from prefect import serve
+from prefect.types.entrypoint import EntrypointType
+import flows.survey
+made = getattr(flows.survey, sys.argv[1]).to_deployment(sys.argv[2], entrypoint_type=EntrypointType.MODULE_PATH)
+serve(made, print_starting_message=False)
+"""
+
+pytestmark = pytest.mark.usefixtures("no_effects", "scheduling")
+
+
+@pytest.fixture(scope="module")
+def scheduling(prefect_home: Path) -> Iterator[str]:
+    """A server that plans and watches deployments, and the address of its API."""
+    with local_server(prefect_home / "scheduling", schedules=True) as api:
+        yield api
+
+
+@pytest.fixture
+def north(field_file: Callable[..., Path]) -> Any:
+    """The field north, which is due at six in Berlin."""
+    return load_fields([field_file("north", effects="none")])[0]
+
+
+def deployed(field: Any) -> Any:
+    """The id of a field's deployment on the server."""
+    return field.deployment(schedule_of("0 6 * * *", None, "Europe/Berlin")).apply()
+
+
+def client() -> Any:
+    """A client of the server."""
+    from prefect.client.orchestration import get_client
+
+    return get_client(sync_client=True)
+
+
+def planned(deployment: Any, due: datetime, parameters: Mapping[str, Any] | None = None) -> Any:
+    """A run of a deployment that is due at a moment."""
+    from prefect.states import Scheduled
+
+    with client() as asked:
+        return asked.create_flow_run_from_deployment(
+            deployment, parameters=dict(parameters or {}), state=Scheduled(scheduled_time=due)
+        )
+
+
+def run_here(run: Any) -> Any:
+    """Run it by Prefect's engine in this process, as a runner does in one of its own; gives the state."""
+    from prefect.flow_engine import run_flow
+
+    from flows.survey import survey
+
+    return run_flow(survey, flow_run=run, return_type="state")
+
+
+def settings_of(out: Path) -> list[dict[str, Any]]:
+    """The settings that an archive's runs were asked for, oldest first."""
+    return [dict(read_run(folder, {}).settings) for folder in Archive.open(out).runs()]
+
+
+def test_a_wrong_parameter_ends_a_run_with_the_message_of_the_command_line(north: Any) -> None:
+    """The server refuses what is no setting; the flow, before it begins, what is out of range."""
+    from prefect.exceptions import PrefectHTTPStatusError
+
+    deployment = deployed(north)
+    settings = {"settings_file": str(north.file), "out": north.settings.out}
+    with pytest.raises(PrefectHTTPStatusError, match="bugdet"):
+        planned(deployment, DUE, {"settings": {**settings, "bugdet": 0.5}})
+    state = run_here(planned(deployment, DUE, {"settings": {**settings, "budget": 2.0}}))
+    assert state.is_failed()
+    assert "--budget must be a share of the full scan's seconds, above 0 and at most 1, got 2.0" in state.message
+
+
+def test_a_run_is_a_visit_of_its_due_time_and_goes_on_from_the_newest(north: Any) -> None:
+    """Whenever it really begins; the first finds no earlier run."""
+    deployment = deployed(north)
+    states = [run_here(planned(deployment, DUE.replace(day=day))) for day in (1, 2)]
+    assert [state.name for state in states] == ["Completed", "Completed"]
+    asked = settings_of(Path(north.settings.out))
+    assert [one["visit"] for one in asked] == ["2026-06-01T04:00:00Z", "2026-06-02T04:00:00Z"]
+    memories = [read_run(folder, {}).receipt.get("memory") for folder in Archive.open(north.settings.out).runs()]
+    assert [memory is None for memory in memories] == [True, False]
+
+
+def test_a_run_that_is_due_while_the_last_still_runs_is_cancelled(north: Any) -> None:
+    """Prefect refuses it a place; the next one after the end has one."""
+    from prefect.states import Completed, Pending, Running
+
+    deployment = deployed(north)
+    first, second, third = (planned(deployment, DUE.replace(hour=hour)).id for hour in (4, 5, 6))
+    with client() as asked:
+        asked.set_flow_run_state(first, Pending())
+        asked.set_flow_run_state(first, Running())
+        asked.set_flow_run_state(second, Pending())
+        assert asked.read_flow_run(second).state.is_cancelled()
+        asked.set_flow_run_state(first, Completed())
+        asked.set_flow_run_state(third, Pending())
+        assert asked.read_flow_run(third).state.is_pending()
+
+
+def test_what_a_killed_serve_left_is_ended_when_it_is_served_again(north: Any) -> None:
+    """What waited is cancelled, what ran has crashed and gives its place back; what is to come stays."""
+    from prefect.states import Pending, Running
+
+    deployment = deployed(north)
+    ran, waited, later = (planned(deployment, DUE.replace(year=year)).id for year in (2024, 2025, 2099))
+    with client() as asked:
+        asked.set_flow_run_state(ran, Pending())
+        asked.set_flow_run_state(ran, Running())
+        _prepare(["north"])
+        assert [asked.read_flow_run(one).state.type.value for one in (ran, waited, later)] == [
+            "CRASHED",
+            "CANCELLED",
+            "SCHEDULED",
+        ]
+        after = planned(deployment, DUE).id
+        asked.set_flow_run_state(after, Pending())
+        assert asked.read_flow_run(after).state.is_pending()
+
+
+def test_two_fields_that_are_due_at_once_take_turns_at_the_rig(tmp_path: Path) -> None:
+    """By Prefect's limit the second waits; without it the rig's own lock refuses it."""
+    from prefect import flow
+
+    archive = Archive.open(tmp_path / "archive")
+    usual = load_settings(None, {"scene": "farm"})
+    rig = replace(usual, source="rig", rig=replace(usual.rig, port=f"/dev/ttyTURNS{os.getpid()}"))
+    plan: Any = SimpleNamespace(run=SimpleNamespace(settings=rig, archive=archive, name="x"), capture_deployment=None)
+    held: list[tuple[float, float]] = []
+    inside = threading.Barrier(2)
+
+    @flow(persist_result=False)
+    def look() -> None:
+        inside.wait(PATIENCE_S)
+        with OpenSurvey.at_work(plan):
+            began = time.monotonic()
+            time.sleep(0.5)
+            held.append((began, time.monotonic()))
+
+    assert rig.crew == THREADS
+    with client() as asked:
+        asked.upsert_global_concurrency_limit_by_name(RIG_LIMIT, 1)
+    threads = [threading.Thread(target=copy_context().run, args=(look,)) for _ in range(2)]
+    for one in threads:
+        one.start()
+    for one in threads:
+        one.join(PATIENCE_S)
+    (_, ended), (began, _) = sorted(held)
+    assert ended <= began
+
+
+@contextmanager
+def serving(flow: str, name: str, api: str) -> Iterator[None]:
+    """Serve a flow as a deployment in a process of its own."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PREFECT_RUNNER_POLL_FREQUENCY": "1", "PREFECT_API_URL": api}
+    with subprocess.Popen([sys.executable, "-c", SERVES, flow, name], cwd=ROOT, env=environment) as process:
+        try:
+            wait_for(f"{flow}/{name}")
+            yield
+        finally:
+            process.send_signal(signal.SIGINT)
+            process.wait(60)
+
+
+def wait_for(name: str) -> None:
+    """Wait until the server knows a deployment."""
+    from prefect.exceptions import ObjectNotFound
+
+    end = time.monotonic() + PATIENCE_S
+    with client() as asked:
+        while time.monotonic() < end:
+            try:
+                asked.read_deployment_by_name(name)
+                return
+            except ObjectNotFound:
+                time.sleep(0.5)
+    pytest.fail(f"{name} is not served")
+
+
+def asked_for(name: str, **parameters: Any) -> Any:
+    """Have a deployment run, wait for the end, and give the state."""
+    from prefect.deployments import run_deployment
+
+    run: Any = run_deployment(name, parameters=parameters, timeout=PATIENCE_S, poll_interval=0.5)
+    return run.state
+
+
+def test_the_rig_and_the_reading_machine_are_two_deployments(
+    field_file: Callable[..., Path], tmp_path: Path, scheduling: str
+) -> None:
+    """One process takes the sweeps, another reads them from the same archive; the map is that of one plain survey."""
+    from flows.settings.parameters import SurveySettings
+    from flows.survey import survey
+
+    file = field_file("north", effects="none")
+    given = {"settings_file": str(file), "name": "north", "visit": "2026-06-01T04:00:00Z", "prior": "none"}
+    with serving("capture", "rig", scheduling), serving("survey", "apart", scheduling):
+        state = asked_for("survey/apart", settings=given, capture_deployment="capture/rig")
+    assert state.is_completed(), state.message
+    with client() as asked:
+        sweeps = [run.parameters["sweeps"] for run in asked.read_flow_runs() if run.name == "capture-north"]
+    assert sorted(sweeps) == ["coarse", "fine"]
+    plain = survey.fn(SurveySettings(**given, out=str(tmp_path / "plain")))
+    (run,) = (read_run(folder, {}) for folder in Archive.open(tmp_path / "archive").runs())
+    stores, others = (
+        {name: address for name, address in one.products.items() if address.startswith("stages/")}
+        for one in (run, read_run(plain.folder, {}))
+    )
+    assert "class_map" in stores
+    assert stores == others
+
+
+def prefect_cli(folder: Path, *words: str) -> str:
+    """Run Prefect's command line in a folder; gives what it says."""
+    command = [sys.executable, "-m", "prefect", *words]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_the_file_of_deployments_is_complete(scheduling: str) -> None:
+    """`prefect deploy --all --no-prompt` makes all three, with schedule, pools and limits, and parameters that fit."""
+    from flows.archive.reprocess_flow import reprocess
+    from flows.survey import survey
+
+    for pool in ("reading", "rig"):
+        prefect_cli(ROOT, "work-pool", "create", pool, "--type", "process", "--overwrite")
+    prefect_cli(ROOT, "deploy", "--all", "--no-prompt")
+    with client() as asked:
+        north, rig, archive = map(asked.read_deployment_by_name, ("survey/north", "capture/rig", "reprocess/archive"))
+    assert [(one.work_pool_name, one.global_concurrency_limit.limit) for one in (north, rig, archive)] == [
+        ("reading", 1),
+        ("rig", 1),
+        ("reading", 1),
+    ]
+    assert [one.concurrency_options.collision_strategy.value for one in (north, rig)] == ["CANCEL_NEW", "ENQUEUE"]
+    assert [(one.schedule.cron, one.schedule.timezone) for one in north.schedules] == [
+        ("0 6-20 * * *", "Europe/Berlin")
+    ]
+    assert set(north.parameters["settings"]) <= set(
+        survey.parameters.model_dump()["definitions"]["SurveySettings"]["properties"]
+    )
+    reprocess.validate_parameters(archive.parameters)
+
+
+def test_the_automation_tells_of_a_failed_run(north: Any, tmp_path: Path, scheduling: str) -> None:
+    """The file is accepted with the id of a block, and a run that fails posts what it failed by."""
+    from prefect.blocks.webhook import Webhook
+
+    told: Queue[dict[str, Any]] = Queue()
+
+    class Listener(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            told.put(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
+            self.send_response(200)
+            self.end_headers()
+
+        def log_message(self, *words: object) -> None:
+            pass
+
+    listener = ThreadingHTTPServer(("127.0.0.1", 0), Listener)
+    threading.Thread(target=listener.serve_forever, daemon=True).start()
+    try:
+        block = Webhook(url=f"http://127.0.0.1:{listener.server_port}/").save("surveys", overwrite=True)
+        text = (ROOT / "automation.yaml").read_text(encoding="utf-8")
+        assert yaml.safe_load(text)["actions"][0]["block_document_id"] in text
+        (tmp_path / "automation.yaml").write_text(text.replace("00000000-0000-0000-0000-000000000000", str(block)))
+        prefect_cli(tmp_path, "automation", "create", "--from-file", "automation.yaml")
+        settings = {"settings_file": str(tmp_path / "gone.toml")}
+        state = run_here(planned(deployed(north), DUE, {"settings": settings}))
+        assert state.is_failed()
+        found = told.get(timeout=PATIENCE_S)
+    finally:
+        listener.shutdown()
+        listener.server_close()
+    assert found["state"] == "Failed"
+    assert "no settings file" in found["why"]
+
+
+def test_a_serve_goes_on_when_its_server_was_killed_and_is_back(
+    field_file: Callable[..., Path], tmp_path: Path
+) -> None:
+    """Runs end well before and after; SIGTERM then ends it with one sentence and pauses the schedule."""
+    from prefect.settings import PREFECT_API_AUTH_STRING, PREFECT_API_URL, temporary_settings
+
+    file, home, port = field_file("north", effects="none"), tmp_path / "home", free_port()
+    with server_process(home, port) as server:
+        password, api = (home / "password").read_text().strip(), f"http://127.0.0.1:{port}/api"
+        environment = {**os.environ, "PYTHONPATH": str(ROOT), "PREFECT_RUNNER_POLL_FREQUENCY": "1"}
+        environment |= {"PREFECT_API_URL": api, "PREFECT_API_AUTH_STRING": password}
+        environment |= {"PREFECT_CLIENT_MAX_RETRIES": "0"}  # else it asks for minutes before it gives up
+        words = [sys.executable, "-m", "flows.cli.main", "serve", str(file), "--every", "365d"]
+        with (
+            temporary_settings({PREFECT_API_URL: api, PREFECT_API_AUTH_STRING: password}),
+            (tmp_path / "said").open("w") as said,
+            subprocess.Popen(words, cwd=ROOT, env=environment, stderr=said) as process,
+        ):
+            try:
+                wait_for("survey/north")
+                assert asked_for("survey/north").is_completed()
+                server.kill()
+                server.wait()
+                end = time.monotonic() + PATIENCE_S
+                while "does not answer" not in (tmp_path / "said").read_text() and time.monotonic() < end:
+                    time.sleep(0.2)
+                with server_process(home, port):
+                    assert asked_for("survey/north").is_completed()
+                    process.terminate()
+                    assert process.wait(PATIENCE_S) == 0
+                    with client() as asked:
+                        assert asked.read_deployment_by_name("survey/north").paused
+            finally:
+                process.kill()
+    lines = (tmp_path / "said").read_text().splitlines()
+    assert lines[-1] == "stopped: nothing is due any more; the same command serves again", lines
+    assert len(settings_of(tmp_path / "archive")) == 2
