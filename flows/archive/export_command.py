@@ -37,9 +37,9 @@ from storage.archive.whole_files import remove_leftovers
 from storage.arrays.cubes import open_raw_cube
 from storage.arrays.georeference import load_geobox
 from storage.arrays.ground_maps import load_bands, open_image
-from storage.arrays.layout import SHARD_ROWS
 from storage.export.image_files import EnviFile, has_map_info, write_cog, write_envi
 from storage.export.map_files import STYLE
+from storage.export.recorded_files import write_recorded_files
 from storage.export.stac_items import (
     COG,
     ZARR,
@@ -91,7 +91,8 @@ def export(
     out
         Folder to export into, beside the runs of the same archive that lie there.
     envi
-        Also write the coarse mosaic and the raw sweeps as ENVI files.
+        Also write the coarse mosaic as ENVI, and the raw sweeps as ENVI with a pointing table each: `survey --sweeps`
+        reads these.
     """
     content = run_export(archive, run, out, envi, stderr, choose_products(products))
     if as_json:
@@ -123,7 +124,7 @@ def run_export(
     try:
         with _alone_in(out):
             check_owner(out, about.id)
-            for folder in (out, export.folder, export.folder / "envi"):
+            for folder in (out, export.folder, export.folder / "envi", export.folder / "sweeps"):
                 remove_leftovers(folder)
             _export_images(export, layers, console)
             _export_tables(export, choice, console)
@@ -191,11 +192,13 @@ def _export_cubes(export: Export, console: Console) -> None:
     file = EnviFile((rows, columns, bands), "<f4", "bil", wave, width, text, float("nan"), geobox)
     _write_cube(export, "mosaic", file, mosaic.rows(), console)
     for path in run.sweeps():
-        cube = open_raw_cube(path)
-        text = f"raw numbers of sweep {cube.sweep.name} of {run.id} (line, sample, band), not calibrated"
-        file = EnviFile(cube.shape, "<u2", "bil", cube.wavelength_nm, cube.fwhm_nm, text)
-        blocks = ((first, cube.read(first, first + SHARD_ROWS)) for first in range(0, cube.shape[0], SHARD_ROWS))
-        _write_cube(export, path.stem, file, blocks, console)
+        name = path.stem
+        with console.status(f"writing {name}.bil"):
+            header = write_recorded_files(open_raw_cube(path), export.folder / "sweeps")
+        data, table = header.with_suffix(".bil"), header.with_name(f"{name}.pointing.csv")
+        export.add(f"{name}_envi", data, f"Raw numbers of sweep {name}", ENVI_NUMBERS, ["data"], **export.nowhere)
+        export.add(f"{name}_envi_header", header, f"{name} as ENVI, header", "text/plain", ["metadata"])
+        export.add(f"{name}_pointing", table, f"Where the lines of {name} looked", CSV, ["metadata"])
 
 
 def _write_cube(export: Export, name: str, file: EnviFile, blocks: Rows, console: Console) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import shlex
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.archive.staging import check_name, file_hash
 from storage.readers.cube_sources import CubeSource
+from storage.readers.pointing_tables import find_pointing
 from storage.readers.scan_files import Report, SourceFile, open_cube_source, with_wavelengths, write_ingested_cube
 from storage.remote.opening import open_archive
 
@@ -53,6 +55,7 @@ def ingest(
     """
     nm = parse_numbers(wavelengths, "--wavelengths")
     record = run_ingest(source, archive, stderr, name=name, dark=dark, white=white, wavelengths=nm)
+    stderr.print(escape(f"next: {_next(record, source)}"), soft_wrap=True)
     if as_json:
         print_json(record)
     return DONE
@@ -111,6 +114,19 @@ def hash_files(source: CubeSource, report: Report = lambda done: None) -> list[S
         files.append(SourceFile(name, path.stat().st_size, file_hash(path)))
         report((number + 1) / len(source.files))
     return files
+
+
+def _next(record: Mapping[str, Any], source: str) -> str:
+    """The command that surveys what was stored: a camera's own numbers as a recording, anything else as a scene."""
+    words = ["spectralzoom", "survey"]
+    if record["source_dtype"].lstrip("<>=|") in ("u1", "u2", "i2"):
+        path = Path(source)
+        table = find_pointing(path.parent, path.name.removesuffix(path.suffix))
+        words += ["--source", "recorded", "--sweeps", record["path"]]
+        words += [] if table is None else ["--pointing", str(table)]
+    else:
+        words += ["--scene", source]
+    return shlex.join([*words, "--weights", "WEIGHTS.safetensors"])
 
 
 def _stamps(source: CubeSource) -> list[tuple[int, int]]:

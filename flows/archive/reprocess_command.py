@@ -22,6 +22,7 @@ from flows.archive.stale_runs import (
     asked_again,
     check_stage,
     file_key,
+    from_raw_cubes,
     is_called,
     is_current,
     is_whole,
@@ -234,7 +235,8 @@ def _again(
         if prior == settings.prior and is_current(catalogue, run, settings):
             same = {"state": "skipped", "message": "is as it would become"}
             return row | same | _scores(run.receipt, "after")
-        settings = replace(settings, prior=prior)
+        settings = from_raw_cubes(catalogue, run, replace(settings, prior=prior))
+        settings = replace(settings, scheduler=request.crew.scheduler, workers=request.crew.workers)
         if request.dry_run:
             return row | {"state": "would run"}
         folder = survey(settings, console)

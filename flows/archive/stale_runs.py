@@ -10,21 +10,24 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from flows.publish.receipt import is_pending
-from flows.settings.load import of_this_version, parse_settings
-from flows.settings.survey_settings import BUILT_IN_SCENES, OF_THE_MACHINE, Settings
+from flows.settings.load import load_settings, of_this_version, parse_settings
+from flows.settings.survey_settings import BUILT_IN_SCENES, OF_THE_MACHINE, RECORDED, Settings
 from flows.tasks.open_survey import STAGES, versions
 from flows.tasks.survey_model import weights_path
 from models.weights.files import content_key
-from pipeline.errors import SettingsError, WeightsError
+from pipeline.errors import PipelineError, SettingsError, WeightsError
 from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, USUAL_DAY, USUAL_HOUR, law_of_key
 from storage.archive.keys import canonical_json
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run, Store
+from storage.readers.raster_files import split_variable
+from storage.readers.recordings import RAW_PRODUCTS, find_raw_cubes
 
+OF_THE_SURVEY = ("labels", "weights", "memory", "accuracy", "prior")  # settings that its raw cubes do not bring
 # what the light of a field depends on; surveys that agree in these are generations of one
 OF_THE_LIGHT = (
     *("scene", "bands", "wavelengths", "source", "seed", "effects", "size"),
-    *("day", "hour", "camera", "pointing_px", "pose", "visit"),
+    *("day", "hour", "camera", "pointing_px", "pose", "visit", "sweeps", "pointing", "dark", "white"),
 )
 
 
@@ -46,7 +49,7 @@ def newest_runs(catalogue: Catalogue) -> list[Generation]:
     found: dict[str, Generation] = {}
     for run in catalogue.runs:  # oldest first
         name = called(run)
-        field = canonical_json([name, _light_of(run) if run.settings else run.uri])
+        field = canonical_json([name, _light_of(_recorded_run(catalogue, run)) if run.settings else run.uri])
         found.pop(field, None)
         found[field] = Generation(name, run)
     return list(found.values())
@@ -57,7 +60,8 @@ def renewals(catalogue: Catalogue) -> dict[str, str]:
     looks: dict[str, list[str]] = {}
     for run in catalogue.runs:
         if run.settings:
-            looks.setdefault(canonical_json([called(run), _light_of(run)]), []).append(run.folder.name)
+            light = _light_of(_recorded_run(catalogue, run))
+            looks.setdefault(canonical_json([called(run), light]), []).append(run.folder.name)
     return {earlier: names[-1] for names in looks.values() for earlier in names[:-1]}
 
 
@@ -66,6 +70,49 @@ def renewed_prior(prior: str, renewed: Mapping[str, str]) -> str:
     while prior in renewed:
         prior = renewed[prior]
     return prior
+
+
+def _recorded_run(catalogue: Catalogue, run: Run) -> Run:
+    """The run of this archive whose raw cubes a run was surveyed from as a recording; itself for all others."""
+    by_name = {one.folder.name: one for one in catalogue.runs}
+    while run.settings.get("source") == RECORDED:
+        place, _, name = str(run.settings.get("sweeps")).rpartition("/runs/")
+        if not place or name == run.folder.name or name not in by_name:
+            return run
+        run = by_name[name]
+    return run
+
+
+def from_raw_cubes(catalogue: Catalogue, run: Run, settings: Settings) -> Settings:
+    """Return the settings of a survey of a run's own raw cubes as a recording, where its light is not found otherwise.
+
+    That is so where another version of the captures is wanted than a rig or a recording left, or where the files of a
+    recording or of a simulated scene are gone. Else, and where the raw cubes are gone too, the settings stay. Raises
+    SettingsError, BudgetError: as `asked_again`.
+    """
+    raw = {uri for name, uri in run.products.items() if name in RAW_PRODUCTS}
+    stores = [catalogue.stores.get(uri) for uri in raw]
+    if not stores or any(one is None or one.problem is not None or one.cleared for one in stores):
+        return settings
+    is_old = settings.source in ("rig", RECORDED) and bool(stale_stores(catalogue, raw, None))
+    if not is_old and _is_there(settings):
+        return settings
+    asked = {"sweeps": f"{settings.out}/{run.uri}", "out": settings.out, "engine": settings.engine}
+    kept = {name: getattr(settings, name) for name in OF_THE_SURVEY}
+    return load_settings(None, {name: value for name, value in {**asked, **kept}.items() if value is not None})
+
+
+def _is_there(settings: Settings) -> bool:
+    """Whether what a recording or a scene comes from still lies where it lay; a rig is taken to be there."""
+    if settings.source == RECORDED:
+        try:
+            find_raw_cubes(str(settings.sweeps))
+        except PipelineError:
+            return False
+        return True
+    if settings.source != "sim" or settings.scene in BUILT_IN_SCENES:
+        return True
+    return split_variable(settings.scene)[0].exists()
 
 
 def _light_of(run: Run) -> dict[str, Any]:

@@ -117,6 +117,7 @@ class Receipt(TypedDict):
     field: NotRequired[dict[str, Any]]  # its size, field of view, ground pixel and range, hectares an hour
     plan: NotRequired[dict[str, Any]]  # how the fine pass was laid out, and what the other orientation would cost
     scans: NotRequired[dict[str, dict[str, Any]]]  # plain ones by the weights' record, where there is one
+    recording: NotRequired[dict[str, Any]]  # only of recorded sweeps: lines read and recorded, seconds of a camera
     look: NotRequired[dict[str, Any]]  # which part of a remembered field was looked at, and what was expected of it
     kept: NotRequired[dict[str, Any]]  # only of a plain scan that is kept and read in part: seats, costs of all, asked
     memory: NotRequired[dict[str, Any]]  # what became of what was remembered, where the map goes on from an earlier run
@@ -151,6 +152,7 @@ FINDINGS = (
     "field",
     "plan",
     "scans",
+    "recording",
     "look",
     "kept",
     "memory",

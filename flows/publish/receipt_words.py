@@ -98,6 +98,8 @@ def sentences(found: Mapping[str, Any]) -> list[str]:
             )
         if plan["lines"]:
             words.append(_sentence(plan["orientation"]["sentence"]))
+    if recording := found.get("recording"):
+        words.append(_recording_words(recording))
     if look := found.get("look"):
         words.append(_look_words(look))
     if kept := found.get("kept"):
@@ -148,6 +150,18 @@ def _field_words(field: Mapping[str, Any]) -> str:
     return (
         f"{view}{away}: {area_words(field['hectares'])} at {format_metres(field['ground_pixel_m'])} a pixel, "
         f"{three_digits(pace)} ha an hour of the camera ({three_digits(SECONDS_PER_HOUR / pace)} s a hectare)."
+    )
+
+
+def _recording_words(recording: Mapping[str, Any]) -> str:
+    """What was read of a recording, and what zooming would have saved a camera."""
+    read, taken = recording["lines_read"], recording["lines_recorded"]
+    done_s, full_s = recording["passes_s"], recording["full_scan_s"]
+    own = "the recorded scan" if recording["full_scan_is"] == "recorded" else "a scan of every line"
+    saved = f", {format_percent(1 - done_s / full_s)} less" if 0 < done_s < full_s else ""
+    return (
+        f"Of {format_count(taken)} recorded lines {format_count(read)} were read. A camera would take "
+        f"{format_seconds(done_s)} for these passes, by the cost model, and {format_seconds(full_s)} for {own}{saved}."
     )
 
 

@@ -37,6 +37,7 @@ from flows.tasks.stages.capture import captured
 from flows.tasks.stages.effects import load_manifest
 from flows.tasks.stages.on_ground import STORE
 from flows.tasks.stages.placement import SEATS_AT_ONCE, line_facts, load_registration, seen_shares
+from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.errors import IncompleteStoreError
 from pipeline.planning.coverage import on_scene
 from pipeline.planning.fine_pass import FinePlan
@@ -328,6 +329,8 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
             "spared_score": plan.wanted_worth - plan.worth,
         }
     found: dict[str, Any] = {"field": field_figures(run, plan), "plan": told}
+    if run.recorded is not None:
+        found["recording"] = _recording(run, run.recorded, plan)
     if run.budget is not None:
         found["kept"] = run.budget.told(plan.seats) | {"stored_bytes": _stored_detail(run, products)}
     if (memory := told_of_memory(products.of("draw_map").path)) is not None:
@@ -354,6 +357,20 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     if troubled:
         found["lines"] = troubled
     return found
+
+
+def _recording(run: SurveyRun, recorded: RecordedPasses, plan: FinePlan) -> dict[str, Any]:
+    """What was read of a recording, and what its passes would have taken of a camera beside the scan of every line."""
+    done, full, cost = [*run.plan.coarse, *plan.sweeps], run.plan.full, run.settings.cost
+    whole = recorded.served(full) is not None
+    return {
+        "sweeps": str(run.settings.sweeps),
+        "lines_read": recorded.lines_served(done),
+        "lines_recorded": recorded.source.lines_recorded,
+        "passes_s": run.plan.coarse_s + plan.seconds,
+        "full_scan_s": cost.seconds(full, run.camera),
+        "full_scan_is": "recorded" if whole else "planned",
+    }
 
 
 def _stored_detail(run: SurveyRun, products: Products) -> int:

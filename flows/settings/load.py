@@ -15,16 +15,19 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 from pydantic import Field, PlainValidator, TypeAdapter, ValidationError
 
+from flows.settings.recorded_defaults import usual_of_recording
 from flows.settings.survey_settings import (
     BUILT_IN_SCENES,
     OF_A_CAMERA,
     OF_A_PART,
     OF_A_VIEW,
     OF_CHOOSING,
+    OF_RECORDINGS,
     OF_TWO_PASSES,
     PATHS,
     PLAIN,
     RASTER,
+    RECORDED,
     REPLACED,
     RIG,
     RIG_FIELD,
@@ -161,8 +164,14 @@ def load_settings(
             origin[key] = "flag"
     if table.get("source") == SURVEY["source"].item.default:  # as if it were not said
         del table["source"]
-    asked = {**_usual_policy(table), **(usual or {}), **table}
-    for wrong in (*_camera_of_a_map(asked, origin), *_contradictions(_given(table), origin)):
+    given = _given(table)
+    recorded = of_this_version(usual_of_recording(table)) if "sweeps" in given else {}
+    for name in TABLES:
+        inner = table.get(name)
+        if isinstance(inner, Mapping):
+            table[name] = {**recorded.pop(name, {}), **inner}
+    asked = {**_usual_policy(table), **(usual or {}), **recorded, **table}
+    for wrong in (*_camera_of_a_map(asked, origin), *_contradictions(given, origin)):
         raise SettingsError(wrong)
     return parse_settings(asked, origin)
 
@@ -301,7 +310,7 @@ def _contradictions(given: set[str], origin: Mapping[str, str]) -> Iterator[str]
             f"{plain[0]} asks for one plain scan of the field, and {passes[0]} is for a survey that looks twice; leave "
             "one of them out"
         )
-    by_hand = [place_of(key, origin.get(key)) for key in ("scan_step", "scan_exposure_ms") if key in given]
+    by_hand = [place_of(key, origin.get(key)) for key in ("scan_step", "scan_exposure_ms", "scan") if key in given]
     if by_hand and given & {"seconds", "bytes_raw", "goal"}:
         yield f"{plain[0]} leaves the choice of the scan to the weights' record, {by_hand[0]} makes it: leave one out"
     if "scan_exposure_ms" in given and "scan_step" not in given:
@@ -318,6 +327,7 @@ def _wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]:
     yield from _policy_wrongs(settings)
     yield from _scene_wrongs(settings, origin)
     yield from _rig_wrongs(settings)
+    yield from _recorded_wrongs(settings, origin)
     yield from _look_wrongs(settings, origin)
     yield from _sparing_wrongs(settings, origin)
 
@@ -346,7 +356,7 @@ def _scene_wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str
     if bands is not None and wavelengths is not None and len(bands) != len(wavelengths):
         place = place_of("wavelengths", origin.get("wavelengths"))
         yield f"{place} must have one value for each of the {len(bands)} bands, got {len(wavelengths)}"
-    if scene == RIG_FIELD and settings.source != RIG:
+    if scene == RIG_FIELD and settings.source not in (RIG, RECORDED):
         yield f"scene {RIG_FIELD!r} is what stands before a rig: give --source rig, or a file"
     if settings.is_map and scene in BUILT_IN_SCENES:
         yield f"source 'raster' takes the pixels of a file, and {scene} is drawn: give --source sim, or a file"
@@ -381,6 +391,32 @@ def _rig_wrongs(settings: Settings) -> Iterator[str]:
     pairs = settings.cost.vector_pairs
     if settings.source == "rig" and not 2 <= pairs <= MOST_PAIRS:
         yield f"cost.vector_pairs = {pairs}: the mirror's vector memory takes 2 to {MOST_PAIRS} pairs; give what it has"
+
+
+def _recorded_wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]:
+    """What a recording needs, and what nothing else has."""
+    if settings.source != RECORDED:
+        for name in OF_RECORDINGS:
+            if getattr(settings, name) is not None:
+                yield (
+                    f"{place_of(name, origin.get(name))} is for recorded sweeps, and source = {settings.source!r}; "
+                    "give --source recorded with --sweeps, or leave it out"
+                )
+        return
+    if settings.sweeps is None:
+        yield "source = 'recorded' reads sweeps that were taken before; give --sweeps, where they lie"
+    if settings.scene != RIG_FIELD:
+        yield (
+            f"{place_of('scene', origin.get('scene'))} = {settings.scene!r}, and the field of recorded sweeps is what "
+            "they show; leave it out, and give --labels FILE where there are some"
+        )
+    if settings.bands is not None:
+        yield f"{place_of('bands', origin.get('bands'))} is for scenes: all bands of a recording are read; leave it out"
+    if settings.look == LOOK_PART:
+        yield (
+            f"{place_of('look', origin.get('look'))} = 'part' chooses lines and exposures for a camera that looks "
+            "again, and a recording has those that were taken; leave it out"
+        )
 
 
 def _look_wrongs(settings: Settings, origin: Mapping[str, str]) -> Iterator[str]:

@@ -50,15 +50,20 @@ from storage.parallel.crew import Crew
 
 BUILT_IN_SCENES = FARM_NAMES
 USUAL_SIZE = f"{FARM_SHAPE[1]}x{FARM_SHAPE[0]}"
-RIG_FIELD = "field"  # the scene of which only the rig knows more than size and bands
+RIG_FIELD = "field"  # the scene of which only the rig, or a recording, knows more than size and bands
 OF_THE_MACHINE = ("scheduler", "workers", "device")  # what of that day need not be there today
 OF_A_PART = ("refresh", "doubt")  # of what a field that is remembered is looked at by
-PLAIN = ("seconds", "bytes_raw", "goal", "scan_step")  # settings of which one asks for a plain scan
+OF_RECORDINGS = ("sweeps", "pointing", "dark", "white", "scan")
+PLAIN = ("seconds", "bytes_raw", "goal", "scan_step", "scan")  # settings of which one asks for a plain scan
 SPARING = ("compute", "bytes_kept", "least_gain")  # by which a plain scan is kept and read in detail in part
 OF_TWO_PASSES = ("budget", "coarse_exposure_ms", "policy", "threshold", "mask", "vgg")  # and of which none may
 OF_CHOOSING = ("policy", "mask", "vgg")  # but for these where a part of the scan is chosen
-PATHS = ("scene", "labels", "out", "mask", "vgg", "weights", "zones.area", "zones.no_go", "zones.plots")
+PATHS = (
+    *("scene", "labels", "sweeps", "pointing", "dark", "white", "out", "mask", "vgg", "weights"),
+    *("zones.area", "zones.no_go", "zones.plots"),
+)
 AUTO, SIM, RIG, RASTER = "auto", "sim", "rig", "raster"  # where pixels come from
+RECORDED = "recorded"  # likewise, and the uniform scan that takes a recording's own lines
 # of a camera alone: tables, and settings beside them
 OF_A_CAMERA = (
     *("camera", "optics", "mirror", "detector", "air", "sky", "cost", "rig", *PLAIN, "scan_exposure_ms"),
@@ -167,11 +172,35 @@ class Settings:
     )
     bands: Bands | None = stated(None, "Bands of the file (or of the farm's 270) to use, from 0: 0,1", example=(0, 1))
     wavelengths: Wavelengths | None = stated(None, "Their centre wavelengths: 660,800", "nm", example=(660.0, 800.0))
-    source: Literal["auto", "sim", "rig", "raster"] = stated(
+    source: Literal["auto", "sim", "rig", "raster", "recorded"] = stated(
         "auto",
         "Where pixels come from: sim (the simulated rig looks at the scene), rig (the one that the table [rig] names), "
-        "raster (the file is a map already: its pixels are taken as they are); auto is raster for files, sim for "
-        "`farm`, rig for the scene `field`",
+        "raster (the file is a map already: its pixels are taken as they are), recorded (the sweeps of --sweeps); auto "
+        "is recorded where there are sweeps, raster for files, sim for `farm`, rig for the scene `field`",
+    )
+    sweeps: str | None = stated(
+        None,
+        "Recorded sweeps: an archive, ARCHIVE/runs/NAME or s3://bucket/prefix, a folder of ENVI cubes or of a Headwall"
+        " camera, one ENVI or Zarr cube",
+        example="sweeps",
+    )
+    pointing: str | None = stated(
+        None,
+        "Where their lines looked: a table with a row a line (CSV, Parquet), a TOML file of a vector that the mirror "
+        "played, or a folder with one for each cube; NAME.pointing.csv beside a cube NAME by default",
+        example="pointing.csv",
+    )
+    dark: str | None = stated(
+        None, "Their dark frame, ENVI or .npy; NAME.dark.hdr or dark*.hdr beside them by default", example="dark.hdr"
+    )
+    white: str | None = stated(
+        None, "Their white frame, likewise; NAME.white.hdr or white*.hdr by default", example="white.hdr"
+    )
+    scan: Literal["recorded"] | None = stated(
+        None,
+        "One uniform scan of a recording's own lines, each as it was taken; of a recording the default where no budget "
+        "and no other scan is asked for",
+        example="recorded",
     )
     out: str = stated("archive", "Archive: a folder, or s3://bucket/prefix")
     budget: Budget = stated(
@@ -231,7 +260,9 @@ class Settings:
     mask: str | None = stated(None, "Image of where to look twice, for the policy mask", example="mask.png")
     vgg: str | None = stated(None, "Weights of VGG19, for the policies vgg-static and vgg-trained", example="vgg19.pth")
     weights: str | None = stated(
-        None, "Model weights (.safetensors); those for `farm` are built in", example="weights.safetensors"
+        None,
+        "Model weights (.safetensors); those for `farm` are built in: `farm` names them for another source's field",
+        example="weights.safetensors",
     )
     unknown: Unknown = stated(
         "auto",
@@ -321,7 +352,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         if self.source == AUTO:
-            object.__setattr__(self, "source", source_of(self.scene))
+            object.__setattr__(self, "source", source_of(self.scene) if self.sweeps is None else RECORDED)
 
     @property
     def plain(self) -> bool:

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.settings.survey_settings import Settings
+from flows.settings.survey_settings import RECORDED, Settings
 from flows.settings.values import LOOK_WHOLE, parse_look_runs
+from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.errors import SettingsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, Sweep
@@ -42,17 +43,19 @@ class CapturePlan:
         return CapturePlan("x", [], [], 0.0, 0.0, 0.0, 0.0, 0.0, plain=True)
 
 
-def plan_capture(settings: Settings, grid: SceneGrid, shown: NDArray[np.bool_] | None = None) -> CapturePlan:
+def plan_capture(
+    settings: Settings, grid: SceneGrid, shown: NDArray[np.bool_] | None = None, recorded: RecordedPasses | None = None
+) -> CapturePlan:
     """Lay out coarse and full sweeps; where the mirror may look beside the plan, with overlaps and margins.
 
     Either pass overlaps by what its own registration needs. Its map lies as the sweep that is held does, which another
     may lie beside by twice the mirror's error: so much earlier sweeps begin, and later they end. Lines show the
-    ``shown`` (seat,) seats, all of them where it is None. Raises SettingsError: the mirror may be so far off that
-    overlaps take whole lines; BudgetError: the budget does not pay for the coarse pass; PoseError: the field is beyond
-    the mirror's range.
+    ``shown`` (seat,) seats, all of them where it is None. Of a recording they are ``recorded`` ones. Raises
+    SettingsError: the mirror may be so far off that overlaps take whole lines; BudgetError: the budget does not pay for
+    the coarse pass; PoseError: the field is beyond the mirror's range; NotRecordedError: a line was never taken.
     """
     camera, cost = settings.camera, settings.cost
-    along, coarse, full = lay_out_sweeps(settings, grid, shown)
+    along, coarse, full = lay_out_sweeps(settings, grid, shown, recorded)
     full_s, coarse_s = cost.seconds(full, camera), cost.seconds(coarse, camera)
     fine_s = 0.0 if settings.plain else check_budget(settings.budget, coarse_s, full_s)
     overlap = _overlap(settings, settings.scan_step or grid.factor)
@@ -60,21 +63,23 @@ def plan_capture(settings: Settings, grid: SceneGrid, shown: NDArray[np.bool_] |
 
 
 def lay_out_sweeps(
-    settings: Settings, grid: SceneGrid, shown: NDArray[np.bool_] | None = None
+    settings: Settings, grid: SceneGrid, shown: NDArray[np.bool_] | None = None, recorded: RecordedPasses | None = None
 ) -> tuple[Axis, list[Sweep], list[Sweep]]:
     """Give the axis that lines lie along, the coarse sweeps or those of a plain scan, and those of the full scan.
 
     Lines that show none of the ``shown`` (seat,) seats are left out, but for a mirror that may look beside the plan:
-    its sweeps are tied together by what they share. Of the looks those lines are left that the settings name. Raises
-    SettingsError: the mirror may be so far off that overlaps take whole lines, or lines are named that the scan does
-    not have; PoseError: the field is beyond the mirror's range.
+    its sweeps are tied together by what they share. Of the looks those lines are left that the settings name. Of a
+    recording they are ``recorded`` lines. Raises SettingsError: the mirror may be so far off that overlaps take whole
+    lines, or lines are named that the scan does not have; PoseError: the field is beyond the mirror's range;
+    NotRecordedError: a line of a recording was never taken.
     """
     camera, cost, apart = settings.camera, settings.cost, 2 * settings.pointing_px
 
     def cut(sweeps: list[Sweep]) -> list[Sweep]:
         return sweeps if shown is None or apart else sweeps_over(sweeps, grid, camera, shown)
 
-    along, full, _ = cheapest_full(grid, camera, cost, overlap_px=_overlap(settings, 1), cut=cut)
+    axes: tuple[Axis, ...] = ("x", "y") if recorded is None else recorded.axes
+    along, full, _ = cheapest_full(grid, camera, cost, overlap_px=_overlap(settings, 1), cut=cut, axes=axes)
     if settings.scan_step is not None:
         step, overlap = settings.scan_step, _overlap(settings, settings.scan_step)
         exposure_ms = settings.scan_exposure_ms
@@ -85,7 +90,11 @@ def lay_out_sweeps(
     looks = cut(looks)
     if settings.look != LOOK_WHOLE:
         looks = sweeps_of_runs(looks, parse_look_runs(settings.look))
-    return along, with_margin(looks, camera, apart), with_margin(full, camera, apart)
+    looks, full = with_margin(looks, camera, apart), with_margin(full, camera, apart)
+    if recorded is None:
+        return along, looks, full
+    own = settings.scan == RECORDED
+    return along, recorded.uniform_scan() if own else recorded.first_pass(looks), recorded.full_scan(full)
 
 
 def _overlap(settings: Settings, step: int) -> float:

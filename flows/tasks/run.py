@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.settings.survey_settings import Settings
+from flows.settings.survey_settings import RECORDED, Settings
 from flows.settings.values import LOOK_PART
 from flows.tasks.beyond_training import beyond_training
 from flows.tasks.capture_plan import CapturePlan, plan_capture
 from flows.tasks.look_choice import LookChoice, choose_look
 from flows.tasks.memory import AUTO, NONE, Prior, find_prior
 from flows.tasks.reading_costs import ReadingCosts
+from flows.tasks.recorded.field import OpenedRecording, open_recorded
 from flows.tasks.scan_choice import ScanChoice, choose_plain_scan
 from flows.tasks.scene import (
     FieldSource,
@@ -41,6 +42,7 @@ from models.network.machine import PROCESSOR, choose_device
 from models.policies.vgg_file import VggFile
 from models.weights.companion_files import FamiliarFile, ReaderFile
 from models.weights.files import Description, Weights
+from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.errors import NoScanPaidFor, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
@@ -133,6 +135,7 @@ class SurveyRun(CaptureRun):
     plan: CapturePlan
     scans: ScanChoice
     zones: SurveyZones  # what the survey keeps to, and plots
+    recorded: RecordedPasses | None = None  # the recording whose lines the passes take
     raster: RasterPixels | None = None  # the pixels of a scene that is a map already: nothing is captured of it
     budget: SeatBudget | None = None  # of seats of a plain scan, where a part of them alone is kept and read
     look: LookChoice | None = None  # the part of a remembered field that is looked at, where one was chosen
@@ -204,22 +207,26 @@ def open_run(settings: Settings, *, planning: bool = False, archive: Archive | N
     """
     settings = for_rig(settings)
     check_scene_there(settings)
+    recorded = open_recorded(settings) if settings.source == RECORDED else None
+    settings = settings if recorded is None else recorded.settings
     settings = replace(settings, device=choose_device(settings.device))
     offered = weights_offered(settings)
     for better in offered[:-1]:
         with suppress(NoScanPaidFor):
-            return _run_by(better, settings, planning=planning, archive=archive)
-    return _run_by(offered[-1], settings, planning=planning, archive=archive)
+            return _run_by(better, settings, recorded, planning=planning, archive=archive)
+    return _run_by(offered[-1], settings, recorded, planning=planning, archive=archive)
 
 
-def _run_by(path: Path, settings: Settings, *, planning: bool, archive: Archive | None) -> SurveyRun:
+def _run_by(
+    path: Path, settings: Settings, recorded: OpenedRecording | None, *, planning: bool, archive: Archive | None
+) -> SurveyRun:
     """Open what a survey needs that is read with the weights of a file, as `open_run`."""
     model = SurveyModel.open(settings, path, planning=planning)
     described = model.described
     refused = farm_refusal(settings)
     if refused is not None and not planning:
         raise SettingsError(refused)
-    pixels, scene, notes, label_notes = _scene_for(model, settings, planning=planning)
+    pixels, scene, notes, label_notes = _scene_for(model, settings, recorded, planning=planning)
     grid = SceneGrid(*scene.shape, described.config.patch, described.config.factor)
     zones = open_zones(settings, place_of_field(settings, scene), grid)
     outside = beyond_training(settings, scene, described, model.trained_on, path)
@@ -233,16 +240,17 @@ def _run_by(path: Path, settings: Settings, *, planning: bool, archive: Archive 
     prior = None if found is None else found[0]
     settings, look, look_notes = choose_look(settings, prior, described, path, model.reader, grid, zones.shown)
     plan, scans, raster = CapturePlan.of_map(), ScanChoice(), None
+    passes, bands = None if recorded is None else recorded.passes, len(scene.wavelength_nm)
     if pixels is None:
-        settings, scans = choose_plain_scan(settings, described, path, grid, len(scene.wavelength_nm), zones.shown)
-        plan = plan_capture(settings, grid, zones.shown)
+        settings, scans = choose_plain_scan(settings, described, path, grid, bands, zones.shown, passes)
+        plan = plan_capture(settings, grid, zones.shown, passes)
     else:
-        raster = RasterPixels(pixels.read, pixels.missing, len(scene.wavelength_nm), grid)
+        raster = RasterPixels(pixels.read, pixels.missing, bands, grid)
     channels = 3 if model.vgg is None else model.vgg.channels
-    costs = ReadingCosts(described.config, grid, len(scene.wavelength_nm), channels)
+    costs = ReadingCosts(described.config, grid, bands, channels)
     budget = SeatBudget.asked(settings, costs, None if zones.shares is None else zones.shares > 0)
     simulated, planned = make_source(scene, settings), (*plan.coarse, *plan.full)
-    source = field_source(scene, settings, simulated, planned)
+    source = field_source(scene, settings, simulated, planned) if recorded is None else recorded.field
     if raster is None:
         check_memory(settings, simulated, grid, plan)
     else:
@@ -264,6 +272,7 @@ def _run_by(path: Path, settings: Settings, *, planning: bool, archive: Archive 
         weights_key=model.key,
         grid=grid,
         plan=plan,
+        recorded=passes,
         scans=scans,
         zones=zones,
         raster=raster,
@@ -279,14 +288,16 @@ def _run_by(path: Path, settings: Settings, *, planning: bool, archive: Archive 
 
 
 def _scene_for(
-    model: SurveyModel, settings: Settings, *, planning: bool
+    model: SurveyModel, settings: Settings, recorded: OpenedRecording | None, *, planning: bool
 ) -> tuple[OpenScene | None, RasterScene, tuple[str, ...], tuple[str, ...]]:
     """Open a scene that the weights can read, drawn unless for ``planning``; what to say of it and of its labels.
 
     The first value is the scene's file where its pixels are taken as they are.
     """
     pixels = None
-    if settings.is_map:
+    if recorded is not None:
+        scene, notes = recorded.scene()
+    elif settings.is_map:
         pixels, scene, notes = open_map(settings, model.described.class_names)
     else:
         scene, notes = open_scene(settings, model.described.class_names)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import nullcontext, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,10 @@ from flows.settings.survey_settings import Settings
 from flows.settings.values import LOOK_WHOLE, parse_goals
 from flows.tasks.capture_plan import lay_out_sweeps
 from models.weights.files import Description
-from pipeline.errors import BudgetError, SettingsError, WeightsError
+from pipeline.capture.recorded_passes import RecordedPasses
+from pipeline.errors import BudgetError, NotRecordedError, SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import Sweep
 from pipeline.planning.plain_scans import (
     MIOU,
     PlainScan,
@@ -61,10 +64,12 @@ def choose_plain_scan(
     grid: SceneGrid,
     bands: int,
     shown: NDArray[np.bool_] | None = None,
+    recorded: RecordedPasses | None = None,
 ) -> tuple[Settings, ScanChoice]:
     """Settings with step and exposure of the plain scan that is asked for, and the choice that there was.
 
-    Lines show the ``shown`` (seat,) seats, all of them where it is None. What was chosen once stands in the settings,
+    Lines show the ``shown`` (seat,) seats, all of them where it is None. Of a ``recorded`` field the scans are those
+    that its lines serve, as they were exposed. What was chosen once stands in the settings,
     and is kept when an archive is read again with other weights. Raises WeightsError: the choice is left to weights
     without a record of scans; BudgetError: no scan costs as little, or reaches the goals; SettingsError: a goal of a
     class that the weights lack, or a camera that exposes shorter than the record knows; PoseError: the field is beyond
@@ -86,8 +91,9 @@ def choose_plain_scan(
             known = ", ".join(one for one in record.scores if one != MIOU)
             raise SettingsError(f"--goal {name}={100 * goals[name]:g}: the weights tell apart {known}")
     camera, cost, whole = settings.camera, settings.cost, replace(settings, look=LOOK_WHOLE)
-    sweeps = {step: lay_out_sweeps(replace(whole, scan_step=step), grid, shown)[1] for step in record.steps}
-    scans = plain_scans(record, sweeps, camera, cost, bands, seconds=settings.seconds)
+    sweeps = _scans_of_steps(record, whole, grid, shown, recorded)
+    taken_ms = None if recorded is None else [camera.exposure_ms]
+    scans = plain_scans(record, sweeps, camera, cost, bands, seconds=settings.seconds, exposures_ms=taken_ms)
     chosen, exposure_ms = None, settings.scan_exposure_ms or camera.exposure_ms
     if settings != whole:  # of a part of a field the record says nothing
         chosen = None
@@ -102,6 +108,22 @@ def choose_plain_scan(
         chosen = choose_scan(scans, ScanLimits(settings.seconds, settings.bytes_raw, goals))
         settings = replace(settings, scan_step=chosen.step, scan_exposure_ms=chosen.exposure_ms)
     return settings, ScanChoice(tuple(scans), chosen)
+
+
+def _scans_of_steps(
+    record: ScanRecord,
+    settings: Settings,
+    grid: SceneGrid,
+    shown: NDArray[np.bool_] | None,
+    recorded: RecordedPasses | None,
+) -> dict[int, list[Sweep]]:
+    """Sweeps of the uniform scans of every step of a record; of a recording those that its lines serve."""
+    found = {}
+    for step in record.steps:
+        with nullcontext() if recorded is None else suppress(NotRecordedError):
+            asked = replace(settings, scan_step=step, scan=None)
+            found[step] = lay_out_sweeps(asked, grid, shown, recorded)[1]
+    return found
 
 
 def as_told(scan: PlainScan | None) -> dict[str, Any] | None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.settings.survey_settings import BUILT_IN_SCENES, RASTER, RIG, RIG_FIELD, Settings
+from flows.settings.survey_settings import BUILT_IN_SCENES, RASTER, RECORDED, RIG, RIG_FIELD, Settings
 from flows.training.data import scene_of_file, unpack_mask
 from models.weights.files import Description
 from pipeline.errors import SceneError, SettingsError
@@ -334,7 +334,12 @@ def field_source(
 
 
 def for_rig(settings: Settings) -> Settings:
-    """Give the settings of a survey through a rig: this look at the field has a name, and no control is simulated."""
+    """Give the settings of a survey through a rig: this look at the field has a name, and no control is simulated.
+
+    Of a recording no control is simulated either.
+    """
+    if settings.source == RECORDED:
+        return replace(settings, controls=False)
     if settings.source != RIG:
         return settings
     return replace(settings, visit=settings.visit or f"{datetime.now(UTC):%Y-%m-%d}", controls=False)

@@ -120,9 +120,9 @@ def weights_offered(settings: Settings) -> tuple[Path, ...]:
     Those that the settings name, or the house's own for its scenes. Raises SettingsError: none are given for one's own
     scene.
     """
-    if settings.weights is not None:
-        return (Path(settings.weights),)
-    if settings.scene not in BUILT_IN_SCENES:
+    if settings.weights not in (None, *BUILT_IN_SCENES):
+        return (Path(str(settings.weights)),)
+    if settings.weights is None and settings.scene not in BUILT_IN_SCENES:
         raise SettingsError(
             f"--weights is missing: the weights that come with SpectralZoom know the built-in farm only;"
             f" train some for {settings.scene} with: spectralzoom train DATASET -o my.safetensors"

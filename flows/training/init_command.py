@@ -1,12 +1,13 @@
-"""What `spectralzoom init` does: it looks at images and labels, and writes a scene.toml of what they do not say."""
+"""What `spectralzoom init` does: it looks at images and labels, and writes a scene.toml of what they do not say.
+
+Of a folder of recorded sweeps it writes a survey.toml.
+"""
 
 from __future__ import annotations
 
 import json
 import re
 import shlex
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,8 @@ from rich.markup import escape
 from flows.cli.app import AsJson, Switch, stderr
 from flows.terminal.processes import DONE, writing
 from flows.terminal.progress import StageProgress, put_out
-from pipeline.errors import SettingsError
+from flows.training.survey_draft import set_aside, show_survey_draft, write_survey_draft
+from flows.training.sweep_draft import draft_sweeps
 from pipeline.readings import MOST_VALUE
 from storage.archive.whole_files import write_whole
 from storage.readers.label_files import is_store, listed_names
@@ -33,15 +35,20 @@ NO_READING = -999.0  # at and below it an edge is filled, not seen
 def init(source: str, *, force: Switch = False, as_json: AsJson = False) -> int:
     """Look at the images and labels of SOURCE, and write a scene.toml beside them that can be read and changed.
 
-    Asks nothing, and says what it could not see and which command comes next.
+    Of a folder of recorded sweeps it is a survey.toml. Asks nothing, and says what it could not see and which command
+    comes next.
 
     Parameters
     ----------
     source
-        A folder of images with their labels, or one image or cube.
+        A folder of images with their labels, one image or cube, or a folder of sweeps: ENVI cubes with pointing tables
+        or reference frames, or those of a Headwall camera.
     force
-        Write a new scene.toml in the place of one that is there, which is kept as scene.toml.old.
+        Write a new file in the place of one that is there, which is kept as scene.toml.old or survey.toml.old.
     """
+    if (draft := draft_sweeps(Path(source))) is not None:
+        put_out(write_survey_draft(draft, force=force), show_survey_draft, as_json=as_json)
+        return DONE
     put_out(run_init(source, stderr, force=force), _show, as_json=as_json)
     return DONE
 
@@ -54,28 +61,11 @@ def run_init(source: str, console: Console, *, force: bool = False) -> dict[str,
     """
     place, _ = split_variable(source)
     path = (place if place.is_dir() and not is_store(place) else place.parent) / SETTINGS_NAME
-    if path.exists() and not force:
-        raise SettingsError(f"there is a {path} already; change it by hand, or write a new one with --force")
-    with writing(path.parent, "folder"), _set_aside(path):
+    with writing(path.parent, "folder"), set_aside(path, force=force):
         with StageProgress(console, TITLES) as progress:
             draft = draft_scene(source, lambda done, name: progress.show("look", done, name, ended=done == 1))
         write_whole(path, scene_text(draft))
     return _record(source, path, draft)
-
-
-@contextmanager
-def _set_aside(path: Path) -> Iterator[None]:
-    """Keep what is there under another name: unread, and put back where no new one is written."""
-    kept = path.with_name(path.name + ".old")
-    there = path.exists()
-    if there:
-        path.replace(kept)
-    try:
-        yield
-    except BaseException:
-        if there:
-            kept.replace(path)
-        raise
 
 
 def scene_text(draft: SceneDraft) -> str:

@@ -208,6 +208,12 @@ class RecordedSource:
         first, last = int(taken[0]), int(taken[-1])
         return replace(sweep, start_px=sweep.start_px + first * sweep.step, lines=last + 1 - first)
 
+    def serves(self, sweep: Sweep) -> bool:
+        """Return whether every line of a sweep was taken, so that `pick` finds it."""
+        return self._own(sweep) is not None or any(
+            bool((self._nearest(sweep, group)[0] >= 0).all()) for group in self._groups
+        )
+
     def pick(self, sweep: Sweep) -> PickedLines:
         """Choose the recorded lines that serve a sweep; nothing is read.
 

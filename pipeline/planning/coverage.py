@@ -54,7 +54,7 @@ def coarse_sweeps(
     if grid.factor > most:
         raise SettingsError(
             f"the coarse factor must be at most {most} for {camera.bits}-bit lines of {camera.samples} samples "
-            f"(samples are summed in 16 bits), got {grid.factor}"
+            f"(samples are summed in 16 bits), got {grid.factor}; take one uniform scan, or weights of a smaller factor"
         )
     covering = _cover(grid, camera, along, step=grid.factor, overlap_px=overlap_px)
     return [replace(sweep, exposure_ms=exposure_ms) for sweep in covering]
@@ -91,15 +91,16 @@ def cheapest_full(
     *,
     overlap_px: float = 0,
     cut: Callable[[list[Sweep]], list[Sweep]] = lambda sweeps: sweeps,
+    axes: Sequence[Axis] = ("x", "y"),
 ) -> tuple[Axis, list[Sweep], float]:
     """Choose the orientation of the full scan that takes the least time: axis of the lines, sweeps, seconds.
 
-    ``cut`` leaves of the sweeps what is to be captured, where that is not all.
+    ``cut`` leaves of the sweeps what is to be captured, where that is not all; ``axes`` are those that lines may lie
+    along.
 
     Raises PoseError: neither orientation is within the mirror's range.
     """
     found: list[tuple[Axis, list[Sweep], float]] = []
-    axes: tuple[Axis, Axis] = ("x", "y")
     for along in axes:
         try:
             sweeps = cut(full_sweeps(grid, camera, along, overlap_px=overlap_px))

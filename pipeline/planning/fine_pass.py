@@ -87,6 +87,7 @@ def plan_fine(
     margin_px: float = 0.0,
     full: Sequence[Sweep] | None = None,
     threshold: float | None = None,
+    strips: Sequence[Sweep] | None = None,
 ) -> FinePlan:
     """Choose the line runs that show the most score for at most ``budget_s`` seconds.
 
@@ -108,6 +109,9 @@ def plan_fine(
         Buy no run, and nothing of a run, that shows less score per second than this: a floor under the price of a
         second, a line priced with its share of a reload and a run with its set-up. None, like 0, spends the budget.
         With the same scores a lower threshold never has less ``worth``.
+    strips
+        Strips that runs may lie on, ascending along the line, from the field's first row on and without lines; None
+        takes all that `strips_at_seats` gives.
 
     Raises
     ------
@@ -124,7 +128,7 @@ def plan_fine(
     scale = _scale(scores)
     worth, unit = _worth(grid, np.asarray(scores, np.float64) / scale, min(limit / scale * budget_s, MOST_WORTH))
     floor = limit / scale / unit
-    field = _field(grid, camera, cost, along, worth, margin_px)
+    field = _field(grid, camera, cost, along, worth, margin_px, strips)
     told = scale if scale <= 1 or field.total <= MOST_FLOAT / scale else 1.0
     missed = int(np.count_nonzero(worth)) - len(np.unique(field.views.seat))
     whole = _full(grid, camera, cost, along) if full is None else (list(full), cost.seconds(list(full), camera))
@@ -160,10 +164,17 @@ def _full(grid: SceneGrid, camera: LineCamera, cost: CostModel, along: Axis) -> 
 
 
 def _field(
-    grid: SceneGrid, camera: LineCamera, cost: CostModel, along: Axis, worth: NDArray[np.float64], margin_px: float
+    grid: SceneGrid,
+    camera: LineCamera,
+    cost: CostModel,
+    along: Axis,
+    worth: NDArray[np.float64],
+    margin_px: float,
+    strips: Sequence[Sweep] | None = None,
 ) -> Field:
-    """What strips at every offset show of the seats that are worth something."""
-    strips = strips_at_seats(grid, camera, along, margin_px=margin_px)
+    """What strips at every offset, or those given, show of the seats that are worth something."""
+    if strips is None:
+        strips = strips_at_seats(grid, camera, along, margin_px=margin_px)
     views = look_from(grid, camera, strips, worth > 0, margin_px=margin_px)
     if np.any(worth > 0) and not len(views.seat):
         first = int(np.flatnonzero(worth > 0)[0])

@@ -115,17 +115,21 @@ def plain_scans(
     bands: int,
     *,
     seconds: float | None = None,
+    exposures_ms: Sequence[float] | None = None,
 ) -> list[PlainScan]:
     """Price scans of every step of a record and many exposures, no longer than the camera's own.
 
-    ``sweeps`` cover the field, by step, whatever their exposure. With ``seconds`` the longest exposure of each step
-    that ends in time is among the scans.
+    ``sweeps`` cover the field, by those steps of the record that can be taken, whatever their exposure. With
+    ``seconds`` the longest exposure of each step that ends in time is among the scans. Where ``exposures_ms`` are
+    given, no others are tried than those of them that the record knows.
     """
     found = []
     shortest, longest = record.exposures_ms[0], min(camera.exposure_ms, record.exposures_ms[-1])
-    for step in record.steps:
+    for step in sweeps:
         tried = exposures_between(shortest, longest)
-        if seconds is not None and tried:
+        if exposures_ms is not None:
+            tried = [exposure_ms for exposure_ms in exposures_ms if record.knows(exposure_ms)]
+        elif seconds is not None and tried:
             tried += _longest_within(seconds, sweeps[step], camera, cost, shortest, longest)
         found += [priced_scan(record, sweeps[step], camera, cost, bands, exposure_ms) for exposure_ms in tried]
     return found

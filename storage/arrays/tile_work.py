@@ -71,11 +71,18 @@ def sight_sweeps(cubes: Sequence[RawCube], registration: Path | None, camera: Li
             shifts[name] = SweepShift(name, np.array(one["offset_px"]), np.array(one["drift_px_per_line"]))
             if one["gain"] is not None:
                 gains[name] = np.array(one["gain"], np.float32)
-    frames_s = [exposing(camera, cube.sweep).frame_ms * 1e-3 for cube in cubes]
+    frames_s = [_period_s(cube, exposing(camera, cube.sweep)) for cube in cubes]
     return [
         Sighted(cube, number_lines(cube.time_s, frame_s), shifts[cube.sweep.name], gains.get(cube.sweep.name))
         for cube, frame_s in zip(cubes, frames_s, strict=True)
     ]
+
+
+def _period_s(cube: RawCube, camera: LineCamera) -> float:
+    """The time from line to line; of lines that were picked out of a recording their own, not the camera's."""
+    apart = np.diff(cube.time_s[np.isfinite(cube.time_s)]) if cube.source == "recorded" else np.zeros(0)
+    rising = apart[apart > 0]
+    return float(np.median(rising)) if len(rising) else camera.frame_ms * 1e-3
 
 
 ROWS_OF_MEANS = 8  # of a mosaic whose pixels are means, rectified at once

@@ -2,7 +2,7 @@
 
 ::
 
-    NAME.bil NAME.hdr            raw numbers, with wavelengths and widths of the bands
+    NAME.bil NAME.hdr            raw numbers, with wavelengths and widths of the bands, and the lines' axis of the field
     NAME.pointing.csv            a row a line: line, time, mirror_x, mirror_y, exposure_ms, valid
     NAME.dark.img NAME.dark.hdr  dark frame, one line of float32
     NAME.white.*                 white frame; its header has the value of the white reference per band
@@ -46,7 +46,9 @@ def write_recorded_files(
 
     header = folder / f"{name}.hdr"
     bands = EnviFile(cube.shape, f"{order}u2", interleave, cube.wavelength_nm, cube.fwhm_nm)
-    write_envi(header, replace(bands, description=f"raw numbers of sweep {name}", ending=f".{interleave}"), blocks())
+    axis = {"line axis": cube.sweep.along}
+    about = f"raw numbers of sweep {name}"
+    write_envi(header, replace(bands, description=about, ending=f".{interleave}", more=axis), blocks())
     known = cube.references
     panel = ", ".join(repr(value) for value in known.panel.astype(np.float64).tolist())
     of_white = {"panel": f"{{{panel}}}", **({"mirror at rest": "1"} if known.by_mirror else {})}

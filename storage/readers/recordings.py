@@ -10,7 +10,8 @@
 
 Beside a cube ``NAME`` of files are found, where no flag names them: ``NAME.pointing.csv`` (.parquet, .toml),
 ``NAME.dark.hdr``, ``NAME.white.hdr``, ``NAME.bad.hdr``, ``NAME.flat.hdr``, or ``dark*.hdr`` and ``white*.hdr`` for all
-cubes of the folder. The header of a white frame may say ``panel = {...}``, the value of the white reference per band,
+cubes of the folder. The header of an ENVI cube may say ``line axis = y``: lines lie along y of the field, and the scan
+goes along x. The header of a white frame may say ``panel = {...}``, the value of the white reference per band,
 and ``mirror at rest = 1`` where it was taken so.
 """
 
@@ -29,13 +30,14 @@ from pipeline.capture.straight_scans import covered_field, fit_sweep, flat_camer
 from pipeline.errors import ArchiveError, IncompleteStoreError, SceneError, SettingsError, WavelengthError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import STRAIGHT, Mounting
-from pipeline.geometry.scan import Sweep
+from pipeline.geometry.scan import Axis, Sweep
 from pipeline.rectify.detector import find_bad_elements
 from pipeline.rig.camera.camera_texts import listed_numbers
 from pipeline.source import References
+from storage.archive.archive import Archive
 from storage.archive.keys import array_digest
 from storage.archive.manifests import manifest_sha256
-from storage.archive.records import read_run
+from storage.archive.records import Run, read_run, read_store
 from storage.archive.staging import MANIFEST_NAME
 from storage.arrays.cubes import RawCube, open_raw_cube
 from storage.arrays.layout import open_group
@@ -106,9 +108,7 @@ class Recording:
         if field_shape is None:
             sweeps, tangents = [one.sweep for one in self.sweeps], [one.tangents for one in self.sweeps]
             field_shape = covered_field(sweeps, tangents, self.camera).shape
-        return RecordedSource(
-            self.sweeps, self.camera, self.wavelength_nm, field_shape, name=self.name, notes=self.notes
-        )
+        return RecordedSource(self.sweeps, self.camera, self.wavelength_nm, field_shape, notes=self.notes)
 
 
 @dataclass(frozen=True)
@@ -186,13 +186,10 @@ def find_raw_cubes(address: str | Path) -> list[Path] | None:
     Raises ArchiveError: the archive has no run of that name, or no run with raw cubes; as `Archive.locate` where they
     are gone.
     """
-    text = str(address).rstrip("/")
-    place, _, run = text.rpartition("/runs/")
-    if place and run and is_archive(place):
-        return _cubes_of_run(place, run)
-    if is_remote(text) or (Path(text) / "stages").is_dir():
-        return _cubes_of_run(text, None)
-    path = Path(text)
+    named = _named_run(address)
+    if named is not None:
+        return _run_with_cubes(*named)[2]
+    path = Path(address)
     if not path.exists():
         raise SceneError(f"there is no recording {path}; check the name (seen from {Path.cwd()})")
     if not path.is_dir():
@@ -212,8 +209,36 @@ def _is_raw_cube(path: Path) -> bool:
         return False
 
 
-def _cubes_of_run(address: str, name: str | None) -> list[Path]:
-    """Raw cubes of a run of an archive, the newest that has some where none is named."""
+def find_recorded_run(address: str | Path) -> tuple[Run, tuple[int, int] | None] | None:
+    """Find the run of an archive whose raw cubes an address stands for, with its field's (y, x) size where known.
+
+    None of addresses that stand for no run. Raises SceneError, ArchiveError: as `find_raw_cubes`.
+    """
+    named = _named_run(address)
+    if named is None:
+        if not Path(address).exists():
+            raise SceneError(f"there is no recording {address}; check the name (seen from {Path.cwd()})")
+        return None
+    archive, run, _ = _run_with_cubes(*named)
+    for row in run.stages:
+        if row.get("name") == "attend":
+            grid = read_store(archive.ref("attend", str(row.get("key")))).params.get("grid", {})
+            if {"height", "width"} <= set(grid):
+                return run, (int(grid["height"]), int(grid["width"]))
+    return run, None
+
+
+def _named_run(address: str | Path) -> tuple[str, str | None] | None:
+    """The archive and the run, where one is named, that an address stands for; None where it is no such address."""
+    text = str(address).rstrip("/")
+    place, _, run = text.rpartition("/runs/")
+    if place and run and is_archive(place):
+        return place, run
+    return (text, None) if is_remote(text) or (Path(text) / "stages").is_dir() else None
+
+
+def _run_with_cubes(address: str, name: str | None) -> tuple[Archive, Run, list[Path]]:
+    """A run of an archive with its raw cubes, the newest that has some where none is named."""
     archive = open_archive(address, create=False, write=False)
     folders = archive.runs()
     if name is not None and name not in [folder.name for folder in folders]:
@@ -221,11 +246,11 @@ def _cubes_of_run(address: str, name: str | None) -> list[Path]:
         raise ArchiveError(f"{archive.name} has no run {name!r}; its latest are {known}")
     for folder in reversed(folders):
         if name in (None, folder.name):
-            products = read_run(folder, {}).products
-            stores = [archive.locate(products[product]) for product in RAW_PRODUCTS if product in products]
+            run = read_run(folder, {})
+            stores = [archive.locate(run.products[product]) for product in RAW_PRODUCTS if product in run.products]
             cubes = [path for store in stores for path in sorted(store.glob("*.zarr"))]
             if cubes:
-                return cubes
+                return archive, run, cubes
     which = "no run" if name is None else f"the run {name}"
     raise ArchiveError(f"{archive.name}: {which} has raw cubes; survey into the archive first, or name another run")
 
@@ -249,7 +274,7 @@ class RecordedFile:
 
 def _open_files(path: Path, camera: LineCamera, given: RecordedWith) -> Recording:
     """Open cubes of files with their pointing and reference frames."""
-    cubes = [_open_file(one, given.wavelengths) for one in _find_cubes(path)]
+    cubes = [_open_file(one, given.wavelengths) for one in find_cubes(path)]
     _check_bands(cubes)
     notes = [note for cube in cubes for note in (*cube.source.notes, cube.source.bands.origin) if note]
     samples = given.samples or max(cube.source.shape[1] for cube in cubes)
@@ -281,8 +306,11 @@ def _open_files(path: Path, camera: LineCamera, given: RecordedWith) -> Recordin
     )
 
 
-def _find_cubes(path: Path) -> list[Path]:
-    """The cubes that an address of files stands for: itself, or the ENVI cubes of a folder."""
+def find_cubes(path: Path) -> list[Path]:
+    """Find the cubes that an address of files stands for: itself, or the ENVI cubes or Zarr stores of a folder.
+
+    Raises SceneError: the folder holds none.
+    """
     if not path.is_dir() or find_zarr_store(path) is not None:
         return [path]
     headers = sorted(entry for entry in path.iterdir() if entry.suffix.lower() == ".hdr" and entry.is_file())
@@ -464,7 +492,8 @@ def _sweeps_of(
         own = np.arange(source.shape[0])
         if pointing.part is not None:
             own = np.flatnonzero(np.array(pointing.part) == name)
-        scan = fit_sweep(pointing.position[own], camera, name=name, samples=source.shape[1], valid=valid[own])
+        position, samples = pointing.position[own], source.shape[1]
+        scan = fit_sweep(position, camera, name=name, samples=samples, along=_line_axis(cube), valid=valid[own])
         exposed = float(np.median(exposure_ms[own]))
         sweep: Sweep = replace(scan.sweep, exposure_ms=None if exposed == camera.exposure_ms else exposed)
         if abs(scan.distance_px - sweep.step) > 1e-3 * sweep.step:
@@ -481,6 +510,16 @@ def _sweeps_of(
             )
         )
     return sweeps
+
+
+def _line_axis(cube: RecordedFile) -> Axis:
+    """The axis of the field that lines lie along: as an ENVI header says, else x."""
+    if reader_of(cube.path) != "envi":
+        return "x"
+    said = load_envi_header(find_envi_pair(cube.path)[0]).fields.get("line axis", "x").strip()
+    if said not in ("x", "y"):
+        raise SceneError(f"{cube.path} says line axis = {said!r}, expected x or y; correct the header")
+    return "y" if said == "y" else "x"
 
 
 def _line_reader(source: CubeSource, own: NDArray[np.intp]) -> Callable[[NDArray[np.intp]], NDArray[np.uint16]]:

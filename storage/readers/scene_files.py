@@ -349,6 +349,17 @@ def _labels(
     return found, (f"labels from {address}{by_name}, {how}", *notes, *_one_class_note(found))
 
 
+def load_field_labels(address: str | Path, shape: tuple[int, int]) -> tuple[Labels, tuple[str, ...]]:
+    """Read labels on a field's (y, x) pixels, with the classes of a scene.toml beside them; and notes.
+
+    Raises SceneError: they cannot be read, or do not fit.
+    """
+    file, _ = split_variable(address)
+    found, notes = _labels(file, shape, None, address, find_scene_settings(file), {})
+    assert found is not None
+    return found, notes
+
+
 def _one_class_note(found: Labels) -> tuple[str, ...]:
     """Question labels that are all alike: the one value may stand for what nobody has labelled."""
     there = np.unique(found.index[found.index != UNLABELLED])

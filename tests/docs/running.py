@@ -98,7 +98,7 @@ class Reader:
         assert program == "spectralzoom", f"{block.place}: only spectralzoom is run; say what is to parse"
         if word == "tree":
             return  # run together
-        given = [*words[1:], *shlex.split(rest)]
+        given = [found for one in (*words[1:], *shlex.split(rest)) for found in self._matching(one)]
         if word == "bucket":
             assert self.bucket is not None
             given = [one.replace(BUCKET, self.bucket) for one in given]
@@ -107,6 +107,12 @@ class Reader:
         else:
             code = run_here(given)
             assert code == 0, f"{block.place}: {command} ended with {code}"
+
+    def _matching(self, word: str) -> list[str]:
+        """Names that a word with stars stands for, as a shell gives them; the word itself where there are none."""
+        if "*" not in word:
+            return [word]
+        return sorted(path.relative_to(self.folder).as_posix() for path in self.folder.glob(word)) or [word]
 
     def _elsewhere(self, block: Block, flags: str) -> None:
         """Run the commands with the copy of the folders, in a process of its own."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +19,11 @@ from flows.tasks.seat_budget import SeatBudget
 from flows.tasks.stage import Product, Wanted, stage
 from models.policies.policies import IMAGE_POLICIES, SEEDED_POLICIES, SEEING_POLICIES, score_seats
 from models.reading.inference import Glance
+from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.geometry.grid import seat_pixels
 from pipeline.geometry.scan import Sweep, exposing
 from pipeline.planning.area_cover import seats_shown
+from pipeline.planning.coverage import field_px
 from pipeline.planning.fine_pass import FinePlan, plan_fine
 from pipeline.planning.orientation import compare_orientations, find_rows
 from pipeline.planning.plain_scans import scan_words
@@ -83,7 +87,8 @@ def _planned(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> tuple[NDArray
 def _scored(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> tuple[NDArray[np.float64], FinePlan]:
     """Scores of the seats, and the runs of lines that show most of them in the time left."""
     scores = _scores_within_zones(run, work, mosaic)
-    plan = plan_fine(
+    plan_on = partial(
+        plan_fine,
         run.grid,
         run.camera,
         run.settings.cost,
@@ -94,7 +99,21 @@ def _scored(run: SurveyRun, work: FieldWork, mosaic: StageRef) -> tuple[NDArray[
         full=run.plan.full,
         threshold=run.settings.threshold,
     )
+    plan = plan_on()
+    if run.recorded is not None:
+        plan = _recorded_plan(run, run.recorded, plan, plan_on)
     return scores, _kept_seats(run, plan)
+
+
+def _recorded_plan(
+    run: SurveyRun, recorded: RecordedPasses, plan: FinePlan, plan_on: Callable[..., FinePlan]
+) -> FinePlan:
+    """The plan of free strips where a recording has its lines, else the one on the strips that it has."""
+    taken = recorded.served(plan.sweeps)
+    if taken is None and (strips := recorded.strips(-(field_px(run.grid, run.plan.along)[1] - 1) / 2)):
+        plan = plan_on(strips=strips)
+    sweeps = recorded.fine_pass(plan.sweeps) if taken is None else taken
+    return replace(plan, sweeps=sweeps, seconds=run.settings.cost.seconds(sweeps, run.camera))
 
 
 def _kept_seats(run: SurveyRun, plan: FinePlan) -> FinePlan:
@@ -190,7 +209,7 @@ def compare_turned(run: SurveyRun, mosaic: StageRef, attention: StageRef) -> Wan
         rows = find_rows(mosaic_brightness(mosaic.path / "mosaic.zarr"))
         turned = compare_orientations(
             run.grid,
-            run.camera,
+            replace(run.camera, bits=8),  # seconds and seats alone, and no sample is summed
             settings.cost,
             run.plan.along,
             scores,

@@ -101,7 +101,7 @@ REFUSED = {
     "mask of another size": (1, "--policy mask --mask small.png", r"\(50, 128\) px \(y, x\), the scene is \(96, 128\)"),
     "policy mask without one": (2, "--policy mask", "needs a mask file"),
     "unknown flag": (2, "--budgets 1", "Unknown option"),
-    "unknown source": (2, "--source rigg", "--source must be one of sim, rig; got 'rigg'"),
+    "unknown source": (2, "--source rigg", "--source must be one of auto, sim, rig, raster, recorded; got 'rigg'"),
     "exposure in seconds": (2, "--exposure-ms 0.1", "--exposure-ms must be a number from 0.5.*then write 100"),
     "farm beyond memory": (2, "--scene farm --size 60000x60000", "takes about .* GB of memory, this machine has"),
     "memory for no tile": (

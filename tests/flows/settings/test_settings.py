@@ -108,7 +108,7 @@ def test_documents_have_every_setting_with_its_default():
         ("[pose]\nlat = 52.1", "'pose.lat_deg'"),
         ("height_m = 12", "'pose.height_m'"),
         ("[map]\nresolution = 0.1", "'map.resolution_m'"),
-        ("pointing = 50", "'pointing_px'"),
+        ("pointing_pix = 50", "'pointing_px'"),
         ("[mirror]\nnatural = 20", "'mirror.natural_hz'"),
         ("smile_nm = 0.2", "'optics.smile_nm'"),
     ],

@@ -351,7 +351,7 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "port number": ({"rig.control_port": 0}, r"control.port must be a whole number from 1 to 65535, got 0"),
     "settling in ms": ({"rig.settle_s": 200}, r"settle.s must be a number from 0.01 to 60 s, got 200.*milliseconds"),
-    "no such source": ({"source": "rigg"}, r"source must be one of sim, rig; got 'rigg'"),
+    "no such source": ({"source": "rigg"}, r"source must be one of auto, sim, rig, raster, recorded; got 'rigg'"),
     "memory too large": ({"source": "rig", "cost.vector_pairs": 9000}, r"cost.vector_pairs = 9000: .* 2 to 8191 pairs"),
     "field without size": (
         {"source": "rig", "scene": "field", "bands": None, "size": None, "weights": "x"},

@@ -1,0 +1,157 @@
+"""The recording that the settings name, as the field of a survey: source, scene, and what a plan may ask of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flows.settings.survey_settings import RECORDED, Settings
+from pipeline.capture.recorded import RecordedSource
+from pipeline.capture.recorded_passes import RecordedPasses
+from pipeline.capture.straight_scans import covered_field
+from pipeline.errors import SceneError
+from pipeline.geometry.camera import LineCamera
+from pipeline.lazy import Once
+from pipeline.simulator.effects.effect import Effect
+from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
+from pipeline.source import Source
+from storage.archive.keys import stage_key
+from storage.readers.recordings import RecordedWith, Recording, open_recording
+from storage.readers.scene_files import load_field_labels
+
+MOST_STEP = 8  # pixels from line to line of a uniform scan, as the setting scan_step has them
+OFF_CENTRE_PX = 0.5  # of a recorded field, from which on the run says so
+
+
+@dataclass(frozen=True)
+class RecordedField:
+    """A `FieldSource`: a recording, whose lines were taken before."""
+
+    source: RecordedSource
+    content: Mapping[str, Any]  # what its lines depend on
+    name = RECORDED
+    simulates = False
+
+    def key(self, field: str) -> dict[str, Any]:
+        return {"recording": dict(self.content)}
+
+    def saying(self, say: Callable[[str], None]) -> RecordedField:
+        return self  # lines come all the time
+
+    def lit(self, chosen: Mapping[Effect, str], clock: Mapping[str, float]) -> RecordedField:
+        return self
+
+    def opened(self, spool: Path) -> AbstractContextManager[Source]:
+        return nullcontext(self.source)
+
+
+@dataclass(frozen=True)
+class OpenedRecording:
+    """A recording with the settings of its survey: camera, size and step are those that it has."""
+
+    settings: Settings
+    recording: Recording
+    field: RecordedField
+    notes: tuple[str, ...]
+
+    @property
+    def passes(self) -> RecordedPasses:
+        """What the passes of a plan can ask of it."""
+        return RecordedPasses(self.field.source)
+
+    def scene(self) -> tuple[RasterScene, tuple[str, ...]]:
+        """Return the field as a scene of which size and bands are known, with the labels that the settings name.
+
+        Raises SceneError: the labels cannot be used.
+        """
+        height, width = self.field.source.field_shape
+        wavelength_nm = self.recording.wavelength_nm
+        found, notes = None, tuple[str, ...]()
+        if self.settings.labels is not None:
+            found, notes = load_field_labels(self.settings.labels, (height, width))
+        scene = RasterScene(
+            name=self.settings.name or _name_of(str(self.settings.sweeps)),
+            key=f"{RECORDED}/{stage_key(RECORDED, 1, self.field.content, [])}/{width}x{height}",
+            raster=SceneRaster.of(np.zeros((height, width, 1), np.float32), None if found is None else found.index),
+            light=Once.of(
+                SceneLight(
+                    np.zeros((1, len(wavelength_nm)), np.float32),
+                    np.full(len(wavelength_nm), self.settings.camera.full_well_e, np.float32),
+                )
+            ),
+            panel=self.recording.sweeps[0].references.panel,
+            wavelength_nm=wavelength_nm,
+            fwhm_nm=self.recording.fwhm_nm,
+            class_names=() if found is None else found.names,
+            class_colours=np.zeros((0, 3), np.uint8) if found is None else found.colours,
+        )
+        return scene, (*self.notes, *notes)
+
+
+def open_recorded(settings: Settings) -> OpenedRecording:
+    """Open the recording that the settings name; no line is read.
+
+    Raises SceneError, WavelengthError, SettingsError, ArchiveError, PoseError: as `open_recording`, or its field cannot
+    be surveyed.
+    """
+    given = RecordedWith(
+        pointing=None if settings.pointing is None else Path(settings.pointing),
+        dark=None if settings.dark is None else Path(settings.dark),
+        white=None if settings.white is None else Path(settings.white),
+        wavelengths=settings.wavelengths,
+        panel=settings.rig.panel,
+        mounting=settings.rig.mounting,
+    )
+    recording = open_recording(str(settings.sweeps), settings.camera, given)
+    shape, notes = _field_shape(settings, recording)
+    source = recording.source(shape)
+    settings = replace(settings, camera=recording.camera, size=shape[::-1])
+    if settings.scan == RECORDED:
+        settings = replace(settings, scan_step=_step_of(source, recording.camera))
+    field = RecordedField(source, recording.key())
+    return OpenedRecording(settings, recording, field, (*recording.notes, *notes))
+
+
+def _field_shape(settings: Settings, recording: Recording) -> tuple[tuple[int, int], tuple[str, ...]]:
+    """(y, x) size of the field, centred on the undeflected direction: as stated, or what all strips show."""
+    if settings.shape is not None:
+        return settings.shape, ()
+    sweeps, tangents = [one.sweep for one in recording.sweeps], [one.tangents for one in recording.sweeps]
+    covered = covered_field(sweeps, tangents, recording.camera)
+    height, width = (
+        size - 2 * int(np.ceil(abs(off) - 1e-6)) for size, off in zip(covered.shape, covered.centre_px, strict=True)
+    )
+    y, x = covered.centre_px
+    if min(height, width) < 1:
+        raise SceneError(
+            f"the field of {settings.sweeps} lies {x:.4g} px across and {y:.4g} px along the scan beside the direction "
+            "at rest, so that nothing of it lies around that; correct the pointing, or state --size WIDTHxHEIGHT"
+        )
+    if max(abs(y), abs(x)) < OFF_CENTRE_PX:
+        return (height, width), ()
+    note = (
+        f"the recorded field lies {x:.4g} px across and {y:.4g} px along the scan beside the direction at rest: "
+        f"{width} x {height} px around that are surveyed; --size states more"
+    )
+    return (height, width), (note,)
+
+
+def _step_of(source: RecordedSource, camera: LineCamera) -> int:
+    """Pixels from line to line of the uniform scan that a recording is (SceneError: it is none, or too coarse)."""
+    step = max(sweep.step for sweep in RecordedPasses(source).uniform_scan())
+    if step > MOST_STEP:
+        raise SceneError(
+            f"the lines of the recording lie {step} px of {camera.ifov_rad * 1e6:.4g} urad apart, and a uniform scan "
+            f"may have up to {MOST_STEP} px between lines; correct the pointing, or camera.focal_length_mm"
+        )
+    return step
+
+
+def _name_of(sweeps: str) -> str:
+    """What a field is called that nobody named: as its recording."""
+    return Path(sweeps.rstrip("/")).stem or RECORDED

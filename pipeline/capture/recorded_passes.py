@@ -1,0 +1,133 @@
+"""Passes over a recording: which recorded lines a survey plans with, and what of a plan a recording can serve.
+
+A pass is planned as for a rig first, and cut where its first or last lines were never taken. Where the recording lacks
+lines of it, the pass is laid on the strips that were recorded instead. Exposures are those of the recorded lines.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.capture.recorded import RecordedSource, RecordedSweep
+from pipeline.errors import SceneError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Axis, Sweep
+
+MOST_CUT_LINES, MOST_CUT_PX = 3, 2.0  # by which a plan may reach beyond a recording: lines that a kernel reads, turns
+
+
+@dataclass(frozen=True)
+class RecordedPasses:
+    """Plans the passes of a survey of a recording; reads no line."""
+
+    source: RecordedSource
+
+    @property
+    def axes(self) -> tuple[Axis, ...]:
+        """Axes of the scene that recorded lines lie along."""
+        return tuple(dict.fromkeys(one.sweep.along for one in self.source.sweeps))
+
+    def uniform_scan(self) -> list[Sweep]:
+        """Give all recorded sweeps, as a uniform scan takes them.
+
+        Raises SceneError: they differ in axis, step or binning, so that they are no one scan.
+        """
+        sweeps = [one.sweep for one in self.source.sweeps]
+        if len(self._kinds) > 1:
+            words = "; ".join(f"along {along}, step {step}, binning {binning}" for along, step, binning in self._kinds)
+            raise SceneError(
+                f"the recording holds lines of {len(self._kinds)} kinds ({words}), which are not one uniform scan; "
+                "give the --budget of a survey in two passes, or name sweeps of one kind"
+            )
+        return sweeps
+
+    def served(self, sweeps: Sequence[Sweep]) -> list[Sweep] | None:
+        """Give planned sweeps without the ends beyond the field that were never taken; None where more is missing."""
+        found = []
+        for sweep in sweeps:
+            cut = self.source.cut_to_recorded(sweep)
+            if cut is None or not self.source.serves(cut):
+                return None
+            before = round((cut.start_px - sweep.start_px) / sweep.step)
+            if max(before, sweep.lines - before - cut.lines) > MOST_CUT_LINES + MOST_CUT_PX / sweep.step:
+                return None
+            found.append(replace(cut, exposure_ms=self._exposure_ms(cut)))
+        return found
+
+    def full_scan(self, planned: Sequence[Sweep]) -> list[Sweep]:
+        """Give the scan of every line that savings are stated against: the recording's own, else the planned one."""
+        own = self._full_sweeps() if len(self._kinds) == 1 else []
+        return self.served(planned) or own or list(planned)
+
+    def first_pass(self, planned: Sequence[Sweep]) -> list[Sweep]:
+        """Give the planned sweeps of a first pass or a uniform scan as the recording serves them.
+
+        Raises NotRecordedError: neither the planned strips nor the recorded ones have the lines.
+        """
+        found = self.served(planned) or self.served(self._on_recorded_strips(planned)) or []
+        if not found:
+            for sweep in planned:
+                self.source.pick(sweep)  # names the first line that is missing
+        return found
+
+    def strips(self, start_px: float) -> list[Sweep]:
+        """Give the strips of recorded lines at full resolution, from ``start_px`` on and without lines yet."""
+        places = sorted({sweep.strip_px for sweep in self._full_sweeps()})
+        return [
+            Sweep(f"fine-{number:03d}", "fine", self.axes[0], place, start_px, 0) for number, place in enumerate(places)
+        ]
+
+    def fine_pass(self, planned: Sequence[Sweep]) -> list[Sweep]:
+        """Give the planned sweeps of a fine pass without what was never taken at the field's ends.
+
+        Raises NotRecordedError: a line between is missing.
+        """
+        found = []
+        for sweep in planned:
+            cut = self.source.cut_to_recorded(sweep)
+            if cut is not None:
+                self.source.pick(cut)
+                found.append(replace(cut, exposure_ms=self._exposure_ms(cut)))
+        return found
+
+    def lines_served(self, sweeps: Sequence[Sweep]) -> int:
+        """Count the recorded lines that serve sweeps, each once."""
+        picked = [self.source.pick(sweep) for sweep in sweeps]
+        return len({pair for one in picked for pair in zip(one.place.tolist(), one.line.tolist(), strict=True)})
+
+    @property
+    def _kinds(self) -> list[tuple[Axis, int, int]]:
+        """Axis, step and binning of the recorded sweeps, each once."""
+        return sorted({(one.sweep.along, one.sweep.step, one.sweep.binning) for one in self.source.sweeps})
+
+    def _full_sweeps(self) -> list[Sweep]:
+        """Recorded sweeps that have every line at full resolution."""
+        return [one.sweep for one in self.source.sweeps if one.sweep.step == one.sweep.binning == 1]
+
+    def _on_recorded_strips(self, planned: Sequence[Sweep]) -> list[Sweep]:
+        """Sweeps of the planned step and binning on every strip of a recorded scan, over the lines taken there."""
+        if not planned or len(self._kinds) > 1:  # runs of a fine pass are no scan of the field
+            return []
+        like, found = planned[0], list[Sweep]()
+        for one in self.source.sweeps:
+            low, high = _ends_px(one, self.source.camera)
+            lines = int((high - low) // like.step) + 1
+            start = low - (like.step - 1) / 2
+            name = f"{like.name.rpartition('-')[0]}-{len(found)}"
+            found.append(replace(like, name=name, strip_px=one.sweep.strip_px, start_px=start, lines=lines))
+        return found
+
+    def _exposure_ms(self, sweep: Sweep) -> float | None:
+        """The exposure of the recorded sweep that serves the first line."""
+        if not sweep.lines:
+            return sweep.exposure_ms
+        return self.source.sweeps[int(self.source.pick(sweep).place[0])].sweep.exposure_ms
+
+
+def _ends_px(one: RecordedSweep, camera: LineCamera) -> tuple[float, float]:
+    """The lowest and the highest scan coordinate of valid lines."""
+    scan_px = one.tangents[one.valid_line, 1] / camera.ifov_rad
+    return float(np.nanmin(scan_px)), float(np.nanmax(scan_px))

@@ -1,0 +1,75 @@
+"""Passes over a recording: plans are kept where its lines serve them, and laid on its own strips elsewhere."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.capture.recorded_passes import RecordedPasses
+from pipeline.errors import NotRecordedError, SceneError
+from pipeline.geometry.scan import Sweep
+from tests.pipeline.capture.recordings import CAMERA, FULL, record, recorded_source, simulated
+
+COARSE = Sweep("coarse-0", "coarse", "x", 0.0, -45.5, 23, step=4, binning=4)
+ASIDE = replace(FULL, name="mine", strip_px=7.0)
+
+
+def passes_over(*sweeps: Sweep) -> RecordedPasses:
+    """Passes over a recording of these sweeps of a small simulated field."""
+    source = simulated()
+    return RecordedPasses(recorded_source(source, [record(source, sweep) for sweep in sweeps]))
+
+
+def test_a_planned_pass_is_cut_where_the_recording_ends() -> None:
+    """A coarse pass from -44 to 44 px keeps the lines within 2 px of those recorded from -39.5 to 39.5 px."""
+    (found,) = passes_over(FULL).first_pass([COARSE])
+    assert (found.strip_px, found.step, found.binning) == (0.0, 4, 4)
+    assert found.line_px()[0] == pytest.approx(-40)
+    assert found.line_px()[-1] == pytest.approx(40)
+    assert passes_over(FULL).source.serves(found)
+
+
+def test_a_pass_is_laid_on_the_recorded_strips() -> None:
+    """Where no recorded line lies on a planned strip, lines of the same kind go along the recorded one, end to end."""
+    passes = passes_over(ASIDE)
+    assert passes.served([COARSE]) is None
+    (found,) = passes.first_pass([COARSE])
+    assert (found.name, found.strip_px, found.step, found.binning) == ("coarse-0", 7.0, 4, 4)
+    np.testing.assert_allclose(found.line_px(), -39.5 + 4 * np.arange(20))
+    assert passes.full_scan([FULL]) == [ASIDE]
+    assert [strip.strip_px for strip in passes.strips(-40.0)] == [7.0]
+
+
+def test_lines_that_serve_twice_count_once() -> None:
+    """A coarse and a fine pass share recorded lines; all of them are 80."""
+    passes = passes_over(FULL)
+    (coarse,) = passes.first_pass([COARSE])
+    assert passes.lines_served([coarse]) == coarse.lines
+    assert passes.lines_served([coarse, FULL, replace(FULL, name="again")]) == 80
+
+
+def test_a_line_that_is_missing_is_named() -> None:
+    """A strip that lies elsewhere and lines that are finer than the recorded ones are refused with their place."""
+    sparse = Sweep("scan-0", "coarse", "x", 0.0, -39.5, 20, step=4)
+    with pytest.raises(NotRecordedError, match=r"line \d+ of sweep scan-0 was never taken.*no finer than they were"):
+        passes_over(sparse).first_pass([FULL])
+    gap = replace(FULL, lines=20), replace(FULL, name="rest", start_px=10.5, lines=30)
+    with pytest.raises(NotRecordedError, match=r"line \d+ of sweep fine was never taken"):
+        passes_over(*gap).fine_pass([replace(FULL, name="fine", start_px=-25.5, lines=50)])
+
+
+def test_a_uniform_scan_is_of_one_kind() -> None:
+    """A recording of a coarse and a fine pass is no uniform scan, and its fine runs are no full scan."""
+    passes = passes_over(replace(COARSE, start_px=-39.5, lines=20), replace(FULL, name="fine-0", lines=30))
+    with pytest.raises(SceneError, match=r"lines of 2 kinds .*give the --budget of a survey in two passes"):
+        passes.uniform_scan()
+    assert passes.full_scan([replace(FULL, name="full-0")]) == [replace(FULL, name="full-0")]
+
+
+def test_exposures_are_the_recorded_ones() -> None:
+    """A plan's own exposure gives way to that of the lines that serve it."""
+    (found,) = passes_over(replace(FULL, exposure_ms=20.0)).first_pass([replace(COARSE, exposure_ms=50.0)])
+    assert found.exposure_ms == 20.0
+    assert CAMERA.exposure_ms == 100.0

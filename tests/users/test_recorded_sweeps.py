@@ -1,0 +1,509 @@
+"""Somebody surveys sweeps that were taken before: the same map as the rig's own, fewer lines, and what goes wrong."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+from rich.console import Console
+
+import storage.readers.recordings
+from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
+from flows.publish.run_folder import Published, load_receipt
+from flows.publish.survey_command import run_survey
+from flows.settings.load import load_settings
+from pipeline.errors import SceneError, SettingsError
+from pipeline.geometry.scan import Sweep
+from pipeline.simulator.rig_model import Rig
+from pipeline.simulator.scenes.scene import RasterScene, raster_from_values
+from pipeline.simulator.simulated import SimulatedSource
+from storage.archive.archive import Archive
+from storage.archive.keys import array_digest
+from storage.arrays.class_maps import load_class_map
+from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
+from storage.arrays.mosaics import load_mosaic
+from storage.export.recorded_files import write_recorded_files
+from storage.remote.opening import verify_archive
+from tests.conftest import Survey, WeightsMaker, patchy_scene
+from tests.flows.conftest import CommandLine, be_version, command_line
+from tests.flows.tasks.test_survey_rig import emulated
+from tests.remembered_work import without_effects
+
+__all__ = ["command_line"]
+pytestmark = pytest.mark.usefixtures("no_effects")
+QUIET = Console(quiet=True)
+SIZE = (128, 96)  # x, y
+NARROW = {"camera.samples": 80}  # two strips for the field
+PASSES: dict[str, dict[str, Any]] = {
+    "two passes": {"budget": 0.8, "policy": "entropy"},
+    "every line": {"scan_step": 1},
+    "lines down the field": {"scan_step": 1, "camera.samples": 96},
+    "every second line, shorter": {"scan_step": 2, "scan_exposure_ms": 25},
+}
+
+
+def field() -> RasterScene:
+    """A field of three classes before the emulated rig."""
+    camera = load_settings(None, dict(NARROW)).camera
+    values = patchy_scene(SIZE[::-1], 3, 1)[0]
+    return raster_from_values(values, camera, name="x", wavelength_nm=np.array([640.0, 550.0, 460.0]))
+
+
+def rig_settings(out: Path, weights: Path, **asked: Any) -> Any:
+    """Settings of a survey of the field through the rig."""
+    told = {
+        **{"source": "rig", "scene": "field", "size": f"{SIZE[0]}x{SIZE[1]}", "wavelengths": "640,550,460"},
+        **{"rig.port": f"rig-{os.getpid()}", "rig.pulses": "position", "visit": "first", "engine": "plain"},
+        **{"weights": str(weights), "out": str(out), **NARROW, **asked},
+    }
+    return load_settings(None, told)
+
+
+def survey_sweeps(out: Path, sweeps: Path | str, **asked: Any) -> Published:
+    """Survey recorded sweeps, as the command does."""
+    return run_survey(load_settings(None, {"sweeps": str(sweeps), "engine": "plain", "out": str(out), **asked}), QUIET)
+
+
+def digest_of_map(out: Path, receipt: Mapping[str, Any]) -> tuple[str, str]:
+    """Hashes of class numbers and confidences."""
+    found = load_class_map(out / receipt["products"]["class_map"])
+    return array_digest(np.asarray(found.classes)), array_digest(np.asarray(found.confidence))
+
+
+def write_sweeps(out: Path, published: Published, folder: Path) -> Path:
+    """Write the raw cubes of a survey as ENVI files with a pointing table each."""
+    products = published.receipt["products"]
+    for product in ("raw_coarse", "raw_fine"):
+        for path in sorted((out / products[product]).glob("*.zarr")) if product in products else ():
+            write_recorded_files(open_raw_cube(path), folder)
+    return folder
+
+
+@pytest.mark.parametrize("asked", PASSES.values(), ids=PASSES)
+def test_sweeps_of_the_rig_give_its_map(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weights: Path, asked: dict[str, Any]
+) -> None:
+    """Written as ENVI and CSV and surveyed as a recording, or out of the archive itself: the class map by hash."""
+    settings = rig_settings(tmp_path / "rig", weights, **asked)
+    with emulated(settings, {}, monkeypatch, scene=field()):
+        published = run_survey(settings, QUIET)
+    expected = digest_of_map(tmp_path / "rig", published.receipt)
+    assert len(np.unique(load_class_map(tmp_path / "rig" / published.receipt["products"]["class_map"]).classes)) > 1
+    folder = write_sweeps(tmp_path / "rig", published, tmp_path / "sweeps")
+    along = {open_raw_cube(path).sweep.along for path in (tmp_path / "rig").glob("stages/capture/*/*.zarr")}
+    assert along == ({"y"} if "camera.samples" in asked else {"x"})
+    plan = asked if "budget" in asked else {}
+    size = f"{SIZE[0]}x{SIZE[1]}"
+    of_files = survey_sweeps(tmp_path / "files", folder, weights=str(weights), size=size, **plan)
+    assert digest_of_map(tmp_path / "files", of_files.receipt) == expected
+    of_run = survey_sweeps(tmp_path / "again", published.folder)
+    assert digest_of_map(tmp_path / "again", of_run.receipt) == expected
+    for one in (of_files, of_run):
+        told = one.receipt["recording"]
+        assert (one.receipt["source"], told["lines_read"]) == ("recorded", told["lines_recorded"])
+        assert "lines" not in one.receipt
+    assert {finding.kind for finding in verify_archive(Archive.open(tmp_path / "files"))} == {"whole"}
+
+
+@contextmanager
+def counted_lines(patch: pytest.MonkeyPatch) -> Iterator[set[tuple[str, int]]]:
+    """Count every line of a file or raw cube that is read as numbers, at the reader."""
+    read: set[tuple[str, int]] = set()
+    real = storage.readers.recordings._line_reader
+
+    def line_reader(source: Any, own: NDArray[np.intp]) -> Any:
+        reader = real(source, own)
+
+        def read_lines(numbers: NDArray[np.intp]) -> NDArray[np.uint16]:
+            read.update((source.name, int(line)) for line in own[numbers])
+            return reader(numbers)
+
+        return read_lines
+
+    with patch.context() as within:
+        within.setattr(storage.readers.recordings, "_line_reader", line_reader)
+        yield read
+
+
+@pytest.fixture(scope="module")
+def full_scan(tmp_path_factory: pytest.TempPathFactory, survey_png: Survey) -> tuple[Path, Published, Path]:
+    """A full scan of the session's picture by the simulated rig: its archive, its run, and its sweeps as files."""
+    folder = tmp_path_factory.mktemp("recorded")
+    with without_effects():
+        published = survey_png(folder / "sim", budget=None, scan_step="1", **NARROW)
+    return folder / "sim", published, write_sweeps(folder / "sim", published, folder / "sweeps")
+
+
+def test_raw_cubes_of_a_simulated_survey_give_its_map(tmp_path: Path, full_scan: tuple[Path, Published, Path]) -> None:
+    """An archive of a simulated survey is a recording like another, and its run says how it was planned."""
+    archive, published, _ = full_scan
+    again = survey_sweeps(tmp_path / "again", f"{archive}/runs/{published.folder.name}")
+    assert digest_of_map(tmp_path / "again", again.receipt) == digest_of_map(archive, published.receipt)
+    assert again.receipt["survey"] == published.receipt["survey"]
+
+
+def test_a_budget_reads_only_the_lines_that_it_asks_for(
+    tmp_path: Path, full_scan: tuple[Path, Published, Path], weights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a recorded full scan two passes read their own lines and no other; the receipt says what zooming saves."""
+    _, _, sweeps = full_scan
+    with counted_lines(monkeypatch) as read:
+        published = survey_sweeps(tmp_path / "a", sweeps, weights=str(weights), budget=0.6)
+    told = published.receipt["recording"]
+    recorded = sum(open_raw_cube(path).sweep.lines for path in raw_cubes(full_scan))
+    assert told["lines_recorded"] == recorded
+    assert told["lines_read"] == len(read) < 0.75 * recorded
+    products = published.receipt["products"]
+    fine = [open_raw_cube(path) for path in (tmp_path / "a" / products["raw_fine"]).glob("*.zarr")]
+    coarse = [open_raw_cube(path) for path in (tmp_path / "a" / products["raw_coarse"]).glob("*.zarr")]
+    assert fine
+    strips = {round(open_raw_cube(path).sweep.strip_px, 6) for path in raw_cubes(full_scan)}
+    assert {cube.sweep.strip_px for cube in fine} <= strips
+    asked = sum(cube.sweep.lines for cube in (*coarse, *fine))
+    assert len(read) <= asked
+    assert told["full_scan_is"] == "recorded"
+    assert told["passes_s"] <= 0.6 * told["full_scan_s"]
+    assert published.receipt["savings"]["lines"] == {
+        **published.receipt["savings"]["lines"],
+        "done": asked,
+        "full": recorded,
+    }
+
+
+def raw_cubes(full_scan: tuple[Path, Published, Path]) -> list[Path]:
+    """Stores of the sweeps of the full scan."""
+    archive, published, _ = full_scan
+    return sorted((archive / published.receipt["products"]["raw_coarse"]).glob("*.zarr"))
+
+
+def write_pushbroom(folder: Path, values: NDArray[np.uint16]) -> Path:
+    """A cube (line, sample, band) of a straight scan as ENVI, with dark and white frames and no pointing."""
+    _, samples, bands = values.shape
+    folder.mkdir()
+    fields = f"bands = {bands}\ninterleave = bil\nbyte order = 0\nwavelength units = nm\n"
+    fields += "wavelength = {640, 550, 460}\n"
+    for name, frame in (
+        ("scan", values),
+        ("scan.dark", np.full((1, samples, bands), 60, np.uint16)),
+        ("scan.white", np.full((1, samples, bands), 3500, np.uint16)),
+    ):
+        head = f"ENVI\nsamples = {samples}\nlines = {len(frame)}\ndata type = 12\n{fields}"
+        (folder / f"{name}.hdr").write_text(head)
+        (folder / f"{name}.img").write_bytes(frame.astype("<u2").transpose(0, 2, 1).tobytes())
+    return folder
+
+
+@pytest.fixture
+def pushbroom(tmp_path: Path) -> tuple[Path, NDArray[np.uint16]]:
+    """A straight scan of 96 lines of 64 samples, and its numbers."""
+    values = (patchy_scene((96, 64), 3, 3)[0] * 12 + 60).astype(np.uint16)
+    return write_pushbroom(tmp_path / "drone", values), values
+
+
+@pytest.mark.parametrize(
+    ("column", "place"),
+    [
+        (None, None),
+        ("position_m", lambda line: 0.05 * line),
+        ("position_px", lambda line: 200.0 - line),
+        ("angle_deg", lambda line: float(np.rad2deg(np.arctan((line - 47.5) * 7.4e-3 / 70)))),
+    ],
+)
+def test_a_straight_scan_is_a_recording(
+    tmp_path: Path, pushbroom: tuple[Path, NDArray[np.uint16]], weights: Path, column: str | None, place: Any
+) -> None:
+    """Drone, stage or conveyor: by metres, pixels or one angle a line, or, as the run says, taken to be even."""
+    folder, values = pushbroom
+    asked = {}
+    if column is not None:
+        table = tmp_path / "track.csv"
+        table.write_text(column + "\n" + "".join(f"{place(line)!r}\n" for line in range(len(values))))
+        asked["pointing"] = str(table)
+    published = survey_sweeps(tmp_path / "a", folder / "scan.hdr", weights=str(weights), **asked)
+    notes = " ".join(published.receipt["settings"]["notes"])
+    assert ("scan has no pointing: taken as an even straight scan" in notes) == (column is None)
+    assert ("a pixel is taken to be as long as lines are apart, 0.05 m" in notes) == (column == "position_m")
+    width, height = published.receipt["settings"]["size"]
+    assert (width, height) == (64, 96)
+    mosaic = load_mosaic(tmp_path / "a" / published.receipt["products"]["mosaic"]).values
+    light = (values.astype(np.float64) - 60) / (3500 - 60)
+    light = light[::-1] if column == "position_px" else light
+    coarse = light.reshape(24, 4, 16, 4, 3).mean(axis=(1, 3))
+    inner = (slice(2, 20), slice(2, 14))
+    assert np.nanmax(np.abs(mosaic[inner] - coarse[inner])) < (0.02 if column != "angle_deg" else 0.2)
+    assert published.receipt["recording"]["lines_read"] == 96
+
+
+def table(folder: Path, header: str, rows: Sequence[str]) -> None:
+    """Write the pointing table beside the cube of a straight scan."""
+    (folder / "scan.pointing.csv").write_text("\n".join([header, *rows]) + "\n")
+
+
+def change_header(folder: Path, old: str, new: str) -> None:
+    """Change what the cube's header says."""
+    header = folder / "scan.hdr"
+    assert old in header.read_text()
+    header.write_text(header.read_text().replace(old, new))
+
+
+def shuffle_bytes(folder: Path) -> None:
+    """Say the other byte order than the file has."""
+    change_header(folder, "byte order = 0", "byte order = 1")
+
+
+def few_lines(folder: Path) -> None:
+    """Point every line 3 px after the one before, which no scan of every line can be made of."""
+    table(folder, "position_px", [str(3 * line) for line in range(96)])
+
+
+def two_ways(folder: Path) -> None:
+    """Say that the scan turns back half way."""
+    table(folder, "position_px", [str(line if line < 48 else 96 - line) for line in range(96)])
+
+
+Fault = Callable[[Path], None]
+BAD: dict[str, tuple[Fault, list[str], str]] = {
+    "fewer rows": (
+        lambda at: table(at, "position_px", [str(line) for line in range(95)]),
+        [],
+        "has 95 rows for scan, fewer than its 96 lines; give one row for each line",
+    ),
+    "angles beyond the mirror": (
+        lambda at: table(at, "angle_deg", [str(line) for line in range(96)]),
+        [],
+        r"row 53: angle_deg = 51 .*beyond the mirror, which turns the view by up to 50 deg.*correct the table",
+    ),
+    "times that do not rise": (
+        lambda at: table(at, "time,position_px", [f"{0.1 * min(line, 40)},{line}" for line in range(96)]),
+        [],
+        "row 43: time = 4 .*expected a time after that of the line before",
+    ),
+    "another interleave": (
+        lambda at: (at / "scan.img").rename(at / "scan.bip") and None,
+        [],
+        "says interleave = bil, and the name of scan.bip says bip; correct the header, or rename the file",
+    ),
+    "another byte order": (shuffle_bytes, [], "has the wrong byte order: .*Write the other byte order"),
+    "no wavelengths": (
+        lambda at: change_header(at, "wavelength = {640, 550, 460}", ""),
+        [],
+        "has 3 bands and nothing says their wavelengths; give --wavelengths in nm",
+    ),
+    "a scan that turns": (two_ways, [], "turns back at line .*give each way of the scan a sweep of its own"),
+    "a dark frame of another camera": (
+        lambda at: np.save(at / "other.npy", np.zeros((50, 3))),
+        ["--dark", "other.npy"],
+        r"the dark frame .* is \(50, 3\) \(sample, band\), the cube \(64, 3\)",
+    ),
+    "lines that were never taken": (
+        few_lines,
+        ["--scan-step", "1"],
+        "line 0 of sweep scan-0 was never taken: .*no finer than they were recorded",
+    ),
+    "lines too far apart": (
+        lambda at: table(at, "position_px", [str(9 * line) for line in range(96)]),
+        [],
+        "the lines of the recording lie 9 px .* apart, and a uniform scan may have up to 8 px",
+    ),
+    "no such table": (lambda at: None, ["--pointing", "nowhere.csv"], "there is no pointing table .*nowhere.csv"),
+    "no such recording": (lambda at: None, ["--sweeps", "nowhere"], "there is no recording nowhere; check the name"),
+    "a scene beside it": (
+        lambda at: None,
+        ["--scene", "farm"],
+        "--scene = 'farm', and the field of recorded sweeps is what they show; leave it out",
+    ),
+    "the simulated rig": (
+        lambda at: None,
+        ["--source", "sim"],
+        "--sweeps is for recorded sweeps, and source = 'sim'; give --source recorded",
+    ),
+    "a part of the field": (
+        lambda at: None,
+        ["--look", "part", "--seconds", "5"],
+        "--look = 'part' chooses lines and exposures for a camera that looks again",
+    ),
+    "two scans": (lambda at: None, ["--scan", "recorded", "--budget", "0.5"], "one plain scan .*leave one of them out"),
+}
+
+
+@pytest.mark.parametrize(("fault", "flags", "message"), BAD.values(), ids=BAD)
+def test_bad_input_gives_one_message(
+    command_line: CommandLine,
+    monkeypatch: pytest.MonkeyPatch,
+    pushbroom: tuple[Path, NDArray[np.uint16]],
+    weights: Path,
+    fault: Fault,
+    flags: list[str],
+    message: str,
+) -> None:
+    """By the command line: one message with value and remedy, no traceback, and no archive."""
+    folder, _ = pushbroom
+    monkeypatch.chdir(folder)
+    fault(folder)
+    asked = ["--engine", "plain", "--out", "a", "--weights", weights]
+    sweeps = [] if "--sweeps" in flags else ["--sweeps", "scan.hdr"]
+    ended = command_line("survey", *sweeps, *asked, *flags)
+    ended.refused(2 if ended.code == 2 else 1, message)  # 2 where settings alone are wrong
+    assert not (folder / "a").exists()
+
+
+def test_source_without_sweeps(command_line: CommandLine, tmp_path: Path) -> None:
+    """A recording has to lie somewhere."""
+    command_line("survey", "--source", "recorded", "--scene", "field", "--out", tmp_path / "a").refused(
+        2, "source = 'recorded' reads sweeps that were taken before; give --sweeps"
+    )
+
+
+def test_what_is_missing_is_assumed_and_said(
+    command_line: CommandLine, tmp_path: Path, pushbroom: tuple[Path, NDArray[np.uint16]], weights: Path
+) -> None:
+    """Without dark and white frames, and cut off after two thirds, a cube is surveyed; notes say what was taken for."""
+    folder, _ = pushbroom
+    for frame in ("dark", "white"):
+        (folder / f"scan.{frame}.hdr").unlink()
+    content = (folder / "scan.img").read_bytes()
+    (folder / "scan.img").write_bytes(content[: len(content) * 2 // 3])
+    flags = ("--weights", weights, "--engine", "plain", "--out", tmp_path / "a", "--json")
+    ended = command_line("survey", "--sweeps", folder / "scan.hdr", *flags)
+    assert ended.code == 0, ended.err
+    notes = " ".join(json.loads(ended.out)["settings"]["notes"])
+    for words in (
+        "is cut off: 64 of 96 lines are whole",
+        "a dark level of 0 is assumed; give --dark",
+        "full scale (4095 DN) is assumed to be white",
+        "nothing says the exposure: 100 ms is assumed",
+    ):
+        assert words in notes
+
+
+def test_init_drafts_what_the_files_do_not_say(
+    command_line: CommandLine, tmp_path: Path, pushbroom: tuple[Path, NDArray[np.uint16]], weights: Path
+) -> None:
+    """A folder of sweeps gives a survey.toml that says what is missing, and its next command surveys it."""
+    folder, _ = pushbroom
+    ended = command_line("init", folder, "--json")
+    assert ended.code == 0, ended.err
+    told = json.loads(ended.out)
+    assert (told["sweeps"], told["lines"], told["bands"]) == (["scan.hdr"], 96, 3)
+    text = (folder / "survey.toml").read_text()
+    assert '# pointing = "pointing.csv"   # where each line looked, a row a line; without it one straight' in text
+    assert "# the dark frame is here" in text
+    words = shlex.split(told["next"])[1:]
+    words[words.index("WEIGHTS.safetensors")] = str(weights)
+    surveyed = command_line(*words, "--engine", "plain", "--out", tmp_path / "a", "--json")
+    assert surveyed.code == 0, surveyed.err
+    assert json.loads(surveyed.out)["recording"]["lines_read"] == 96
+    command_line("init", folder).refused(2, r"there is a .*survey\.toml already; .*--force")
+    assert command_line("init", folder, "--force").code == 0
+    assert (folder / "survey.toml.old").read_text() == text
+
+
+def test_ingest_names_the_survey_as_the_next_step(
+    command_line: CommandLine, tmp_path: Path, pushbroom: tuple[Path, NDArray[np.uint16]], weights: Path
+) -> None:
+    """Its next command surveys the stored cube with the frames that were stored with it."""
+    folder, _ = pushbroom
+    frames = ("--dark", folder / "scan.dark.hdr", "--white", folder / "scan.white.hdr")
+    ended = command_line("ingest", folder / "scan.hdr", tmp_path / "store", *frames)
+    line = next(line for line in ended.err.splitlines() if line.startswith("next: "))
+    words = shlex.split(line.removeprefix("next: "))[1:]
+    assert words[:3] == ["survey", "--source", "recorded"]
+    words[words.index("WEIGHTS.safetensors")] = str(weights)
+    surveyed = command_line(*words, "--engine", "plain", "--out", tmp_path / "a", "--json")
+    assert surveyed.code == 0, surveyed.err
+    of_files = survey_sweeps(tmp_path / "b", folder / "scan.hdr", weights=str(weights))
+    assert digest_of_map(tmp_path / "a", json.loads(surveyed.out)) == digest_of_map(tmp_path / "b", of_files.receipt)
+
+
+def test_a_run_of_the_rig_is_reprocessed_from_its_raw_cubes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weights: Path
+) -> None:
+    """Once captures have a newer version the rig is not asked: the same map, once, and nothing is left to do."""
+    archive = tmp_path / "rig"
+    with emulated(rig_settings(archive, weights), {}, monkeypatch, scene=field()):
+        published = run_survey(rig_settings(archive, weights, scan_step=2), QUIET)
+    be_version(monkeypatch, "capture", 99)
+    assert run_reprocess(ReprocessRequest(archive), QUIET) == 0
+    first, second = Archive.open(archive).runs()
+    again = load_receipt(second)
+    assert first == published.folder
+    assert (again["source"], again["survey"]) == ("recorded", published.receipt["survey"])
+    assert digest_of_map(archive, again) == digest_of_map(archive, published.receipt)
+    assert run_reprocess(ReprocessRequest(archive), QUIET) == 0
+    assert len(Archive.open(archive).runs()) == 2
+
+
+def test_a_recording_whose_files_moved_is_reprocessed(
+    tmp_path: Path, pushbroom: tuple[Path, NDArray[np.uint16]], weights: Path, make_weights: WeightsMaker
+) -> None:
+    """New weights read the raw cubes that the archive has of it."""
+    folder, _ = pushbroom
+    archive = tmp_path / "a"
+    survey_sweeps(archive, folder / "scan.hdr", weights=str(weights))
+    folder.rename(tmp_path / "elsewhere")
+    other = make_weights(dim=24)
+    assert run_reprocess(ReprocessRequest(archive, weights=other), QUIET) == 0
+    again = load_receipt(Archive.open(archive).runs()[-1])
+    fresh = survey_sweeps(tmp_path / "b", tmp_path / "elsewhere" / "scan.hdr", weights=str(other))
+    assert digest_of_map(archive, again) == digest_of_map(tmp_path / "b", fresh.receipt)
+
+
+def test_labels_judge_the_map_of_a_recording(
+    tmp_path: Path, pushbroom: tuple[Path, NDArray[np.uint16]], weights: Path
+) -> None:
+    """Labels on the field's pixels give accuracy; those of another size are refused."""
+    folder, _ = pushbroom
+    Image.fromarray(patchy_scene((96, 64), 3, 3)[1]).save(tmp_path / "labels.png")
+    labels = str(tmp_path / "labels.png")
+    published = survey_sweeps(tmp_path / "a", folder / "scan.hdr", weights=str(weights), labels=labels)
+    assert 0 < published.receipt["accuracy"]["overall_accuracy"] < 1
+    Image.fromarray(patchy_scene((90, 64), 3, 3)[1]).save(tmp_path / "labels.png")
+    with pytest.raises(SceneError, match="are 90 x 64 px, the scene is 96 x 64 px"):
+        survey_sweeps(tmp_path / "b", folder / "scan.hdr", weights=str(weights), labels=labels)
+
+
+def test_strips_of_ones_own_are_surveyed_in_two_passes(tmp_path: Path, weights: Path) -> None:
+    """A recording whose strips lie where no plan would put them: both passes go along these strips."""
+    own = [Sweep(f"mine-{at}", "fine", "x", at, -52.5, 106) for at in (-35.0, 4.0, 38.0)]
+    camera = load_settings(None, dict(NARROW)).camera
+    source = SimulatedSource(field(), Rig(camera), seed=3)
+    for sweep in own:
+        header = SweepHeader(sweep, source.references(sweep), source.wavelength_nm, None, "sim")
+        with RawCubeWriter(tmp_path / "raw" / f"{sweep.name}.zarr", header) as cube:
+            cube.write(source.lines(sweep))
+    for path in sorted((tmp_path / "raw").glob("*.zarr")):
+        write_recorded_files(open_raw_cube(path), tmp_path / "files")
+    asked = {"weights": str(weights), "size": "120x96", "budget": 0.7, "policy": "entropy"}
+    published = survey_sweeps(tmp_path / "a", tmp_path / "files", **asked)
+    raw = {
+        path.stem: open_raw_cube(path).sweep
+        for product in ("raw_coarse", "raw_fine")
+        for path in (tmp_path / "a" / published.receipt["products"][product]).glob("*.zarr")
+    }
+    assert {round(sweep.strip_px) for sweep in raw.values() if sweep.step == 4} == {-35, 4, 38}
+    assert {round(sweep.strip_px) for sweep in raw.values()} == {-35, 4, 38}
+    assert published.receipt["recording"]["lines_read"] < 318
+    assert np.isfinite(load_mosaic(tmp_path / "a" / published.receipt["products"]["mosaic"]).values).mean() > 0.99
+
+
+def test_numbers_of_sixteen_bits_are_surveyed_and_found_again(tmp_path: Path, weights: Path) -> None:
+    """The camera of the receipt has the bits and the period of the recording, and can be asked for again."""
+    values = (patchy_scene((96, 64), 3, 3)[0] * 200 + 60).astype(np.uint16)
+    folder = write_pushbroom(tmp_path / "drone", values)
+    table(folder, "time,position_px", [f"{3.5 * line},{line}" for line in range(96)])
+    published = survey_sweeps(tmp_path / "a", folder / "scan.hdr", weights=str(weights))
+    camera = published.receipt["settings"]["camera"]
+    assert (camera["bits"], camera["exposure_ms"] + camera["readout_ms"]) == (16, 3500)
+    assert run_reprocess(ReprocessRequest(tmp_path / "a"), QUIET) == 0
+    assert len(Archive.open(tmp_path / "a").runs()) == 1
+    with pytest.raises(SettingsError, match=r"at most 1 for 16-bit lines .*take one uniform scan"):
+        survey_sweeps(tmp_path / "b", folder / "scan.hdr", weights=str(weights), budget=0.6)
