@@ -13,7 +13,8 @@ from tests.conftest import Survey, WeightsMaker, patchy_scene
 from tests.remembered_work import without_effects
 
 SETTINGS = (
-    'name = "{name}"\nscene = "field.png"\nlabels = "labels.png"\nweights = "mine.safetensors"\nbudget = 0.8\n{camera}'
+    'name = "{name}"\nsource = "sim"\nscene = "field.png"\nlabels = "labels.png"\nweights = "mine.safetensors"\n'
+    "budget = 0.8\n{camera}"
 )
 CAMERA = "[camera]\nsamples = 320\n"  # a narrow one: most of a small survey's time goes into samples beside the field
 CLASSES = 'labels = "labels/{number}_labels.png"\n[classes]\nclass_0 = 0\nclass_1 = 1\nclass_2 = 2\n'

@@ -39,7 +39,8 @@ from tests.faults.nursery import ROOT
 
 ZONE = "Europe/Berlin"
 FIELDS = {"hourly": "0 * * * *", "daily": "0 6 * * *"}
-SETTINGS = 'scene = "scene.png"\nweights = "weights.safetensors"\nbudget = 0.8\neffects = "none"\ncontrols = false\n'
+SCENE = 'source = "sim"\nscene = "scene.png"\nweights = "weights.safetensors"\n'
+SETTINGS = f'{SCENE}budget = 0.8\neffects = "none"\ncontrols = false\n'
 IN_THE_PAST = {"PREFECT_SERVER_SERVICES_LATE_RUNS_ENABLED": "false"}  # all of the week is late
 KILLED_AT = 0.4  # of the runs
 INTO_RUN_S, AWAY_S = 0.4, 2.0
