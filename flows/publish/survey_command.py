@@ -17,6 +17,7 @@ from flows.publish.receipt_words import headline, sentences
 from flows.publish.run_folder import Published
 from flows.settings.parameters import SurveySettings
 from flows.settings.survey_settings import Settings
+from flows.tasks.captures import opened_first
 from flows.tasks.local_server import (
     ServerUnavailable,
     check_answers,
@@ -29,7 +30,6 @@ from flows.tasks.open_survey import TITLES, RunRef
 from flows.tasks.prefect_tasks import inside_flow
 from flows.terminal.progress import StageProgress
 from models.network.machine import keep_freed_memory, use_one_thread
-from pipeline.errors import NothingToMend
 from pipeline.lazy import deferred
 from storage.archive.staging import remove_tree, take_lock
 from storage.remote.object_stores import is_remote
@@ -53,10 +53,8 @@ def run_survey(settings: Settings, console: Console) -> Published:
         def note(words: str) -> None:
             console.print(f"[dim]note: {escape(words)}[/]", soft_wrap=True)
 
-        with observed_by(Observer(progress.watch, note, progress.say)):
+        with observed_by(Observer(progress.watch, note, progress.say)), opened_first(settings):
             run = _survey(settings, console)
-    if run.unchanged is not None:
-        raise NothingToMend(run.name, run.unchanged)
     published = published_run(run)
     show_published(published, settings.out, console)
     return published

@@ -3,15 +3,19 @@
 No ``from __future__ import annotations`` here: Prefect reads signatures.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import replace
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
 from flows.settings.parameters import SurveySettings, at_due_time
+from flows.settings.survey_settings import Settings
 from flows.tasks.observer import current_observer
 from flows.tasks.open_survey import OpenSurvey, RunRef
 from flows.tasks.prefect_tasks import as_task, inside_flow
-from flows.tasks.run import open_run
+from flows.tasks.run import SurveyRun, open_run
 from flows.tasks.stages.capture import capture_coarse, capture_fine
 from pipeline.errors import ArchiveError, NothingToMend, RigError, SettingsError
 from pipeline.lazy import deferred
@@ -26,6 +30,7 @@ else:
     prefect_deployments = deferred("prefect.deployments")
 
 OPENING = "plan"
+_opened: ContextVar[tuple[Settings, SurveyRun] | None] = ContextVar("opened", default=None)
 PASSES = {"coarse": capture_coarse, "fine": capture_fine}
 
 
@@ -38,21 +43,37 @@ def plan_capture(settings: SurveySettings) -> OpenSurvey | RunRef:
     return as_task(_plan_capture, "plan_capture")(settings)
 
 
-def _plan_capture(settings: SurveySettings) -> OpenSurvey | RunRef:
-    observer = current_observer()
-    observer.watch(OPENING, "running", 0.0)
-    asked, due = settings.settings(), _due_time()
+@contextmanager
+def opened_first(settings: Settings) -> Iterator[None]:
+    """Open a survey before its flow begins: bad input is refused before a server starts or an archive is made.
+
+    Raises PipelineError, NothingToMend as `plan_capture` finds them.
+    """
+    watch = current_observer().watch
+    watch(OPENING, "running", 0.0)
     try:
-        run = open_run(asked if due is None else at_due_time(asked, due))
-    except NothingToMend as known:
-        observer.watch(OPENING, "ran", 1.0)
-        observer.log(str(known))
-        return RunRef(f"runs/{known.run}", open_archive(asked.out).root / "runs" / known.run, unchanged=str(known))
+        run = open_run(settings)
     except BaseException:
-        observer.watch(OPENING, "failed", 1.0)
+        watch(OPENING, "failed", 1.0)
         raise
+    watch(OPENING, "ran", 1.0)
+    before = _opened.set((settings, run))
+    try:
+        yield
+    finally:
+        _opened.reset(before)
+
+
+def _plan_capture(settings: SurveySettings) -> OpenSurvey | RunRef:
+    observer, asked, due = current_observer(), settings.settings(), _due_time()
+    first, run = _opened.get() or (None, None)
+    if run is None or first is not asked:
+        try:
+            run = open_run(asked if due is None else at_due_time(asked, due))
+        except NothingToMend as known:
+            observer.log(str(known))
+            return RunRef(f"runs/{known.run}", open_archive(asked.out).root / "runs" / known.run, unchanged=str(known))
     run.archive.reclaim()  # what a killed run left half made
-    observer.watch(OPENING, "ran", 1.0)
     for note in run.notes:
         observer.note(note)
     return OpenSurvey(replace(run, source=run.source.saying(observer.say)), observer)

@@ -1,5 +1,5 @@
 -- The empty database of Prefect 3.8.8
--- python tests/flows/tasks/test_local_server.py writes this file.
+-- python tests/flows/schedule/test_local_server.py writes this file.
 BEGIN TRANSACTION;
 CREATE TABLE agent (
 	id CHAR(36) DEFAULT (

@@ -125,7 +125,7 @@ def _texts(here: Path) -> None:
     square = {"type": "Polygon", "coordinates": [[[0, 0], [9, 0], [9, 9], [0, 9], [0, 0]]]}
     owned = {"type": "Feature", "properties": {"owner": "Ada"}, "geometry": square}
     (here / "owners.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [owned]}))
-    (here / "bom.toml").write_bytes(b'\xef\xbb\xbfscene = "field.png"\nweights = "w.safetensors"\nbudget = 0.8\n')
+    (here / "bom.toml").write_bytes(b'\xef\xbb\xbfsource = "sim"\nscene = "field.png"\nbudget = 0.8\n')
     (here / "unknown.toml").write_text('scene = "field.png"\nbuget = 0.8\n')
     (here / "broken.toml").write_text("scene = field.png\n")
     (here / "latin.toml").write_bytes('scene = "Rüben.png"\n'.encode("latin-1"))

@@ -32,7 +32,8 @@ Heard = dict[str, list[float]]
 def asked(scene_files: Path, weights: Path) -> dict[str, object]:
     """What a small survey is asked for, on a rig that stands somewhere, as a table of settings."""
     files = {"scene": scene_files / "scene.png", "labels": str(scene_files / "labels.png"), "weights": weights}
-    return {**files, "pose": POSE, "camera": {"samples": 320}, "budget": 0.8, "accuracy": False, "controls": False}
+    quick = {"camera": {"samples": 320}, "budget": 0.8, "accuracy": False, "controls": False}
+    return {**files, "source": "sim", "pose": POSE, **quick}
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,6 @@
 """Prefect's server in this process: whom it answers, and the database that it begins with.
 
-`python tests/flows/tasks/test_local_server.py` writes the database's schema anew, for another version of Prefect.
+`python tests/flows/schedule/test_local_server.py` writes the database's schema anew, for another version of Prefect.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from importlib import metadata
 from pathlib import Path
 
 SCHEMA = Path(__file__).parents[3] / "flows" / "tasks" / "prefect_schema.sql"
-HEAD = "-- The empty database of Prefect {}\n-- python tests/flows/tasks/test_local_server.py writes this file.\n"
+HEAD = "-- The empty database of Prefect {}\n-- python tests/flows/schedule/test_local_server.py writes this file.\n"
 
 
 MIGRATE = """
