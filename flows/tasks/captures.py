@@ -56,7 +56,7 @@ def opened_first(settings: Settings) -> Iterator[None]:
     except BaseException:
         watch(OPENING, "failed", 1.0)
         raise
-    watch(OPENING, "ran", 1.0)
+    watch(OPENING, "opened", 1.0)
     before = _opened.set((settings, run))
     try:
         yield

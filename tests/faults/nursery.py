@@ -139,6 +139,7 @@ def serve(choices: Path) -> None:
         "flows.cli.main",
         "flows.publish.run_folder",
         "flows.publish.survey_command",
+        "flows.survey",
         "flows.cli.survey_verbs",
         "flows.archive.commands",
         "matplotlib.backends.backend_agg",

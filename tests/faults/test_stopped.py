@@ -37,7 +37,7 @@ BEGUN = ("flows.tasks.stages.accuracy:load_class_map", 1)
 PLACES = {  # function and call before which a survey is stopped that has its map, and with what
     "before the map is looked at": (*BEGUN, signal.SIGTERM),
     "in the controls": ("flows.tasks.stages.accuracy:run_controls", 1, signal.SIGKILL),
-    "stored and not added": ("flows.publish.survey_command:add_accuracy", 1, signal.SIGKILL),
+    "stored and not added": ("flows.publish.publishing:extend_with_accuracy", 1, signal.SIGKILL),
     "drawn anew": ("flows.publish.run_folder:draw_quicklook", 1, signal.SIGTERM),
     "after the run has changed": ("storage.archive.run_folders:remove_tree", 1, signal.SIGKILL),
 }
