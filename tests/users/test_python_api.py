@@ -190,7 +190,7 @@ def test_a_plan_knows_what_is_stored(asked: dict[str, object], run: OpenedRun, t
 def test_keywords_win_over_a_file(asked: dict[str, object], tmp_path: Path) -> None:
     """A table in a keyword changes its own keys alone."""
     (tmp_path / "survey.toml").write_text("budget = 0.3\nengine = 'plain'\n[camera]\nsamples = 320\nbits = 10\n")
-    same = {"scene": asked["scene"], "weights": asked["weights"], "out": tmp_path / "archive"}
+    same = {"source": "sim", "scene": asked["scene"], "weights": asked["weights"], "out": tmp_path / "archive"}
     with pytest.raises(spectralzoom.Error, match=r"--bits must be a whole number from 8 to 16"):
         spectralzoom.plan(tmp_path / "survey.toml", **same, camera={"bits": 40})
     (tmp_path / "survey.toml").write_text("[camera]\nsamples = 3\n")
