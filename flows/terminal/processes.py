@@ -81,7 +81,11 @@ def writing(out: Path, flag: str = "--out") -> Iterator[None]:
 
 
 NO_HOME = "/nonexistent"  # as Debian calls the home of users that have none
-OF_LIBRARIES = {"NUMBA_CACHE_DIR": "numba", "MPLCONFIGDIR": "matplotlib"}  # those that ask for more than XDG's folder
+OF_LIBRARIES = {  # those that ask for more than XDG's folder
+    "NUMBA_CACHE_DIR": "numba",
+    "MPLCONFIGDIR": "matplotlib",
+    "PREFECT_HOME": "prefect",
+}
 
 
 def place_caches(environment: MutableMapping[str, str] | None = None) -> Path | None:

@@ -357,7 +357,10 @@ BAD: dict[str, tuple[dict[str, Any], str]] = {
         {"source": "rig", "scene": "field", "bands": None, "size": None, "weights": "x"},
         r"give its size",
     ),
-    "field without rig": ({"scene": "field", "bands": None}, r"scene 'field' is what stands before a rig"),
+    "field without rig": (
+        {"scene": "field", "source": "sim", "bands": None},
+        r"scene 'field' is what stands before a rig",
+    ),
     "frame period of the camera": (
         {"source": "rig", "camera.exposure_ms": 9500, "camera.readout_ms": 900},
         r"frame period of 10400 ms is above",

@@ -71,8 +71,6 @@ def _history(words: str) -> FieldHistory:
     row = {
         "run": words,
         "created": "2026-06-01T10:00:00Z",
-        "due": words,
-        "attempts": 1,
         "miou": 0.5,
         "unit": "share",
         "overall_accuracy": None,
@@ -81,7 +79,7 @@ def _history(words: str) -> FieldHistory:
         "capture_seconds": {"done": None, "full": None},
         "colours": {},
     }
-    return FieldHistory(words, words, [row], [{"event": "failed", "due": words, "reason": words}])
+    return FieldHistory(words, words, [row])
 
 
 @pytest.mark.parametrize(
