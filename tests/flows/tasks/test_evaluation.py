@@ -87,7 +87,7 @@ def test_corrections_are_found_and_read(monkeypatch: pytest.MonkeyPatch, tmp_pat
     record = {"a": {"offset_px": [1.0, -2.0], "drift_px_per_line": [0.5, 0.0], "gain": [0.5, 2.0]}}
     ref = _registration(tmp_path, {"sweeps": record})
     sweeps = [SimpleNamespace(name=name, exposure_ms=None) for name in "ab"]
-    cubes = [SimpleNamespace(sweep=sweep, time_s=np.arange(3.0)) for sweep in sweeps]
+    cubes = [SimpleNamespace(sweep=sweep, time_s=np.arange(3.0), source="sim") for sweep in sweeps]
     monkeypatch.setattr(placement, "captured", lambda _: cubes)
     run: Any = SimpleNamespace(camera=LineCamera())
     one, other = placement.sighted(run, ref, ref)

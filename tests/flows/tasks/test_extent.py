@@ -101,6 +101,7 @@ def _run(side: int, policy: str, *, plain: bool = False) -> SurveyRun:
         plan=SimpleNamespace(plain=plain),
         prior=None,
         budget=None,
+        chooses=not plain,
     )
     return cast("SurveyRun", made)
 
