@@ -141,7 +141,7 @@ def test_numbers_are_limits_too(name: str) -> None:
         ({"bytes_kept": "some"}, BudgetError, "such as 40%"),
         ({"least_gain": -1}, SettingsError, "from 0 to 100"),
         ({"least_gain": 0.1, "policy": "sobel"}, SettingsError, "scores in a unit of its own"),
-        ({"compute": "50%", "scan_step": None}, SettingsError, "is for a plain scan.*give --seconds"),
+        ({"compute": "50%", "scan_step": None}, SettingsError, "is for a raster or a plain scan.*give --seconds"),
         ({"compute": "50%", "look": "0:1-9"}, SettingsError, "a whole field, and 'look' looks at a part"),
     ],
 )

@@ -202,8 +202,10 @@ def test_a_name_must_say_which() -> None:
         code.named("gone")
 
 
-def test_every_stage_says_once_what_receipts_call_its_store() -> None:
-    """No two stages share a name in receipts, and each has one at least."""
-    named = [one.addresses(StageRef(one.product.name, "abc", Path())) for one in STAGES.values()]
+@pytest.mark.parametrize("absent", [("average_raster", "take_patches"), ("rectify", "cut_patches")])
+def test_every_stage_says_once_what_receipts_call_its_store(absent: tuple[str, str]) -> None:
+    """No two stages of a survey, of a capture or of a raster, share a name in receipts; each has one at least."""
+    ran = [one for name, one in STAGES.items() if name not in absent]
+    named = [one.addresses(StageRef(one.product.name, "abc", Path())) for one in ran]
     assert all(named)
     assert len({name for one in named for name in one}) == sum(map(len, named))
