@@ -36,7 +36,7 @@ class Noted:
     capture_deployment = None
 
     def __init__(self, **facts: bool) -> None:
-        self.uniform = self.registers = self.on_the_ground = False
+        self.uniform = self.registers = self.on_the_ground = self.is_map = False
         self.__dict__ |= facts
         self.steps: dict[str, list[str]] = {}
 
@@ -83,6 +83,11 @@ def test_patches_are_placed_by_the_registration_of_their_own_pass(uniform: bool,
 def test_a_posed_survey_is_drawn_on_the_ground() -> None:
     """The map on the ground is made of the class map and the mosaic."""
     assert steps(on_the_ground=True)["ground"] == ["draw_map", "rectify"]
+
+
+def test_a_raster_is_neither_captured_nor_rectified() -> None:
+    """Its own pixels take the place of capture, lookup and mosaic."""
+    assert list(steps(is_map=True)) == ["average_raster", "attend", "take_patches", "draw_map"]
 
 
 SETTINGS = [
