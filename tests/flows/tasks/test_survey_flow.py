@@ -93,6 +93,7 @@ def test_a_raster_is_neither_captured_nor_rectified() -> None:
 SETTINGS = [
     {"scene": "farm", "seconds": "25", "camera.exposure_ms": "50", "size": "64x96", "tol": "0.5dn"},
     {
+        "source": "sim",
         "scene": "field.png",
         "weights": "w.safetensors",
         "bands": "0-3",
