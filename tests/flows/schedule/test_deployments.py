@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import subprocess
 import sys
 import threading
@@ -196,8 +195,7 @@ def serving(flow: str, name: str, api: str) -> Iterator[None]:
             wait_for(f"{flow}/{name}")
             yield
         finally:
-            process.send_signal(signal.SIGINT)
-            process.wait(60)
+            process.kill()
 
 
 def wait_for(name: str) -> None:
