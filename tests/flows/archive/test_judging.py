@@ -200,10 +200,10 @@ def test_ls_and_the_receipt_say_that_a_map_is_not_judged_yet(
 
 
 def test_accuracy_that_is_left_out(surveyed: Path) -> None:
-    """The receipt says so, and the stage that judges had nothing to do."""
+    """The receipt says so, and no stage judged."""
     (receipt,) = receipts(surveyed)
     assert receipt["accuracy_is"] == "left out"
-    assert (receipt["stages"][-1]["name"], receipt["stages"][-1]["state"]) == ("evaluate", "skipped")
+    assert "evaluate" not in [stage["name"] for stage in receipt["stages"]]
     assert "accuracy" not in receipt
     assert problems(surveyed) == []
 

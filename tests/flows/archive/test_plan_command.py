@@ -24,7 +24,6 @@ from tests.flows.conftest import be_version, python
 pytestmark = pytest.mark.usefixtures("no_effects")
 
 WAITS = {"locate": "capture_coarse", "rectify": "locate", "attend": "rectify", "capture_fine": "attend"}
-ON_REQUEST = ["register_coarse", "register_fine", "ground"]
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +81,6 @@ def test_without_an_archive_the_plan_makes_none(settings: Settings, tmp_path: Pa
     assert planned["capture_coarse"].key is not None
     assert planned["capture_coarse"].seconds is None
     assert "no such store has a record" in planned["capture_coarse"].basis
-    assert [name for name, row in planned.items() if row.state == "skipped"] == ON_REQUEST
     assert {name: planned[name].why for name in WAITS} == {name: f"waits for {on}" for name, on in WAITS.items()}
 
 
@@ -173,7 +171,6 @@ def test_a_field_beyond_this_machine_is_planned_without_drawing_it(
     asked = replace(settings, scene="farm", size=(10240, 10240), labels=None, weights=None, out=str(tmp_path / "a"))
     found = forecast(asked)
     assert [row.stage for row in found.stages if row.state == "to run"] == ["choose_effects", "capture_coarse"]
-    assert [row.stage for row in found.stages if row.state == "skipped"] == ON_REQUEST
     with pytest.raises(SettingsError, match="this machine has 9; take a smaller one") as refused:
         open_run(asked)
     assert found.refused == str(refused.value)
