@@ -59,7 +59,7 @@ def _publish_second_round(archive: Archive, one: Published) -> None:
     hashes = archive.manifest_hashes([*of.values(), *made.values()])
     for row, ref in zip(added, made.values(), strict=True):
         row["manifest_sha256"] = hashes[ref.uri]
-    receipt["stages"][at:at] = [*added, {**rows["register_fine"], "name": "register_again"}]
+    receipt["stages"][at:at] = added
     receipt["settings"]["rounds"] = 2
     round_of = {"seats": 4, "lines": 9, "sweeps": 1, "seconds": 2.0, "score": 1.0, "score_share": 0.5}
     receipt["plan"] |= {"rounds": [round_of, round_of], "second_move_s": 0.1}
