@@ -96,7 +96,9 @@ def judge(plan: OpenSurvey, run: RunRef) -> RunRef:
 
 
 @flow(name="capture", flow_run_name="capture-{settings.name_of_run}", validate_parameters=True, persist_result=False)
-def capture(settings: SurveySettings, sweeps: str = "coarse", inputs: list[str] | None = None) -> str:
+def capture(
+    settings: SurveySettings, sweeps: str = "coarse", inputs: list[str] | None = None, rig_file: str | None = None
+) -> str:
     """Take the sweeps of one pass into the archive of the settings: what the rig's machine is asked for.
 
     Parameters
@@ -107,12 +109,15 @@ def capture(settings: SurveySettings, sweeps: str = "coarse", inputs: list[str] 
         ``coarse``, the first pass or all of a uniform scan, or ``fine``.
     inputs
         Addresses of the stores that the pass follows from; those of a first pass are made here.
+    rig_file
+        A settings file on the rig's machine whose [rig] says where its devices are. It is a parameter of the
+        deployment: the survey that asks for the pass knows neither ports nor passwords.
 
     Returns
     -------
     The address of the stored sweeps.
     """
-    plan = plan_capture(settings)
+    plan = plan_capture(settings if rig_file is None else settings.with_rig_of(rig_file))
     if isinstance(plan, RunRef):
         return plan.uri
     with plan.at_work():

@@ -369,7 +369,7 @@ def _check_same(catalogue: Catalogue, found: Run, products: Products, run: Surve
         raise SceneError(
             f"the scene {run.settings.scene} is another than {found.uri} looked at; put that one back, or survey again"
         )
-    if run.weights_key != catalogue.stores[products.of("draw_map").uri].params.get("weights"):
+    if run.weights_key != catalogue.stores[products["draw_map"].uri].params.get("weights"):
         raise WeightsError(
             f"the weights {run.settings.weights or 'that come with SpectralZoom'} are others than the map of"
             f" {found.uri} was drawn with; put those back, or reprocess with these"

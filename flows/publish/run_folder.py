@@ -69,7 +69,7 @@ class Published:
 def publish_run(survey: OpenSurvey) -> Published:
     """Write receipt.json, quicklook.png and report.html into a run folder and publish it as a whole."""
     run, products = survey.run, survey.products
-    plan = load_plan(products.of("attend"))
+    plan = load_plan(products["attend"])
     with run.archive.new_run(run.name) as draft:
         receipt = make_receipt(survey, plan, f"runs/{draft.id}")
         return _publish(run, draft, products, plan, receipt)
@@ -93,7 +93,7 @@ def extend_with_accuracy(survey: OpenSurvey, draft: RunDraft, accuracy: StageRef
         settings={name: asked[name] for name in names},
         judged=now(),
     )
-    return _publish(run, draft, products, load_plan(products.of("attend")), receipt)
+    return _publish(run, draft, products, load_plan(products["attend"]), receipt)
 
 
 def load_receipt(folder: Path) -> Receipt:
@@ -116,9 +116,9 @@ def _publish(run: SurveyRun, draft: RunDraft, products: Products, plan: FinePlan
     picture = (draft.folder / "quicklook.png").read_bytes()
     maps = (load_ground_map(ref.path / STORE) for ref in products.there("ground"))
     pictures = [Picture(draw_ground(drawn), "The map on the ground, north up.") for drawn in maps]
-    before = remembered(run.prior, products.of("draw_map"), receipt)
+    before = remembered(run.prior, products["draw_map"], receipt)
     field = field_map(run, products, plan, glance, coarse.spectra, before)
-    legend = load_class_names(products.of("draw_map").path / "class_map.zarr")
+    legend = load_class_names(products["draw_map"].path / "class_map.zarr")
     pictures += change_pictures(before, field.classes, legend, run.grid.patch)
     page = render_report(receipt, picture, pictures, looked_twice=looked_twice, field=field)
     (draft.folder / "report.html").write_text(page, encoding="utf-8")
@@ -132,7 +132,7 @@ def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str) -> Receipt:
     run, products = survey.run, survey.products
     accuracy = load_accuracy(products["evaluate"]) if "evaluate" in products else None
     savings = _savings(run, products, plan)
-    simulation = None if not run.source.simulates else load_manifest(products.of("choose_effects"))
+    simulation = None if not run.source.simulates else load_manifest(products["choose_effects"])
     if accuracy is not None and "segment_wall_s" in accuracy:
         savings["segment_wall_s"] = accuracy.pop("segment_wall_s")
     stores: dict[str, str] = {}
@@ -222,8 +222,8 @@ def quicklook_data(
     """Gather what the four panels show, three bands of it; ``coarse`` are those of the mosaic, (y, x, 3)."""
     bands, _ = choose_bands(run.scene.wavelength_nm)
     chosen = list(bands)
-    attention = load_attention(products.of("attend").path / "attention.zarr")
-    found = load_class_map(products.of("draw_map").path / "class_map.zarr")
+    attention = load_attention(products["attend"].path / "attention.zarr")
+    found = load_class_map(products["draw_map"].path / "class_map.zarr")
     order = np.argsort(attention.rank.ravel(), kind="stable")
     accuracy = receipt.get("accuracy")
     moment = run.settings.moment  # of a farm that grows
@@ -308,7 +308,7 @@ def scans_told(run: SurveyRun, seconds: float) -> dict[str, Any]:
 
 def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
     """``plan``, and what not every survey has: see `flows.publish.receipt.FINDINGS`."""
-    plan = load_plan(products.of("attend"))
+    plan = load_plan(products["attend"])
     told: dict[str, Any] = {
         "kind": plan.kind,
         "reason": plan.reason,
@@ -320,7 +320,7 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
         "out_of_reach": plan.out_of_reach,
     }
     if run.raster is None:
-        told["orientation"] = load_orientation(products.of("compare_turned"))
+        told["orientation"] = load_orientation(products["compare_turned"])
     if plan.threshold is not None:  # what it left, and the score that was not worth more seconds
         told |= {
             "threshold": plan.threshold,
@@ -333,7 +333,7 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
         found["recording"] = _recording(run, run.recorded, plan)
     if run.budget is not None:
         found["kept"] = run.budget.told(plan.seats) | {"stored_bytes": _stored_detail(run, products)}
-    if (memory := told_of_memory(products.of("draw_map").path)) is not None:
+    if (memory := told_of_memory(products["draw_map"].path)) is not None:
         found["memory"] = memory
     if run.settings.look != LOOK_WHOLE:
         asked = run.grid.valid_share().ravel() > 0 if run.zones.shown is None else run.zones.shown
@@ -347,7 +347,7 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
         pointing["fine"]["partly_seen"] = int(np.count_nonzero(seen_shares(run, products.patches) < 1))
     if pointing:
         found["pointing"] = {"prior_px": run.settings.pointing_px, **pointing}
-    class_map = products.of("draw_map")
+    class_map = products["draw_map"]
     drawn = load_class_map(class_map.path / "class_map.zarr")
     posed = next((load_ground_map(ref.path / STORE) for ref in products.there("ground")), None)
     found |= find_ground(run, posed, drawn, BeliefStore(class_map.path / "belief.zarr")) | find_zones(run, drawn)

@@ -84,7 +84,7 @@ def field_map(
 def sweeps_shown(run: SurveyRun, products: Products, plan: FinePlan) -> list[SweepShown]:
     """The sweeps of a run in the order in which they were taken: where each looked, and when."""
     passes = (("capture_coarse", run.plan.coarse), ("capture_fine", plan.sweeps))
-    taken = [(sweep, products.of(stage).path / f"{sweep.name}.zarr") for stage, sweeps in passes for sweep in sweeps]
+    taken = [(sweep, products[stage].path / f"{sweep.name}.zarr") for stage, sweeps in passes for sweep in sweeps]
     return [
         SweepShown(block_of(sweep, run), sweep.kind, _sweep_words(run, sweep, path, f"{number} of {len(taken)}"))
         for number, (sweep, path) in enumerate(taken, 1)

@@ -90,6 +90,10 @@ class SurveySettings(_Declared):  # type: ignore[misc]
         made._settings = settings
         return made
 
+    def with_rig_of(self, file: str) -> SurveySettings:
+        """Return the same with the table [rig] of another settings file (SettingsError: it cannot be used)."""
+        return SurveySettings.of(replace(self.settings(), rig=load_settings(file).rig))
+
     @property
     def name_of_run(self) -> str:
         """Return the field's name, or its scene's."""
@@ -110,12 +114,12 @@ def _model(table: str) -> type[BaseModel]:
 
 
 def at_due_time(settings: Settings, due: datetime) -> Settings:
-    """Return the settings of a scheduled visit: named by its due time, on its day, after the field's newest run.
+    """Return the settings of a scheduled visit: named by its due time, after what the field's newest run left.
 
-    What the settings say of visit, day and prior stays.
+    The farm is as on that day by this machine's clock. What the settings say of visit, day and prior stays.
     """
     visit = settings.visit or due.astimezone(UTC).isoformat().replace("+00:00", "Z")
     asked = replace(settings, visit=visit, prior="latest" if settings.prior == "auto" else settings.prior)
     if asked.source == "sim" and asked.scene in BUILT_IN_SCENES and asked.day is None:
-        return replace(asked, day=due.timetuple().tm_yday)
+        return replace(asked, day=due.astimezone().timetuple().tm_yday)
     return asked

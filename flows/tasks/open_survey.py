@@ -33,7 +33,6 @@ else:
     prefect_concurrency = deferred("prefect.concurrency.sync")
 
 RIG_LIMIT = "rig"  # Prefect's global concurrency limit, where the server has one of that name
-
 OF_THE_SURVEY = (
     *(choose_effects, capture_coarse, register_coarse, locate, rectify, average_raster, attend),
     *(capture_fine, register_fine, cut_patches, take_patches, draw_map, compare_turned, ground, evaluate),
@@ -72,10 +71,6 @@ class RunRef:
 
 class Products(dict[str, StageRef]):
     """The stores of a survey, by the stages that left them."""
-
-    def of(self, stage: str) -> StageRef:
-        """Return the store of a stage that ran."""
-        return self[stage]
 
     @property
     def mosaic(self) -> StageRef:
@@ -138,7 +133,7 @@ class OpenSurvey:
             if captures and self.run.settings.source == "rig" and self.capture_deployment is None:
                 if inside_flow():
                     held.enter_context(prefect_concurrency.concurrency(RIG_LIMIT, occupy=1, lease_duration=60))
-                held.enter_context(rig_to_oneself(self.run.settings, f"a survey of {self.run.name}"))
+                held.enter_context(rig_to_oneself(self.run.settings.rig.port, f"a survey of {self.run.name}"))
             held.enter_context(self.run.archive.in_use())
             held.enter_context(self.run.settings.crew.open())
             yield

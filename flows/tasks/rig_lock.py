@@ -15,44 +15,31 @@ import os
 import re
 import socket
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from flows.settings.survey_settings import Settings
 from pipeline.errors import ArchiveError, RigError
 from storage.archive.staging import take_lock
 
 FIXED_FOLDER = Path("/tmp")  # not TMPDIR, of which each user may have another
-A_LOOK_S = 1.0
 _LONGEST_NAME = 60  # of the 107 bytes that a name in the kernel may have; the rest is for its holder's words
 _NAMES = Path("/proc/net/unix")
 
 
 @dataclass
 class RigLock:
-    """The lock of one rig: a name in the kernel, or a file. Of the simulated rig each archive has its own."""
+    """The lock of one rig: a name in the kernel, or a file."""
 
     place: Path | str
     _release: Callable[[], None] | None = field(default=None, repr=False)
 
-    @property
-    def held(self) -> bool:
+    def take(self, words: str) -> bool:
+        """Try to take it; ``words`` say who holds it. RigError: it cannot be had at all, ArchiveError: a link."""
+        if self._release is None:
+            self._release = hold_place(self.place, f"{words} (process {os.getpid()})")
         return self._release is not None
-
-    def take(self, words: str = "") -> bool:
-        """Try to take it, ``words`` telling who holds it. RigError: it cannot be had at all, ArchiveError: a link."""
-        if not self.held:
-            self._release = hold_place(self.place, f"{words or 'a survey'} (process {os.getpid()})")
-        return self.held
-
-    def take_soon(self, words: str = "") -> bool:
-        """Take it now or in a moment: another process may only look whether the rig is free."""
-        if not self.take(words):
-            time.sleep(A_LOOK_S)
-        return self.take(words)
 
     def release(self) -> None:
         """Let go; harmless where it is not held."""
@@ -70,11 +57,8 @@ class RigLock:
         return "another process"
 
 
-def rig_lock(settings: Settings, archive: Path) -> RigLock:
-    """The lock of the rig that a survey looks through."""
-    port = _port(settings)
-    if port is None:
-        return RigLock(archive / ".locks" / "rig-sim.lock")
+def rig_lock(port: str) -> RigLock:
+    """Return the lock of the rig at a port."""
     name = f"spectralzoom-rig-{_as_name(port)}"
     return RigLock(name if sys.platform == "linux" else FIXED_FOLDER / f"{name}.lock")
 
@@ -118,22 +102,15 @@ def _bind(held: ExitStack, name: str) -> None:
 
 
 @contextmanager
-def rig_to_oneself(settings: Settings, words: str) -> Iterator[None]:
-    """Hold the rig while the block runs (RigError: another survey holds it); the simulated one needs no holding."""
-    if _port(settings) is None:
-        yield
-        return
-    lock = rig_lock(settings, Path())
-    if not lock.take_soon(words):
+def rig_to_oneself(port: str, words: str) -> Iterator[None]:
+    """Hold the rig at a port while the block runs (RigError: another survey holds it)."""
+    lock = rig_lock(port)
+    if not lock.take(words):
         raise RigError(f"the rig is in use by {lock.holder()}; wait until that survey has ended, or end it")
     try:
         yield
     finally:
         lock.release()
-
-
-def _port(settings: Settings) -> str | None:
-    return settings.rig.port if settings.source == "rig" else None
 
 
 def _as_name(port: str) -> str:

@@ -7,12 +7,10 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from flows.settings.survey_settings import Settings
 from flows.tasks import rig_lock as rig_locks
 from flows.tasks.rig_lock import RigLock, rig_lock
 from pipeline.errors import ArchiveError, RigError
@@ -22,22 +20,12 @@ ROOT = Path(__file__).parents[3]
 PORT = f"/dev/ttyTEST{os.getpid()}"  # two runs of these tests on one machine are two rigs
 TAKES = """
 import os, sys
-from dataclasses import replace
-from pathlib import Path
 os.access = lambda *given, **named: False  # /run/lock is for others
 from flows.tasks.rig_lock import rig_lock
-from flows.settings.survey_settings import Settings
-settings = Settings()
-lock = rig_lock(replace(settings, source="rig", rig=replace(settings.rig, port=sys.argv[1])), Path())
+lock = rig_lock(sys.argv[1])
 print(lock.take("a survey"), flush=True)
 sys.stdin.read()
 """
-
-
-def lock_of(port: str = PORT) -> RigLock:
-    """The lock of the rig at a port."""
-    settings = Settings()
-    return rig_lock(replace(settings, source="rig", rig=replace(settings.rig, port=port)), Path())
 
 
 @contextmanager
@@ -69,25 +57,25 @@ def test_three_users_with_folders_of_their_own(tmp_path: Path) -> None:
     """With /run/lock shut and another TMPDIR each, one of three has the rig, and it is free once that one is killed."""
     with takers(tmp_path, 3) as tried:
         assert [took for _, took in tried] == [True, False, False]
-        lock, holder = lock_of(), tried[0][0]
-        assert not lock.take()
+        lock, holder = rig_lock(PORT), tried[0][0]
+        assert not lock.take("a survey")
         assert lock.holder() == f"a survey (process {holder.pid})"
         holder.kill()
         holder.wait()
         assert lock.take("by hand")
-        assert lock_of().holder() == f"by hand (process {os.getpid()})"
+        assert rig_lock(PORT).holder() == f"by hand (process {os.getpid()})"
         lock.release()
-    assert lock_of().holder() == "another process"
+    assert rig_lock(PORT).holder() == "another process"
 
 
 def test_locks_are_of_the_port_and_say_their_holder(tmp_path: Path) -> None:
     """A link to the device is the device; words of a killed process are not kept."""
     (tmp_path / "tty").touch()
     (tmp_path / "by-id").symlink_to(tmp_path / "tty")
-    assert lock_of(str(tmp_path / "by-id")).place == lock_of(str(tmp_path / "tty")).place
-    one, other = (lock_of(f"socket://{'a' * 200}:{port}") for port in (5000, 5001))
-    assert one.take()
-    assert other.take()
+    assert rig_lock(str(tmp_path / "by-id")).place == rig_lock(str(tmp_path / "tty")).place
+    one, other = (rig_lock(f"socket://{'a' * 200}:{port}") for port in (5000, 5001))
+    assert one.take("a survey")
+    assert other.take("a survey")
     one.release()
     other.release()
     path = tmp_path / "rig.lock"
@@ -106,19 +94,19 @@ def test_a_rig_that_cannot_be_locked_is_not_used(monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr(rig_locks.socket, "socket", refuse)
     with pytest.raises(RigError, match=r"cannot lock the rig .*: Operation not permitted; .* goes on without"):
-        lock_of().take()
+        rig_lock(PORT).take("a survey")
 
 
 def test_a_system_without_such_names_uses_one_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Elsewhere than on Linux a file at a fixed place is the lock, whatever TMPDIR says, and links are refused."""
     monkeypatch.setattr(rig_locks.sys, "platform", "darwin")
-    place = lock_of("/dev/cu.usb").place
+    place = rig_lock("/dev/cu.usb").place
     monkeypatch.setenv("TMPDIR", str(tmp_path))
-    assert lock_of("/dev/cu.usb").place == place == Path("/tmp/spectralzoom-rig-dev-cu.usb.lock")
+    assert rig_lock("/dev/cu.usb").place == place == Path("/tmp/spectralzoom-rig-dev-cu.usb.lock")
     monkeypatch.setattr(rig_locks, "FIXED_FOLDER", tmp_path)
-    lock, other = lock_of("/dev/cu.usb"), lock_of("/dev/cu.usb")
+    lock, other = rig_lock("/dev/cu.usb"), rig_lock("/dev/cu.usb")
     assert lock.take("a survey")
-    assert not other.take()
+    assert not other.take("a survey")
     assert other.holder() == f"a survey (process {os.getpid()})"
     lock.release()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -123,6 +124,15 @@ def test_a_password_is_no_parameter() -> None:
     assert "secret-4711" not in SurveySettings.of(settings).model_dump_json()
     with pytest.raises(ValidationError, match=r"rig\.password"):
         SurveySettings(rig={"password": "secret-4711"})
+
+
+def test_the_rig_of_a_pass_is_that_of_its_own_machine(tmp_path: Path) -> None:
+    """Ports and passwords stand in a file there; all else is what the survey asks for."""
+    (tmp_path / "rig.toml").write_text('[rig]\nport = "/dev/ttyRIG"\npassword = "secret-4711"\n')
+    asked = SurveySettings(source="rig", scene="field", size="64x64", wavelengths="500,600", seconds=5)
+    here = asked.with_rig_of(str(tmp_path / "rig.toml")).settings()
+    assert (here.rig.port, here.rig.password) == ("/dev/ttyRIG", "secret-4711")
+    assert replace(here, rig=asked.settings().rig) == asked.settings()
 
 
 def test_a_wrong_parameter_is_refused_with_the_message_of_the_command_line() -> None:
