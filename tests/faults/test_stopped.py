@@ -39,7 +39,7 @@ PLACES = {  # function and call before which a survey is stopped that has its ma
     "in the controls": ("flows.tasks.stages.accuracy:run_controls", 1, signal.SIGKILL),
     "stored and not added": ("flows.publish.publishing:extend_with_accuracy", 1, signal.SIGKILL),
     "drawn anew": ("flows.publish.run_folder:draw_quicklook", 1, signal.SIGTERM),
-    "after the run has changed": ("storage.archive.run_folders:remove_tree", 1, signal.SIGKILL),
+    "after the run has changed": ("storage.archive.run_folders:remove_tree", 2, signal.SIGKILL),
 }
 ADDED = "after the run has changed"
 KILLS = 3

@@ -199,12 +199,21 @@ def newest_run(flow: str, count: int) -> tuple[Any, dict[str, Any]]:
     It hears of tasks by events, of the last one after the flow has ended.
     """
     from prefect.client.orchestration import get_client
-    from prefect.client.schemas.filters import FlowFilter, FlowFilterName, FlowRunFilter, FlowRunFilterId
+    from prefect.client.schemas.filters import (
+        FlowFilter,
+        FlowFilterName,
+        FlowRunFilter,
+        FlowRunFilterId,
+        FlowRunFilterStartTime,
+    )
     from prefect.client.schemas.sorting import FlowRunSort
 
     with get_client(sync_client=True) as client:
         named = FlowFilter(name=FlowFilterName(any_=[flow]))
-        (run,) = client.read_flow_runs(flow_filter=named, sort=FlowRunSort.START_TIME_DESC, limit=1)
+        begun = FlowRunFilter(start_time=FlowRunFilterStartTime(is_null_=False))  # others have deployments here
+        (run,) = client.read_flow_runs(
+            flow_filter=named, flow_run_filter=begun, sort=FlowRunSort.START_TIME_DESC, limit=1
+        )
         of_it, latest = FlowRunFilter(id=FlowRunFilterId(any_=[run.id])), time.monotonic() + RECORDED_S
         tasks = client.read_task_runs(flow_run_filter=of_it)
         while time.monotonic() < latest and not (

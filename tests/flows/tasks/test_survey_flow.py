@@ -162,6 +162,7 @@ def of_run(api: str) -> tuple[Any, dict[str, Any], list[str], dict[str, Any]]:
         FlowFilterName,
         FlowRunFilter,
         FlowRunFilterId,
+        FlowRunFilterStartTime,
         LogFilter,
         LogFilterFlowRunId,
     )
@@ -169,7 +170,10 @@ def of_run(api: str) -> tuple[Any, dict[str, Any], list[str], dict[str, Any]]:
 
     with get_client(sync_client=True) as client:
         named = FlowFilter(name=FlowFilterName(any_=["survey"]))
-        (run,) = client.read_flow_runs(flow_filter=named, sort=FlowRunSort.START_TIME_DESC, limit=1)
+        begun = FlowRunFilter(start_time=FlowRunFilterStartTime(is_null_=False))  # others have deployments here
+        (run,) = client.read_flow_runs(
+            flow_filter=named, flow_run_filter=begun, sort=FlowRunSort.START_TIME_DESC, limit=1
+        )
         tasks = client.read_task_runs(flow_run_filter=FlowRunFilter(id=FlowRunFilterId(any_=[run.id])))
         logs = client.read_logs(LogFilter(flow_run_id=LogFilterFlowRunId(any_=[run.id])))
         mine = ArtifactFilter(flow_run_id=ArtifactFilterFlowRunId(any_=[run.id]))
