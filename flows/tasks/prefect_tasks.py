@@ -27,7 +27,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 def inside_flow() -> bool:
     """Return whether a Prefect flow is being run, here and now."""
-    return "prefect" in sys.modules and prefect_context.FlowRunContext.get() is not None
+    return "prefect.context" in sys.modules and prefect_context.FlowRunContext.get() is not None
 
 
 def as_task(function: Function, name: str, *, retries: int = 0) -> Function:
