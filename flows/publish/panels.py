@@ -106,8 +106,8 @@ def outline(chosen: NDArray[np.bool_], patch_px: int, shape: tuple[int, int]) ->
     return segments
 
 
-def draw_scale(axes: Axes, shape: tuple[int, ...], pixel_mrad: float) -> None:
-    """A bar of a round number of px in the lower left corner, with its angle."""
+def draw_scale(axes: Axes, shape: tuple[int, ...], pixel_mrad: float | None) -> None:
+    """Draw a bar of a round number of px in the lower left corner, with its angle; None of a raster, which has none."""
     height, width = shape[:2]
     inch_x, inch_y = (size / inches for size, inches in zip((width, height), panel_inches(axes), strict=True))
     most = max(width / 4, 1)
@@ -116,7 +116,7 @@ def draw_scale(axes: Axes, shape: tuple[int, ...], pixel_mrad: float) -> None:
     left, bottom = 0.14 * inch_x - 0.5, height - 0.5 - 0.14 * inch_y
     bar = Rectangle((left, bottom - 0.07 * inch_y), length, 0.07 * inch_y, facecolor="white", edgecolor="black")
     axes.add_patch(bar)
-    text = f"{length} px = {length * pixel_mrad:.3g} mrad"
+    text = f"{length} px" if pixel_mrad is None else f"{length} px = {length * pixel_mrad:.3g} mrad"
     label = axes.text(left, bottom - 0.12 * inch_y, text, color="white", size=11, va="bottom", weight="bold")
     label.set_path_effects(HALO)
 

@@ -57,7 +57,7 @@ class QuicklookData:
     class_colours: NDArray[np.integer] | None = None  # (class, 3) 0..255; None for a colour-blind safe palette
     truth: NDArray[np.integer] | None = None  # (y, x), 255 unlabelled
     confidence: NDArray[np.floating] | None = None  # (y, x) 0..1, shown where there is no truth
-    pixel_mrad: float = 0.105714
+    pixel_mrad: float | None = 0.105714
     along: Axis = "x"  # of the scene along which the raw lines lie
     note: str = ""  # at the end of the title line, such as the accuracy
     scan: bool = False  # a plain scan, which looked nowhere twice

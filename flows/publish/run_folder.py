@@ -252,7 +252,7 @@ def quicklook_data(
         class_colours=found.colours,
         truth=run.labels,
         confidence=found.confidence,
-        pixel_mrad=run.camera.ifov_rad * 1e3,
+        pixel_mrad=None if run.raster is not None else run.camera.ifov_rad * 1e3,
         along=run.plan.along,
         note="   ·   ".join(notes),
     )

@@ -162,6 +162,8 @@ def test_scale_bar_is_a_round_number_of_at_most_a_quarter(width, length):
     draw_scale(axes, (100, width), 0.1)
     assert axes.patches[0].get_width() == length
     assert axes.texts[0].get_text().startswith(f"{length} px = ")
+    draw_scale(axes, (100, width), None)
+    assert axes.texts[1].get_text() == f"{length} px"  # a raster has no view angles
 
 
 def test_sweeps_stand_apart_and_shorter_ones_are_filled_up():
