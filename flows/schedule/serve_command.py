@@ -61,6 +61,7 @@ removed.update(
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 UNITS_S = {"s": 1, "m": 60, "h": 3600, "d": 86400}
 LEAST, MOST = timedelta(minutes=1), timedelta(days=366)
+STOPPED_AGAIN_S = 15.0  # after which a runner that was asked to stop is asked again; pausing takes less than one
 AGAIN_S = 2.0  # between two tries to reach a server that has gone
 
 
@@ -273,7 +274,13 @@ async def _run(deployments: Sequence[Any], limit: int) -> None:
         await runner.aadd_deployment(one)
     running = asyncio.ensure_future(runner.start())
     await asyncio.sleep(0)  # here it takes SIGTERM for itself, and would end without having paused the schedules
-    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, running.cancel)  # SIGINT may be ignored here
+    loop = asyncio.get_running_loop()
+
+    def stop() -> None:
+        running.cancel()
+        loop.call_later(STOPPED_AGAIN_S, stop)  # the runner's observer of cancelled runs may swallow the first one
+
+    loop.add_signal_handler(signal.SIGTERM, stop)  # SIGINT may be ignored here
     await running
 
 
