@@ -21,12 +21,17 @@ from tests.house.source_tree import (  # noqa: E402
     circles,
     files_by_folder,
     files_of_tests,
+    functions,
     imported_in_functions,
+    inlinable,
     lines_of,
+    parameters_of_type,
     shared_class_names,
     source,
+    statements,
 )
 
+FEW = 3  # statements, at most, of a function that says little more than its name
 SHORT = 60  # lines, below which a file is short
 SURVEY = ("survey", "--scene", "farm", "--size", "192x160", "--seconds", "6", "--engine", "plain")
 
@@ -47,6 +52,10 @@ def figures() -> Iterator[tuple[str, str, str]]:
     by_room = {room: sum(count for path, count in lines.items() if path.parts[0] == room) for room in ROOMS}
     yield "source lines", str(sum(lines.values())), ", ".join(f"{room} {count}" for room, count in by_room.items())
     yield "source files", str(len(lines)), ""
+    yield "statements", str(statements(source())), ""
+    small = inlinable(source(), FEW)
+    yield "functions", str(len(list(functions(source())))), f"{len(small)} of at most {FEW} statements have one caller"
+    yield "parameters that hold all Settings", str(parameters_of_type(source(), "Settings")), ""
     folder, most = files_by_folder([*source(), *files_of_tests()]).most_common(1)[0]
     yield "files in a folder, most", str(most), folder
     found = circles(source())

@@ -92,6 +92,43 @@ def shared_class_names(trees: Trees) -> dict[str, int]:
     return {name: count for name, count in names.items() if count > 1}
 
 
+def statements(trees: Trees) -> int:
+    """Return how many statements the files have."""
+    return sum(isinstance(node, ast.stmt) for tree in trees.values() for node in nodes(tree))
+
+
+def functions(trees: Trees) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef]:
+    """Yield every function and method."""
+    for tree in trees.values():
+        yield from (node for node in nodes(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef))
+
+
+def inlinable(trees: Trees, most: int) -> list[str]:
+    """Return the names of undecorated functions of at most ``most`` statements that are named in one place."""
+    named = Counter[str]()
+    for tree in trees.values():
+        named.update(node.id for node in nodes(tree) if isinstance(node, ast.Name))
+        named.update(node.attr for node in nodes(tree) if isinstance(node, ast.Attribute))
+    return [
+        one.name
+        for one in functions(trees)
+        if named[one.name] == 1
+        and not one.decorator_list
+        and sum(isinstance(x, ast.stmt) for x in nodes(one)) - 1 <= most
+    ]
+
+
+def parameters_of_type(trees: Trees, name: str) -> int:
+    """Return how many parameters of functions are annotated as a type of this name."""
+    parameters = (
+        given.annotation
+        for one in functions(trees)
+        for given in (*one.args.args, *one.args.kwonlyargs)
+        if given.annotation
+    )
+    return sum(name in ast.unparse(annotation).split(" | ") for annotation in parameters)
+
+
 def public(tree: ast.AST) -> Iterator[Documented]:
     """Functions and classes whose names begin with no underscore, wherever they stand: in others too."""
     return (node for node in nodes(tree) if isinstance(node, Documented) and not node.name.startswith("_"))
