@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flows.publish.receipt_table import FOREIGN
 from flows.settings.values import LOOK_WHOLE
 from flows.tasks.memory import told_of_memory
 from flows.tasks.run import SurveyRun
 from flows.tasks.stages.maps import strange_pixels
-from flows.terminal.figures import area_words, counted, format_count, format_percent
 from models.evaluation.expected_scores import expected_counts
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace, areas_by_number
@@ -26,10 +26,7 @@ from storage.arrays.class_maps import BeliefStore, ClassMap
 from storage.arrays.ground_maps import GroundMap
 
 OLDER_DAYS = (1, 7, 30)  # since a look, of which the hectares are told
-MOST_CHANGES = 4  # told in words
 PLOTS_FILE = "plots.csv"
-LEADING = 3  # classes of a plot that are told in words
-FOREIGN = 0.2  # share of a map that is unknown from which on its weights are the wrong ones
 STRIP_ROWS = 256  # of a belief that are read at a time
 
 
@@ -93,26 +90,6 @@ def changed_hectares(place: FieldPlace, old_class: NDArray[np.uint8], found: Cla
     return [[float(areas[pair]) / M2_PER_HECTARE, names[pair // count], names[pair % count]] for pair in largest]
 
 
-def ground_words(ground: Mapping[str, Any]) -> str:
-    """What the classes cover on the ground, what of it changed, and what was not looked at for long."""
-    areas = [f"{_spaced(name)} {area_words(area)}" for name, area in ground["areas_ha"].items() if area]
-    place = f"{ground['crs']}, {ground['resolution_m']:.4g} m a pixel"
-    words = [f"On the ground ({place}) the classes cover {', '.join(areas)}."]
-    if changes := ground.get("changes_ha"):
-        told = [f"{_spaced(old)} to {_spaced(new)} {area_words(area)}" for area, old, new in changes[:MOST_CHANGES]]
-        whole = area_words(sum(area for area, _, _ in changes))
-        words.append(f"Of it {whole} changed since the look before: {', '.join(told)}.")
-    older = {int(days): area for days, area in ground.get("older_ha", {}).items() if area}
-    if older:
-        ago = [f"{area_words(area)} more than {counted(days, 'day')} ago" for days, area in older.items()]
-        words.append(f"Last looked at: {', '.join(ago)}.")
-    return " ".join(words)
-
-
-def _spaced(name: str) -> str:
-    return name.replace("_", " ")
-
-
 def find_zones(run: SurveyRun, drawn: ClassMap) -> dict[str, Any]:
     """``zones``: how much of the field is kept to; ``plots``: a row each. Empty for a survey without either."""
     zones, found = run.zones, dict[str, Any]()
@@ -134,39 +111,6 @@ def _ground_m2(run: SurveyRun, kept: NDArray[np.bool_]) -> float | None:
     rows, columns = (slice(0, size) for size in kept.shape)
     areas = run.zones.place.pixel_areas_m2(rows, columns)
     return None if areas is None else float(np.nansum(areas[kept]))
-
-
-def zone_words(zones: Mapping[str, Any]) -> str:
-    """How much of the field a survey kept to."""
-    ground = "" if zones["kept_m2"] is None else f", {area_words(zones['kept_m2'] / M2_PER_HECTARE)}"
-    share = format_percent(zones["kept_px"] / zones["field_px"])
-    no_go = f"; no-go zones touch {format_count(zones['no_go_px'])} px" if zones["no_go_px"] else ""
-    return (
-        f"The survey keeps to {format_count(zones['kept_px'])} px, {share} of the field{ground}{no_go}. Of the rest "
-        "no detail was asked for and no map is drawn."
-    )
-
-
-def plot_rows(plots: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
-    """The table of plots in words: name, ground, leading classes, confidence."""
-    return [
-        {
-            "plot": plot["plot"],
-            "area": f"{format_count(plot['pixels'])} px"
-            if plot["area_m2"] is None
-            else area_words(plot["area_m2"] / M2_PER_HECTARE),
-            "classes": _leading(plot["shares"]) if plot["mapped_pixels"] else "not mapped",
-            "confidence": format_percent(plot["confidence"]),
-        }
-        for plot in plots
-    ]
-
-
-def _leading(shares: Mapping[str, float | None]) -> str:
-    """The classes that cover most of a plot."""
-    known = [(share, name) for name, share in shares.items() if share]
-    most = sorted(known, key=lambda one: -one[0])[:LEADING]
-    return ", ".join(f"{name.replace('_', ' ')} {format_percent(share)}" for share, name in most)
 
 
 def plots_csv(plots: Sequence[Mapping[str, Any]]) -> str:

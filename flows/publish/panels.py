@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib import patheffects
 from matplotlib.axes import Axes
@@ -17,6 +19,7 @@ from numpy.typing import NDArray
 
 from flows.terminal.figures import area_words
 from pipeline.geometry.grid import UNLABELLED
+from storage.arrays.class_maps import ClassMap
 from storage.arrays.ground_maps import GroundMap
 from storage.arrays.quicklooks import stretch
 
@@ -126,6 +129,30 @@ def panel_inches(axes: Axes) -> tuple[float, float]:
     box, page = axes.get_window_extent(), axes.get_figure(root=True)
     dpi = 100.0 if page is None else page.dpi
     return float(box.width / dpi), float(box.height / dpi)
+
+
+def draw_difference(path: Path, maps: Sequence[ClassMap], titles: Sequence[str]) -> None:
+    """Draw two maps of one field with one list of classes, and red where they differ, as a PNG of three panels."""
+    old, new = (one.classes for one in maps)
+    tall = min(max(old.shape[0] / old.shape[1], 0.3), 2.0)
+    step = -(-max(old.shape) // GROUND_MOST_PX)
+    beyond = tuple((0, -size % step) for size in old.shape)
+    blocks = np.pad(old != new, beyond).reshape(-(-old.shape[0] // step), step, -1, step)
+    palette = class_palette(len(maps[0].names), maps[0].colours)
+    changed = np.where(blocks.any(axis=(1, 3))[..., None], (0.77, 0.15, 0.18), (0.96, 0.96, 0.95))
+    with mpl.rc_context({"text.parse_math": False}):  # names may hold dollar signs
+        figure = Figure(figsize=(14, 4.6 * tall + 1.2), dpi=GROUND_DPI, layout="constrained")
+        pictures = (*(class_rgb(one[::step, ::step], palette) for one in (old, new)), changed)
+        for axes, picture, title in zip(figure.subplots(1, 3), pictures, titles, strict=True):
+            axes.imshow(picture, interpolation="nearest")
+            axes.set_title(title, fontsize=9, loc="left")
+            axes.set_axis_off()
+        marks = [
+            Patch(facecolor=colour, edgecolor="0.4", linewidth=0.5, label=name.replace("_", " "))
+            for name, colour in zip(maps[0].names, palette.tolist(), strict=True)
+        ]
+        figure.legend(handles=marks, loc="outside lower center", ncols=6, fontsize=8, frameon=False)
+        save_png(figure, path)
 
 
 def draw_ground(found: GroundMap) -> bytes:
