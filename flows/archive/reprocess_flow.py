@@ -20,7 +20,6 @@ from pipeline.errors import ArchiveError
 def reprocess(
     archive: str,
     since: str | None = None,
-    stage: str | None = None,
     field: str | None = None,
     failed: bool = False,
     weights: str | None = None,
@@ -32,10 +31,10 @@ def reprocess(
     archive or a parameter cannot be used, or no field could be reprocessed.
     """
     named = None if weights is None else Path(weights)
-    code = run_reprocess(ReprocessRequest(archive, since, stage, field, failed, named, dry_run), on_stderr())
+    code = run_reprocess(ReprocessRequest(archive, since, field, failed, named, dry_run), on_stderr())
     if code == FAILED:
-        raise ArchiveError("no field could be reprocessed; reprocess-TIME.json beside the archive says why")
-    return "some fields failed; reprocess-TIME.json beside the archive says why" if code == PARTLY else "done"
+        raise ArchiveError("no field could be reprocessed; the log says why of each")
+    return "some fields failed; the log says why of each" if code == PARTLY else "done"
 
 
 def deployment(archive: str, number: int = 1) -> Any:

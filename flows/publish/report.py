@@ -103,7 +103,7 @@ def _visible_words(content: Any) -> Any:
         return visible(content)
     if isinstance(content, Mapping):
         return {visible(name): _visible_words(item) for name, item in content.items()}
-    if isinstance(content, list) and not (content and isinstance(content[0], int | float)):
+    if isinstance(content, list | tuple):
         return [_visible_words(item) for item in content]
     return content
 

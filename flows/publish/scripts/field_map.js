@@ -2,7 +2,7 @@
 // The map of a report: pictures and sweeps as layers in Leaflet, whose own control switches them.
 const facts = JSON.parse(document.getElementById("field-data").textContent);
 const [width, height] = facts.size, whole = [[-height, 0], [0, width]], layers = {};
-const map = L.map("map", { crs: L.CRS.Simple, attributionControl: false, zoomSnap: 0.25, minZoom: -6, maxZoom: 6 });
+globalThis.map = L.map("map", { crs: L.CRS.Simple, attributionControl: false, zoomSnap: 0.25, minZoom: -6, maxZoom: 6 });
 for (const { title, picture, boxes, shown, opacity } of facts.layers) {
   const rectangles = boxes.map(([[y0, y1, x0, x1], words]) => {
     const said = document.createElement("span");

@@ -283,7 +283,7 @@ def test_a_reprocessing_of_which_a_stage_fails(
         state = reprocess(archive=str(out), return_state=True)
     run, _ = newest_run("reprocess", 0)
     assert (state.is_failed(), run.name, run.state.message) == (True, f"reprocess-{out}", state.message)
-    assert "no field could be reprocessed; reprocess-TIME.json beside the archive says why" in state.message
+    assert "no field could be reprocessed; the log says why of each" in state.message
     (summary,) = tmp_path.glob("reprocess-*.json")
     assert [row["message"] for row in json.loads(summary.read_text())["fields"]] == [FULL_DISK]
     assert archive.find("segment", missing.key) is None
