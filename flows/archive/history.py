@@ -237,7 +237,7 @@ def render_history(history: FieldHistory, runs_at: str) -> str:
         parts = {name: [(at, row[of].get(name) if of else row[name]) for at, row in dated] for name in labels}
         return {labels[name]: [(at, one) for at, one in points if one is not None] for name, points in parts.items()}
 
-    charts = []
+    charts: list[tuple[str, Points, bool]] = []
     for unit, title in (("share", "Share of the map of each class"), ("ha", "Hectares of each class")):
         own = [(at, row["areas"]) for at, row in dated if row["unit"] == unit]
         names = dict.fromkeys(name for _, areas in own for name, area in areas.items() if area)

@@ -127,10 +127,10 @@ def field_map(
     if sweeps := _sweep_boxes(run, products, plan):
         layers.append(MapLayer("Sweeps, in their order", boxes=sweeps))
     counts = np.bincount(glance.class_map.ravel(), minlength=256) / max(glance.class_map.size, 1)
-    shares = [*counts[: len(glance.class_names)], counts[len(glance.class_names) :].sum()]
+    covered = [*counts[: len(glance.class_names)].tolist(), float(counts[len(glance.class_names) :].sum())]
     rows = [
         {"name": name.replace("_", " "), "share": format_percent(share), "colour": "#" + bytes(colour.tolist()).hex()}
-        for name, share, colour in zip((*glance.class_names, "no class"), shares, palette, strict=False)
+        for name, share, colour in zip((*glance.class_names, "no class"), covered, palette, strict=False)
         if share
     ]
     return FieldMap((width, height), layers, rows)

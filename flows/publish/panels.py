@@ -134,10 +134,11 @@ def panel_inches(axes: Axes) -> tuple[float, float]:
 def draw_difference(path: Path, maps: Sequence[ClassMap], titles: Sequence[str]) -> None:
     """Draw two maps of one field with one list of classes, and red where they differ, as a PNG of three panels."""
     old, new = (one.classes for one in maps)
+    differs: NDArray[np.bool_] = np.not_equal(old, new)
     tall = min(max(old.shape[0] / old.shape[1], 0.3), 2.0)
     step = -(-max(old.shape) // GROUND_MOST_PX)
     beyond = tuple((0, -size % step) for size in old.shape)
-    blocks = np.pad(old != new, beyond).reshape(-(-old.shape[0] // step), step, -1, step)
+    blocks = np.pad(differs, beyond).reshape(-(-old.shape[0] // step), step, -1, step)
     palette = class_palette(len(maps[0].names), maps[0].colours)
     changed = np.where(blocks.any(axis=(1, 3))[..., None], (0.77, 0.15, 0.18), (0.96, 0.96, 0.95))
     with mpl.rc_context({"text.parse_math": False}):  # names may hold dollar signs

@@ -209,7 +209,7 @@ def with_accuracy(
     added = {
         **{"accuracy_is": "judged", "judged": judged, "accuracy": accuracy},
         "settings": {**receipt["settings"], **settings},
-        "stages": [*(row for row in receipt["stages"] if row["name"] != stage.name), asdict(stage)],
+        "stages": [row for row in receipt["stages"] if row["name"] != stage.name] + [asdict(stage)],
         "products": {**stores, "accuracy": address, **files},
     }
     return build_receipt(**(receipt | added))

@@ -16,17 +16,17 @@ from flows.publish.receipt_table import finding_rows
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings, parse_settings
 from flows.tasks.capture_plan import plan_capture
-from flows.tasks.stages.maps import patch_columns
+from flows.tasks.field_work import seat_columns
 from models.network.spectral import SpectralBasis
 from models.reading.inference import Glance
+from models.reading.regions import whole_field
 from pipeline.errors import SettingsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
 from pipeline.planning.coverage import coarse_sweeps, full_sweeps, reach_px
 from pipeline.simulator.effects.pointing import PointingErrors
-from storage.archive.keys import StageRef
 from storage.arrays.layout import open_group, read_array
-from storage.arrays.mosaics import PatchWriter
+from storage.arrays.mosaics import PatchWriter, open_patches
 from tests.flows.conftest import FEW_BANDS
 from tests.remembered_work import without_effects
 
@@ -95,9 +95,9 @@ def test_unseen_pixels_take_the_coarse_look(tmp_path: Path) -> None:
     coarse = np.random.default_rng(1).normal(size=(*np.array(grid.padded_shape) // 2, 2)).astype(np.float32)
     writer = PatchWriter(tmp_path / "patches.zarr", seats, grid.seat_origin(seats), 4, np.array([500.0, 700.0]))
     writer.write(values, np.asarray(np.isfinite(values).all(axis=-1), np.bool_))
-    run = SimpleNamespace(grid=grid, weights=weights, scene=SimpleNamespace(wavelength_nm=np.array([500.0, 700.0])))
     seen = Glance(grid, coarse, np.empty(0, np.float32))
-    told, columns = patch_columns(run, StageRef("patches", "k", tmp_path), seen)  # type: ignore[arg-type]
+    store, nm = open_patches(tmp_path / "patches.zarr"), np.array([500.0, 700.0])
+    told, columns = seat_columns(weights, store, nm, seen, whole_field(grid))  # type: ignore[arg-type]
     assert told.tolist() == [1, 7]
     np.testing.assert_allclose(columns[1], values[2], rtol=1e-3)
     np.testing.assert_allclose(columns[0][:, 0], values[0][:, 0], rtol=1e-3)
