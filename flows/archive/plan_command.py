@@ -14,9 +14,10 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from flows.archive.field_figures import field_figures, figure_lines
 from flows.cli.app import AsJson
 from flows.cli.survey_verbs import NO_FLAGS, SurveyFlags, by_setting
+from flows.publish.findings import field_figures
+from flows.publish.receipt_table import finding_rows
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
 from flows.tasks.open_survey import JUDGED, STAGES, OpenSurvey
@@ -25,7 +26,7 @@ from flows.tasks.scan_choice import ScanChoice, as_told
 from flows.tasks.stage import Stage, Wanted
 from flows.tasks.stages.accuracy import evaluate
 from flows.tasks.stages.attention import load_plan
-from flows.terminal.figures import format_bytes, format_percent, format_points
+from flows.terminal.figures import format_bytes, format_count, format_percent, format_points, format_seconds
 from flows.terminal.processes import DONE
 from flows.terminal.progress import put_out
 from pipeline.errors import IncompleteStoreError, PipelineError
@@ -103,7 +104,7 @@ class Forecast:
     stages: list[StageForecast]
     refused: str | None = None
     scans: ScanChoice = field(default_factory=ScanChoice)
-    figures: Mapping[str, Any] = field(default_factory=dict)  # see `flows.archive.field_figures`
+    figures: Mapping[str, Any] = field(default_factory=dict)  # see `flows.publish.findings`
     kept: Mapping[str, Any] | None = None  # of a plain scan that is kept and read in part: at most, as receipts tell it
 
 
@@ -289,6 +290,28 @@ def show_plan(content: dict[str, Any], console: Console) -> None:
         console.print(f"preview: {escape(content['preview'])}", soft_wrap=True)
     if content["refused"] is not None:
         console.print(f"[yellow]refused here[/]: {escape(content['refused'])}", soft_wrap=True)
+
+
+def figure_lines(figures: Mapping[str, Any]) -> list[str]:
+    """The figures of the field and of the captures in words, a line each."""
+    ((_, ground),) = finding_rows({"field": figures})
+    size = "" if figures["view_deg"] is None else f"{' x '.join(map(format_count, figures['size_px']))} px, "
+    lines = [f"field: {size}{ground}"]
+    if figures["kept_share"] is not None:
+        lines.append(f"zones: {format_percent(figures['kept_share'])} of the field is kept to")
+    if figures["ground_pixel_m"] is None:
+        lines.append("no metres are known: a [pose], or a georeferenced scene, gives them and hectares an hour")
+    camera, count = figures["camera_s"], figures["lines"]
+    if camera is None:
+        return [*lines, "camera: none; the pixels of the raster are taken as they are"]
+    fine = f"{'' if figures['fine_planned'] else 'at most '}{format_seconds(camera['fine'])}"
+    fine_lines = "" if count["fine"] is None else f" and {format_count(count['fine'])}"
+    return [
+        *lines,
+        f"camera: {format_seconds(camera['all'])} (coarse {format_seconds(camera['coarse'])}, fine {fine}) for "
+        f"{format_count(count['coarse'])}{fine_lines} lines; every line at full exposure: "
+        f"{format_seconds(camera['full_scan'])} for {format_count(count['full_scan'])}",
+    ]
 
 
 def kept_words(kept: Mapping[str, Any]) -> str:

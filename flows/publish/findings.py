@@ -18,9 +18,10 @@ from flows.tasks.run import SurveyRun
 from flows.tasks.stages.maps import strange_pixels
 from models.evaluation.expected_scores import expected_counts
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace, areas_by_number
+from pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace, FieldScale, areas_by_number
 from pipeline.ground.georeference import class_areas_m2, crs_name, pixel_side_m
 from pipeline.ground.zones import figures_of_plots
+from pipeline.planning.fine_pass import FinePlan
 from storage.archive.keys import StageRef
 from storage.arrays.class_maps import BeliefStore, ClassMap
 from storage.arrays.ground_maps import GroundMap
@@ -28,6 +29,52 @@ from storage.arrays.ground_maps import GroundMap
 OLDER_DAYS = (1, 7, 30)  # since a look, of which the hectares are told
 PLOTS_FILE = "plots.csv"
 STRIP_ROWS = 256  # of a belief that are read at a time
+
+
+def field_figures(run: SurveyRun, fine: FinePlan | None) -> dict[str, Any]:
+    """Figures of the field and of the captures as JSON tells them; None for what nobody knows.
+
+    ``fine`` is the fine pass where it is planned already, else it takes what the budget leaves at most. Hectares are
+    those that the survey keeps to, and those an hour are of all of the camera's seconds. A raster has no camera: no
+    view but by a pose, no seconds, no lines.
+    """
+    scale, fine_s = run.zones.place.scale(run.camera.ifov_rad), run.plan.fine_s if fine is None else fine.seconds
+    seconds = run.plan.coarse_s + fine_s
+    kept = _kept(run, scale)
+    footprint, captured = scale.footprint, run.raster is None
+    camera_s = {"coarse": run.plan.coarse_s, "fine": fine_s, "all": seconds, "full_scan": run.plan.full_s}
+    lines = {
+        "coarse": sum(sweep.lines for sweep in run.plan.coarse),
+        "fine": None if fine is None else fine.lines,
+        "full_scan": sum(sweep.lines for sweep in run.plan.full),
+    }
+    return {
+        "size_px": [scale.shape[1], scale.shape[0]],
+        "view_deg": [scale.view_deg[1], scale.view_deg[0]] if captured or footprint is not None else None,
+        "ground_pixel_m": scale.pixel_m,
+        "range_m": None
+        if footprint is None
+        else dict(zip(("nearest", "median", "farthest"), footprint.range_m, strict=True)),
+        "footprint_m": None if footprint is None else {"width": footprint.width_m, "depth": footprint.depth_m},
+        "footprint_east_north_m": None if footprint is None else footprint.outline_m.tolist(),
+        "hectares": kept.hectares,
+        "kept_share": None if run.zones.kept is None else float(run.zones.kept.kept.mean()),
+        "camera_s": camera_s if captured else None,
+        "fine_planned": fine is not None or run.plan.plain,
+        "lines": lines if captured else None,
+        "hectares_per_hour": kept.hectares_per_hour(seconds) if captured else None,
+        "full_scan_hectares_per_hour": kept.hectares_per_hour(run.plan.full_s) if captured else None,
+    }
+
+
+def _kept(run: SurveyRun, scale: FieldScale) -> FieldScale:
+    """The scale of what zones leave of the field."""
+    if run.zones.kept is None or scale.area_m2 is None:
+        return scale
+    rows, columns = (slice(0, size) for size in scale.shape)
+    areas = run.zones.place.pixel_areas_m2(rows, columns)
+    assert areas is not None
+    return FieldScale(scale.shape, scale.view_deg, scale.pixel_m, float(np.nansum(areas[run.zones.kept.kept])))
 
 
 def find_ground(run: SurveyRun, posed: GroundMap | None, found: ClassMap, belief: BeliefStore) -> dict[str, Any]:

@@ -134,7 +134,7 @@ def panel_inches(axes: Axes) -> tuple[float, float]:
 def draw_difference(path: Path, maps: Sequence[ClassMap], titles: Sequence[str]) -> None:
     """Draw two maps of one field with one list of classes, and red where they differ, as a PNG of three panels."""
     old, new = (one.classes for one in maps)
-    differs: NDArray[np.bool_] = np.not_equal(old, new)
+    differs = np.asarray(old != new, np.bool_)
     tall = min(max(old.shape[0] / old.shape[1], 0.3), 2.0)
     step = -(-max(old.shape) // GROUND_MOST_PX)
     beyond = tuple((0, -size % step) for size in old.shape)

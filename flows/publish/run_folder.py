@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.archive.field_figures import field_figures
 from flows.publish.field_map import block_of, field_map, remembered
-from flows.publish.findings import PLOTS_FILE, find_ground, find_map, find_zones, plots_csv
+from flows.publish.findings import PLOTS_FILE, field_figures, find_ground, find_map, find_zones, plots_csv
 from flows.publish.panels import draw_ground
 from flows.publish.quicklook import QuicklookData, draw_quicklook
 from flows.publish.receipt import AccuracyIs, Receipt, build_receipt, check_receipt, with_accuracy

@@ -29,15 +29,11 @@ from models.evaluation.metrics import (
     iou_per_class,
     kappa,
 )
-from models.evaluation.placement import CONTROL_SHARE, Controls, run_controls
-from models.policies.policies import score_seats
+from models.evaluation.placement import CONTROL_SHARE, run_controls
 from models.reading.inference import Glance, segment
 from models.weights.files import Weights
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.geometry.scan import Sweep
-from pipeline.planning.fine_pass import price_of_seats
-from pipeline.planning.prices import count_lines
-from pipeline.planning.selection import frame_seats
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.region import read_seats
 from pipeline.simulator.effects.pointing import CommonOffset, PointingErrors
@@ -150,7 +146,7 @@ def _controls(
         "all": figures,
         "gap_closed": gap_closed(result["miou"], result["none"]["miou"], figures["miou"]),
         "controls": controls.as_dict(),
-        "controls_mode": _controls_mode(run, seen, controls),
+        "controls_share": controls.share,
     }
 
 
@@ -174,27 +170,6 @@ def _control_share(run: SurveyRun, patches: StageRef) -> float:
     if run.budget is None:
         return CONTROL_SHARE
     return len(open_patches(patches.path / "patches.zarr").seats) / len(run.budget.seats)
-
-
-def _controls_mode(run: SurveyRun, seen: Glance, controls: Controls) -> dict[str, Any]:
-    """What the controls' seats are, and what those of most gain would cost the rig: seats are not lines."""
-    grid, share, shares = run.grid, run.grid.valid_share().ravel(), run.zones.shares
-    seats = frame_seats(score_seats("gain", seen), controls.share, (share if shares is None else shares) > 0).seats
-    fine = share[seats].sum() * grid.patch**2  # samples beside the scene do not count
-    mode = {
-        "mode": "frame",
-        "share_of_seats": controls.share,
-        "seats": controls.seats,
-        "share_of_samples": (fine + np.prod(grid.coarse_shape)) / (grid.height * grid.width),
-    }
-    if run.plan.plain:  # whose lines are those of every placement
-        return mode
-    price = price_of_seats(grid, run.camera, run.settings.cost, run.plan.along, seats)
-    coarse_lines, full_lines = count_lines(run.plan.coarse), count_lines(run.plan.full)
-    return mode | {
-        "share_of_lines": (coarse_lines + price.lines) / full_lines,
-        "share_of_seconds": (run.plan.coarse_s + price.seconds) / run.plan.full_s,
-    }
 
 
 def _figures(run: SurveyRun, counts: NDArray[np.int64]) -> dict[str, Any]:
