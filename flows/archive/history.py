@@ -25,7 +25,7 @@ from flows.tasks.scores import score_of
 from flows.terminal.figures import DASH, area_words, counted, format_percent, format_seconds, known_number
 from flows.terminal.processes import DONE
 from flows.terminal.progress import print_json
-from pipeline.errors import ArchiveError, SettingsError
+from pipeline.errors import ArchiveError, SettingsError, visible
 from pipeline.lazy import deferred
 from pipeline.simulator.scenes.farm.farm_scene import USUAL_HOUR
 from storage.archive.archive import Archive
@@ -271,7 +271,7 @@ def _drawn(charts: Sequence[tuple[str, Points, bool]]) -> Iterator[tuple[str, st
         axes = figure.subplots()
         for name, points in known.items():
             if points:
-                label = name.replace("$", r"\$")
+                label = visible(name).replace("$", r"\$")
                 axes.plot(*zip(*points, strict=True), marker="o", markersize=4, label=label)
         axes.set_ylim(bottom=0)
         if is_share:

@@ -23,7 +23,6 @@ Receipt = dict[str, Any]
 AccuracyIs = Literal["judged", "pending", "left out", "without labels"]  # pending: it is worked out after the map
 Facts = dict[str, Any]
 COSTS = ("lines", "samples", "bytes_raw", "bytes_stored", "capture_s", "tokens", "multiply_adds")
-OF_A_RASTER = ("bytes_stored", "tokens", "multiply_adds")  # of which nothing is captured
 # what another run of the same seed has otherwise
 _OF_ONE_RUN = ("wall_s", "cpu_s", "peak_rss_bytes", "state", "manifest_sha256")
 
