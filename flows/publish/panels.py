@@ -9,12 +9,10 @@ from typing import IO, Any
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib import patheffects
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import hsv_to_rgb, to_rgb
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch, Rectangle
+from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from flows.terminal.figures import area_words
@@ -39,7 +37,6 @@ STYLE: Any = {
     "savefig.facecolor": "#fbfaf7",
 }
 UNLABELLED_COLOUR = (0.86, 0.86, 0.84)
-HALO: list[patheffects.AbstractPathEffect] = [patheffects.withStroke(linewidth=3, foreground="black")]
 # Okabe and Ito (2008), then Paul Tol's muted scheme (2021) without near twins: told apart by colour-blind readers
 _SAFE = (
     "#E69F00",
@@ -107,28 +104,6 @@ def outline(chosen: NDArray[np.bool_], patch_px: int, shape: tuple[int, int]) ->
         ends = np.minimum(np.stack([start, end], axis=1) * patch_px, limit) - 0.5
         segments += [[tuple(point) for point in pair] for pair in ends if (pair[0] != pair[1]).any()]
     return segments
-
-
-def draw_scale(axes: Axes, shape: tuple[int, ...], pixel_mrad: float) -> None:
-    """A bar of a round number of px in the lower left corner, with its angle."""
-    height, width = shape[:2]
-    inch_x, inch_y = (size / inches for size, inches in zip((width, height), panel_inches(axes), strict=True))
-    most = max(width / 4, 1)
-    power = 10 ** int(np.floor(np.log10(most)))
-    length = int(max(step * power for step in (1, 2, 5) if step * power <= most))
-    left, bottom = 0.14 * inch_x - 0.5, height - 0.5 - 0.14 * inch_y
-    bar = Rectangle((left, bottom - 0.07 * inch_y), length, 0.07 * inch_y, facecolor="white", edgecolor="black")
-    axes.add_patch(bar)
-    text = f"{length} px = {length * pixel_mrad:.3g} mrad"
-    label = axes.text(left, bottom - 0.12 * inch_y, text, color="white", size=11, va="bottom", weight="bold")
-    label.set_path_effects(HALO)
-
-
-def panel_inches(axes: Axes) -> tuple[float, float]:
-    """(width, height) of a panel on the page [in]."""
-    box, page = axes.get_window_extent(), axes.get_figure(root=True)
-    dpi = 100.0 if page is None else page.dpi
-    return float(box.width / dpi), float(box.height / dpi)
 
 
 def draw_difference(path: Path, maps: Sequence[ClassMap], titles: Sequence[str]) -> None:

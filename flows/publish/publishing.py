@@ -163,13 +163,11 @@ def small_jpeg(png: bytes) -> bytes:
     with Image.open(io.BytesIO(png)) as opened:
         picture = opened.convert("RGB")
     for width in WIDTHS_PX:
-        smaller = picture.copy()
+        smaller, file = picture.copy(), io.BytesIO()
         smaller.thumbnail((width, 10 * width))
-        for quality in (85, 70):
-            file = io.BytesIO()
-            smaller.save(file, "JPEG", quality=quality, optimize=True)
-            if len(file.getvalue()) * 4 / 3 <= MOST_BYTES - 4:
-                return file.getvalue()
+        smaller.save(file, "JPEG", quality=80, optimize=True)
+        if len(file.getvalue()) * 4 / 3 <= MOST_BYTES - 4:
+            break
     return file.getvalue()
 
 

@@ -111,33 +111,6 @@ class Accuracy(Score):
     controls: dict[str, Control]
 
 
-class Effect(_Part):
-    """One effect of the simulated rig: on or off, by which variant, and what that changes at most."""
-
-    name: str
-    state: str
-    variant: str | None
-    bound: float | None
-    measured: float | None
-    cost_s: float | None
-    why: str | None
-
-
-class EffectsTotal(_Part):
-    """Sum of the bounds beside the tolerance, and seconds saved."""
-
-    asked: str
-    tolerance: float | None
-    unit: str
-    bound: float | None
-    measured: float | None
-    on: int
-    off: int
-    cost_s: float
-    saved_s: float
-    saved_cheap_s: float
-
-
 class ReceiptFields(_Part):
     """All fields of a receipt. Those from ``field`` to ``pixels`` are findings, each only where it says something."""
 
@@ -154,8 +127,8 @@ class ReceiptFields(_Part):
     accuracy_is: AccuracyIs | None = None
     judged: str | None = None  # when accuracy was added
     accuracy: Accuracy | None = None
-    effects: list[Effect] | None = None  # of a simulated source
-    effects_total: EffectsTotal | None = None
+    effects: list[Facts] | None = None  # of a simulated source, with their bounds
+    effects_total: Facts | None = None  # sum of the bounds beside the tolerance, and seconds saved
     field: Facts | None = None  # its size, field of view, ground pixel and range, hectares an hour
     plan: Facts | None = None  # how the fine pass was laid out
     scans: Facts | None = None  # uniform ones by the scan performance table, where there is one

@@ -52,10 +52,10 @@ def cost_rows(savings: Mapping[str, Any]) -> list[dict[str, Any]]:
 def print_table(receipt: Receipt, console: Console) -> None:
     """Print the savings to the terminal."""
     table = Table(header_style="dim", box=SIMPLE_HEAD, show_edge=False)
-    for name in ("cost", "this survey", "everything", "ratio", "everything is"):
+    for name in ("cost", "this survey", "everything", "ratio"):
         table.add_column(name, justify="left" if name == "cost" else "right", no_wrap=name != "cost")
     for row in cost_rows(receipt["savings"]):
-        table.add_row(row["label"], row["done"], row["full"], format_percent(row["ratio"]), row["full_is"])
+        table.add_row(row["label"], row["done"], row["full"], format_percent(row["ratio"]))
     console.print(table)
 
 

@@ -245,7 +245,6 @@ def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: 
         class_colours=found.colours,
         truth=run.labels,
         confidence=found.confidence,
-        pixel_mrad=run.camera.ifov_rad * 1e3,
         along=run.plan.along,
         note="   ·   ".join(notes),
     )
