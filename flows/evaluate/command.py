@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from flows.evaluate.figures import seeds_of, summarise
 from flows.evaluate.frames import (
     COST,
     Candidate,
@@ -26,7 +25,7 @@ from flows.evaluate.frames import (
     scene_of,
     sort_frames,
 )
-from flows.evaluate.judge import BUDGETS, Record, Trial, judge_frame
+from flows.evaluate.judge import BUDGETS, Record, Trial, judge_frame, seeds_of, summarise
 from flows.terminal.processes import writing
 from flows.terminal.progress import StageProgress, on_stdout
 from flows.training.data import TrainingData, alike_notes

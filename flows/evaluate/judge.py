@@ -1,11 +1,14 @@
-"""One frame judged by one set of weights: its map by every policy at each share of the patches, and by plans of lines.
+"""One frame judged by one set of weights, and the figures of many: means over seeds, intervals over frames and seeds.
 
-A record holds plain lists and numbers: counts of labels and map, which add up over frames, and what each map costs.
+A record holds plain lists and numbers: counts of labels and map by every policy at each share of the patches and by
+plans of lines, which add up over frames, and what each map costs. Weights of frames left out in turn have no frame in
+common: together they are one seed of the training, judged on all of their frames. Weights that share a frame are
+different seeds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,8 +16,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.evaluate.frames import COST, Look
-from models.evaluation.metrics import confusion
-from models.evaluation.placement import RANDOM_DRAWS, gain_sums, oracle_gain
+from models.evaluation.metrics import (
+    average_accuracy,
+    confusion,
+    false_pixels,
+    gap_closed,
+    iou_per_class,
+    kappa,
+    mean_iou,
+    overall_accuracy,
+    paired_interval,
+)
+from models.evaluation.placement import RANDOM_DRAWS, captured_gain, gain_sums, oracle_gain
 from models.network.sizes import multiply_adds
 from models.policies.policies import score_multiply_adds, score_seats
 from models.reading.inference import segment
@@ -164,3 +177,160 @@ def _plans(look: Look, camera: LineCamera, along: Axis, seed: int) -> list[tuple
     found = [(policy, 0, ours(policy)) for policy in PLANNED]
     found.append((UNIFORM, 0, without_a_model(None)))
     return [*found, *((RANDOM, draw, without_a_model(draw)) for draw in range(RANDOM_DRAWS))]
+
+
+Runs = Sequence[Sequence[Record]]  # of each weights, or of each seed, the records of its frames
+COSTS = ("seats", "samples", "bytes", "multiply_adds", "capture_s", "full_s", "lines", "full_lines")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One policy at one share over all frames; a run is one seed with one draw. Zeros where a run has no frame."""
+
+    policy: str
+    share: float
+    counts: NDArray[np.int64]  # (run, frame, class, class)
+    of_seed: NDArray[np.intp]  # (run,)
+    parts: list[Record]  # rows of the records
+
+    def over_runs(self, figure: Callable[[Any], Any]) -> NDArray[np.float64]:
+        """A figure of each run's frames together, (run,) or (run, class)."""
+        return np.array([figure(run.sum(axis=0)) for run in self.counts])
+
+    @property
+    def judged(self) -> NDArray[np.bool_]:
+        """Frames that any run has, (frame,)."""
+        found: NDArray[np.bool_] = self.counts.sum(axis=(0, 2, 3)) > 0
+        return found
+
+
+def seeds_of(runs: Runs) -> list[list[int]]:
+    """Numbers of the weights of each seed: those with no frame in common, in the order given; without a frame none."""
+    seeds: list[tuple[set[str], list[int]]] = []
+    for number, records in enumerate(runs):
+        names = {record["frame"] for record in records}
+        if not names:
+            continue
+        for covered, members in seeds:
+            if not covered & names:
+                covered |= names
+                members.append(number)
+                break
+        else:
+            seeds.append((set(names), [number]))
+    return [members for _, members in seeds]
+
+
+def collect_row(seeds: Runs, policy: str, share: float, kind: str = "rows") -> Row | None:
+    """Gather the counts of one row, or of one of the ``plans``, from the records of all seeds; None without any."""
+    order = sorted({record["frame"] for records in seeds for record in records})
+    found = [
+        (number, order.index(record["frame"]), row)
+        for number, records in enumerate(seeds)
+        for record in records
+        for row in record[kind]
+        if (row["policy"], row["share"]) == (policy, share)
+    ]
+    if not found:
+        return None
+    draws = 1 + max(row["draw"] for _, _, row in found)
+    classes = len(found[0][2]["counts"])
+    counts = np.zeros((len(seeds) * draws, len(order), classes, classes), np.int64)
+    for number, at, row in found:
+        counts[number * draws + row["draw"], at] = row["counts"]
+    return Row(policy, share, counts, np.repeat(np.arange(len(seeds)), draws), [row for _, _, row in found])
+
+
+def difference(row: Row, other: Row | None, trial: Trial, draws: int) -> Record | None:
+    """Paired interval of one row less another, over the frames that both have; None without another."""
+    if other is None or other is row:
+        return None
+    both = row.judged & other.judged
+    if not both.any():
+        return {"difference": None, "low": None, "high": None, "frames": 0}
+    counts, seeds = (row.counts[:, both], other.counts[:, both]), (row.of_seed, other.of_seed)
+    found = paired_interval(*counts, seeds=seeds, draws=draws, seed=trial.seed)
+    return {**found.as_dict(), "frames": int(both.sum())}
+
+
+def summarise(runs: Runs, class_names: Sequence[str], trial: Trial, draws: int) -> Record:
+    """Give the figures of every row against every patch and against chance, and of every plan of lines.
+
+    ``runs`` are of each weights the records of `judge_frame`, ``draws`` those of the bootstrap.
+    """
+    seeds = [[record for number in members for record in runs[number]] for members in seeds_of(runs)]
+    shared = [(policy, share) for policy in (*trial.policies, ORACLE) for share in trial.shares]
+    keys = [("none", 0.0), *shared, ("all", 1.0)]
+    rows = {key: row for key in keys if (row := collect_row(seeds, *key)) is not None}
+    whole, none = rows["all", 1.0], rows["none", 0.0]
+    ends = [_mean(row.over_runs(mean_iou)) for row in (none, whole)]
+    support = whole.counts.sum(axis=3).max(axis=0).sum(axis=0)  # labelled pixels of each class, each frame once
+    table = []
+    for (policy, share), row in rows.items():
+        figures = {"policy": policy, "share": share, "uses_labels": policy == ORACLE, **_accuracy(row, class_names)}
+        figures["gap_closed"] = None if policy in ENDS else gap_closed(figures["miou"], *ends)
+        figures["captured_gain"] = captured_gain(*(sum(p[name] for p in row.parts) for name in ("gain", "best_gain")))
+        figures["against_all"] = difference(row, whole, trial, draws)
+        figures["against_random"] = difference(row, rows.get(("random", share)), trial, draws)
+        table.append(figures | {"cost": _cost(row, whole)})
+    named = dict(zip(class_names, support.tolist(), strict=True))
+    return {"rows": table, "support": named, "rig": _plan_figures(seeds, class_names, trial, draws)}
+
+
+def _plan_figures(seeds: Runs, class_names: Sequence[str], trial: Trial, draws: int) -> list[Record]:
+    """Give mIoU, seconds and lines of every plan at every budget, and ours against the two without a model.
+
+    A budget at which a frame has no plan is judged on the other frames, in every row alike; their number is said.
+    """
+    every = [(plan, budget) for plan in (*PLANNED, UNIFORM, RANDOM) for budget in BUDGETS]
+    rows = {key: row for key in every if (row := collect_row(seeds, *key, "plans")) is not None}
+    table = []
+    for (plan, budget), row in rows.items():
+        figures = {"policy": plan, "budget": budget, **_accuracy(row, class_names), "cost": _cost(row, row)}
+        for other, name in ((UNIFORM, "against_uniform"), (RANDOM, "against_random")):
+            figures[name] = difference(row, rows[other, budget], trial, draws) if plan in PLANNED else None
+        table.append(figures)
+    return table
+
+
+def _accuracy(row: Row, class_names: Sequence[str]) -> Record:
+    each = row.over_runs(mean_iou)
+    drawn = [each[row.of_seed == number] for number in np.unique(row.of_seed)]
+    seeds = np.array([_mean(some) for some in drawn])
+    classes = row.over_runs(iou_per_class)
+    false = row.over_runs(false_pixels).mean(axis=0).tolist()  # of a run
+    return {
+        "frames": int(row.judged.sum()),
+        "miou": _mean(each),
+        "spread": float(seeds.std(ddof=1)) if len(seeds) > 1 else None,
+        "draws_spread": _mean([some.std(ddof=1) for some in drawn]) if len(drawn[0]) > 1 else None,
+        "by_seed": seeds.tolist(),
+        "classes_averaged": int((~np.isnan(classes)).any(axis=0).sum()),
+        "pixel_accuracy": _mean(row.over_runs(overall_accuracy)),
+        "average_accuracy": _mean(row.over_runs(average_accuracy)),
+        "kappa": _mean(row.over_runs(kappa)),
+        "per_class_iou": dict(zip(class_names, [_mean(column) for column in classes.T], strict=True)),
+        "false_classes": {name: pixels for name, pixels in zip(class_names, false, strict=True) if pixels},
+    }
+
+
+def _cost(row: Row, whole: Row) -> Record:
+    """Give what a frame takes in the mean, of each cost, and its share of that of every patch."""
+    found = {}
+    for name in COSTS:
+        done, full = (_mean_or_none([one.get(name) for one in some.parts]) for some in (row, whole))
+        if done is not None:
+            found[name] = {"done": done, "ratio": done / full if full else None}
+    return found
+
+
+def _mean(values: Sequence[float] | NDArray[np.float64]) -> float:
+    """Mean of what is known; NaN where nothing is."""
+    known = np.asarray(values, np.float64)
+    known = known[~np.isnan(known)]
+    return float(known.mean()) if known.size else float("nan")
+
+
+def _mean_or_none(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None

@@ -109,13 +109,13 @@ def outline(chosen: NDArray[np.bool_], patch_px: int, shape: tuple[int, int]) ->
 def draw_difference(path: Path, maps: Sequence[ClassMap], titles: Sequence[str]) -> None:
     """Draw two maps of one field with one list of classes, and red where they differ, as a PNG of three panels."""
     old, new = (one.classes for one in maps)
-    differs = np.asarray(old != new, np.bool_)
+    differs = old != new
     tall = min(max(old.shape[0] / old.shape[1], 0.3), 2.0)
     step = -(-max(old.shape) // GROUND_MOST_PX)
     beyond = tuple((0, -size % step) for size in old.shape)
     blocks = np.pad(differs, beyond).reshape(-(-old.shape[0] // step), step, -1, step)
     palette = class_palette(len(maps[0].names), maps[0].colours)
-    changed = np.where(blocks.any(axis=(1, 3))[..., None], (0.77, 0.15, 0.18), (0.96, 0.96, 0.95))
+    changed = np.where(np.asarray(blocks.any(axis=(1, 3)))[..., None], (0.77, 0.15, 0.18), (0.96, 0.96, 0.95))
     with mpl.rc_context({"text.parse_math": False}):  # names may hold dollar signs
         figure = Figure(figsize=(14, 4.6 * tall + 1.2), dpi=GROUND_DPI, layout="constrained")
         pictures = (*(class_rgb(one[::step, ::step], palette) for one in (old, new)), changed)

@@ -228,4 +228,5 @@ def _heat_key(image: AxesImage, ends: tuple[str, str]) -> None:
     figure = image.axes.get_figure(root=False)
     assert figure is not None
     bar = figure.colorbar(image, ax=image.axes, orientation="horizontal", shrink=0.3, pad=0.01, aspect=30)
-    bar.set_ticks([image.norm.vmin or 0.0, image.norm.vmax or 1.0], labels=list(ends))
+    low, high = image.get_clim()
+    bar.set_ticks([low or 0.0, high or 1.0], labels=list(ends))

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from flows.archive import tables as archive_tables
+from flows.archive import commands as archive_tables
 from flows.archive.commands import command, contents, explain, gc, ls, run_verify
 from flows.settings.load import load_settings
 from flows.terminal.figures import DASH

@@ -14,9 +14,8 @@ from rich.console import Console
 from flows.cli.main import main
 from flows.evaluate import command as evaluate_command
 from flows.evaluate.command import KeptResults, evaluate_weights, run_evaluate
-from flows.evaluate.figures import collect_row, difference, seeds_of, summarise
 from flows.evaluate.frames import COST, EvaluateRequest, open_candidates
-from flows.evaluate.judge import BUDGETS, ORACLE, Trial, judge_frame
+from flows.evaluate.judge import BUDGETS, ORACLE, Trial, collect_row, difference, judge_frame, seeds_of, summarise
 from flows.evaluate.table import print_evaluation
 from flows.training.data import farm_test_data, pack_mask
 from flows.training.train import train_weights
