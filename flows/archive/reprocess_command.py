@@ -104,7 +104,15 @@ class ReprocessRequest:
 def run_reprocess(
     request: ReprocessRequest, console: Console, *, survey: Survey | None = None, as_json: bool = False
 ) -> int:
-    """Survey again what was asked for; progress on ``console``, the summary on stdout.
+    """Survey again what was asked for; progress on ``console``, the summary on stdout. Raises as `reprocess_fields`."""
+    content = reprocess_fields(request, console, survey)
+    put_out(content, _show, as_json=as_json)
+    failed = sum(row["state"] == "failed" for row in content["fields"])
+    return DONE if not failed else FAILED if failed == len(content["fields"]) else PARTLY
+
+
+def reprocess_fields(request: ReprocessRequest, console: Console, survey: Survey | None = None) -> dict[str, Any]:
+    """Survey again what was asked for, and return a row a field.
 
     Fields whose newest run is already as it would become are skipped: the same command goes on after an interruption.
     Raises SettingsError: a date that is none, or no field is called so; ArchiveError: the archive cannot be read or
@@ -123,9 +131,7 @@ def run_reprocess(
             if rows[-1]["new"] is not None:
                 renewed[generation.run.folder.name] = rows[-1]["new"]
             console.print(escape(_words(rows[-1])), soft_wrap=True)
-    put_out({"archive": opened.name, "dry_run": request.dry_run, "fields": rows}, _show, as_json=as_json)
-    failed = sum(row["state"] == "failed" for row in rows)
-    return DONE if not failed else FAILED if failed == len(rows) else PARTLY
+    return {"archive": opened.name, "dry_run": request.dry_run, "fields": rows}
 
 
 def _chosen(catalogue: Catalogue, request: ReprocessRequest) -> list[Generation]:

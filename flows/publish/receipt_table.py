@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from flows.publish.receipt import Receipt, is_pending
@@ -32,8 +33,8 @@ COST_LABELS = {
     "samples": ("samples on the field", format_count),
     "bytes_raw": ("raw data", format_bytes),
     "bytes_stored": ("stored data", format_bytes),
-    "tokens": ("tokens of the model", format_count),
-    "multiply_adds": ("multiply-adds of the model", format_count),
+    "tokens": ("model's tokens", format_count),
+    "multiply_adds": ("model's multiply-adds", format_count),
 }
 MOST_CHANGES = 4  # in words
 LEADING = 3  # classes of a plot in words
@@ -50,13 +51,16 @@ def cost_rows(savings: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def print_table(receipt: Receipt, console: Console) -> None:
-    """Print the savings to the terminal."""
+    """Print the savings to the terminal, and what became of a prior map or of weights that do not know the field."""
     table = Table(header_style="dim", box=SIMPLE_HEAD, show_edge=False)
     for name in ("cost", "this survey", "everything", "ratio"):
         table.add_column(name, justify="left" if name == "cost" else "right", no_wrap=name != "cost")
     for row in cost_rows(receipt["savings"]):
         table.add_row(row["label"], row["done"], row["full"], format_percent(row["ratio"]))
     console.print(table)
+    for name, words in finding_rows({name: receipt[name] for name in ("memory", "unknown") if name in receipt}):
+        if name != "unknown" or receipt["unknown"]["share"] > FOREIGN:
+            console.print(escape(f"{name} {words}"))
 
 
 def headline(receipt: Receipt, captured_again: float | None = None) -> str:
@@ -226,8 +230,9 @@ def _unknown_words(unknown: Mapping[str, Any], found: Mapping[str, Any]) -> str:
     return text
 
 
-def _scans_words(scans: Mapping[str, Mapping[str, Any]], _: object) -> str:
-    titles = {"taken": "this one", "best_in_time": "best in the same seconds", "reference": "nearly as good as any"}
+def _scans_words(scans: Mapping[str, Mapping[str, Any]], found: Mapping[str, Any]) -> str:
+    own = "this one, read whole" if "kept" in found else "this one"
+    titles = {"taken": own, "best_in_time": "best in the same seconds", "reference": "nearly as good as any"}
     return "; ".join(
         f"{title}: {scan_words(one['step'], one['exposure_ms'])}, {one['seconds']:.1f} s, about "
         f"{format_points(one['expected_miou'])} ± {format_points(one.get('expected_spread'))}"

@@ -107,5 +107,5 @@ def show_published(published: Published, out: str, console: Console) -> None:
     print_table(published.receipt, console)
     if is_remote(out):
         console.print(f"  {escape(out)}/runs/{published.folder.name}, and on this machine", soft_wrap=True)
-    for name in ("report.html", "quicklook.png", "receipt.json"):
-        console.print(f"  {escape(str(published.folder / name))}", soft_wrap=True)
+    beside = ", with quicklook.png and receipt.json beside it"
+    console.print(f"  {escape(str(published.folder / 'report.html'))}{beside}", soft_wrap=True)

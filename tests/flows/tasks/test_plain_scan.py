@@ -97,8 +97,8 @@ def test_what_is_read_in_part_is_not_promised_what_reading_everything_scores(
     """The record tells of scans that are read whole, and the sentence says so."""
     published = survey_png(tmp_path, weights=str(recorded), budget=None, scan_step="2", compute="40%", policy="sobel")
     page = (published.folder / "report.html").read_text(encoding="utf-8")
-    assert "such a scan, read whole, scores about" in page
-    assert "such a scan scores" not in page
+    assert "this one, read whole: " in page
+    assert "this one: " not in page
 
 
 def test_controls_say_nothing_of_a_scan(tmp_path: Path, survey_png: Survey) -> None:
@@ -121,7 +121,7 @@ def test_a_survey_in_two_passes_stands_beside_the_best_plain_scan(
     assert best["expected_miou"] > 0.9
     page = (published.folder / "report.html").read_text(encoding="utf-8")
     told = f"{100 * best['expected_miou']:.1f} ± {100 * best['expected_spread']:.1f}"
-    assert f"{best['seconds']:.1f} s) scores about {told} by the weights&#39; record" in page
+    assert f"{best['seconds']:.1f} s, about {told}" in page
     assert "taken" not in published.receipt["scans"]
 
 
