@@ -8,6 +8,7 @@ import io
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from dataclasses import field as dataclass_field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -69,6 +70,7 @@ class FieldHistory:
     archive: str
     runs: Sequence[Row]
     visits: Sequence[Mapping[str, str]] = ()
+    colours: Mapping[str, str] = dataclass_field(default_factory=dict)  # of the classes on the maps, as CSS writes them
 
     def to_dict(self) -> dict[str, Any]:
         """Return what is written as JSON."""
@@ -125,7 +127,12 @@ def read_histories(archive: Archive, field: str | None = None) -> list[FieldHist
         rows = [_row(run, maps.get(run.uri)) for run in own]
         mapped = [(run, row) for run, row in zip(own, rows, strict=True) if run.uri in maps][-MOST_VISITS:]
         visits = [_visit(archive, run, row, maps[run.uri]) for run, row in mapped]
-        found.append(FieldHistory(name, archive.name, rows, visits))
+        colours = {
+            one: f"#{bytes(map(int, rgb)).hex()}"
+            for shown in maps.values()
+            for one, rgb in zip(shown.names, shown.colours, strict=False)
+        }
+        found.append(FieldHistory(name, archive.name, rows, visits, colours))
     return found
 
 
@@ -237,6 +244,7 @@ def render_history(history: FieldHistory, runs_at: str) -> str:
         parts = {name: [(at, row[of].get(name) if of else row[name]) for at, row in dated] for name in labels}
         return {labels[name]: [(at, one) for at, one in points if one is not None] for name, points in parts.items()}
 
+    colours = {name.replace("_", " "): colour for name, colour in history.colours.items()}
     charts: list[tuple[str, Points, bool]] = []
     for unit, title in (("share", "Share of the map of each class"), ("ha", "Hectares of each class")):
         own = [(at, row["areas"]) for at, row in dated if row["unit"] == unit]
@@ -251,14 +259,14 @@ def render_history(history: FieldHistory, runs_at: str) -> str:
         title=history.field,
         lead=f"{counted(len(history.runs), 'run')} in the archive.",
         about=f"{history.archive}; times in UTC",
-        charts=[{"title": title, "picture": picture} for title, picture in _drawn(charts)],
+        charts=[{"title": title, "picture": picture} for title, picture in _drawn(charts, colours)],
         visits=history.visits,
         runs=[_shown(row, runs_at) for row in reversed(history.runs[-MOST_ROWS:])],
         older_runs=len(history.runs) - MOST_ROWS,
     )
 
 
-def _drawn(charts: Sequence[tuple[str, Points, bool]]) -> Iterator[tuple[str, str]]:
+def _drawn(charts: Sequence[tuple[str, Points, bool]], colours: Mapping[str, str]) -> Iterator[tuple[str, str]]:
     """Draw each chart that has a point: its title, and the data address of a PNG; same points, same bytes."""
     for title, series, is_share in charts:
         known = {
@@ -272,7 +280,7 @@ def _drawn(charts: Sequence[tuple[str, Points, bool]]) -> Iterator[tuple[str, st
         for name, points in known.items():
             if points:
                 label = visible(name).replace("$", r"\$")
-                axes.plot(*zip(*points, strict=True), marker="o", markersize=4, label=label)
+                axes.plot(*zip(*points, strict=True), marker="o", markersize=4, label=label, color=colours.get(name))
         axes.set_ylim(bottom=0)
         if is_share:
             axes.yaxis.set_major_formatter(lambda value, _: f"{100 * value:.3g} %")
