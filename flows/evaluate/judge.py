@@ -164,6 +164,8 @@ def _plans(look: Look, camera: LineCamera, along: Axis, seed: int) -> list[tuple
         return spend
 
     def without_a_model(draw: int | None) -> Spend:
+        """Give what shows the most of lines that lie evenly, or by chance where a draw is numbered."""
+
         def spend(seconds: float) -> tuple[Seats, float, int]:
             if draw is None:
                 lines = most_shown(options, lambda blocks: blocks.evenly(seconds))

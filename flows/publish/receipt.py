@@ -31,7 +31,7 @@ class _Part(BaseModel):
     model_config = ConfigDict(extra="allow")
 
 
-class Stage(_Part):
+class StageRow(_Part):
     """One stage: seconds, memory and bytes; null of one whose store was found."""
 
     name: str
@@ -122,7 +122,7 @@ class ReceiptFields(_Part):
     finished: str
     versions: dict[str, str]
     settings: Facts
-    stages: list[Stage]
+    stages: list[StageRow]
     savings: Savings
     accuracy_is: AccuracyIs | None = None
     judged: str | None = None  # when accuracy was added
