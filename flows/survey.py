@@ -19,7 +19,7 @@ from flows.settings.parameters import SurveySettings
 from flows.tasks.captures import capture_pass, plan_capture
 from flows.tasks.open_survey import JUDGED, OpenSurvey, RunRef
 from flows.tasks.stages.accuracy import evaluate
-from flows.tasks.stages.attention import attend, compare_turned
+from flows.tasks.stages.attention import attend
 from flows.tasks.stages.effects import choose_effects
 from flows.tasks.stages.maps import draw_map
 from flows.tasks.stages.on_ground import ground
@@ -84,7 +84,6 @@ def _draw_captured(plan: OpenSurvey) -> tuple[StageRef, StageRef]:
         seams = register_fine(plan, raw, mosaic) if plan.registers else None
     patches = cut_patches(plan, request, raw, seams)
     class_map = draw_map(plan, mosaic, patches)
-    compare_turned(plan, mosaic, request)
     return mosaic, class_map
 
 

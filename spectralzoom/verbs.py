@@ -49,7 +49,7 @@ Told = Callable[[str, float, float], None]
 USUAL = {"engine": "plain"}  # a server of Prefect's is started where it is asked for
 TOKENS = ("dim", "layers", "heads", "mlp_ratio")
 MADE_HERE = ("dataset", "choices", "tokens", "settings", "command", "camera")  # of requests
-FILES = ("weights", "controls")
+FILES = ("weights",)
 LISTS = (*FILES, "shares", "policies", "frames")
 OF_ONE_SCENE = ("labels", "bands", "wavelengths", "train_mask", "mask_classes")
 
@@ -120,8 +120,6 @@ def evaluate(dataset: str | Path | OpenedRun, *, progress: Told | None = None, *
     if isinstance(dataset, OpenedRun):
         return _judge(dataset, progress, **flags)
     kind, asked = evaluate_frames.EvaluateRequest, {**flags}
-    if "control" in asked:
-        asked["controls"] = asked.pop("control")
     choices = _taken(asked, OF_ONE_SCENE)
     _check_known(asked, kind, "evaluate", also=[])
     if "weights" not in asked:

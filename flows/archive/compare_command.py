@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,15 +13,16 @@ from rich.markup import escape
 from rich.table import Table
 
 from flows.cli.app import ArchiveName, AsJson, OutFolder, check_outside
-from flows.publish.change_pictures import MapPair, draw_difference
 from flows.publish.receipt import areas_on_ground
+from flows.publish.receipt_table import COST_LABELS
 from flows.settings.survey_settings import BUILT_IN_SCENES
 from flows.tasks.scores import score_of
-from flows.terminal.figures import DASH, format_count, format_percent, format_points, format_seconds, known_number
+from flows.terminal.figures import area_words, format_count, format_percent, format_points, known_number
 from flows.terminal.processes import DONE
 from flows.terminal.progress import put_out
 from pipeline.errors import ArchiveError, SceneError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
+from pipeline.lazy import deferred
 from pipeline.simulator.scenes.farm.farm_scene import REMOVED_LAW, law_of_key
 from storage.archive.archive import Archive
 from storage.archive.keys import in_text
@@ -31,12 +32,12 @@ from storage.archive.whole_files import written_aside
 from storage.arrays.class_maps import ClassMap, load_class_map
 from storage.remote.opening import open_archive
 
-LARGEST_PAIRS = 10
-SAVINGS = {  # name in a receipt: words for it, and how it is shown
-    "lines": ("lines", format_count),
-    "capture_s": ("time of capture", format_seconds),
-    "tokens": ("tokens", format_count),
-}
+if TYPE_CHECKING:
+    import flows.publish.panels as panels
+else:
+    panels = deferred("flows.publish.panels")  # matplotlib
+
+MOST_CHANGES = 10
 NOT_ASKED = ("notes", "out")  # of a receipt's settings
 NO_FILES = (None, *BUILT_IN_SCENES, REMOVED_LAW)  # scenes of runs that are no file's
 
@@ -64,12 +65,12 @@ def compare(archive: ArchiveName, old: str, new: str, *, out: OutFolder = None, 
         scenes = ((run, run.settings.get("scene")) for run in runs)
         fields = (f"{run.uri} is of {_field_key(run) if scene in NO_FILES else scene}" for run, scene in scenes)
         raise SceneError(f"these runs are of different fields: {', '.join(fields)}; give two runs of one field")
-    pair = _pair_of([_class_map(catalogue, opened, run) for run in runs])
-    content = _comparison(catalogue, runs, pair)
+    maps = _by_one_list([_class_map(catalogue, opened, run) for run in runs])
+    content = _comparison(runs, maps)
     name = f"compare-{runs[0].folder.name}-{runs[1].folder.name}.png"
-    words = [*(panel_words(side) for side in (content["a"], content["b"])), change_words(content["differing"])]
     with written_aside(folder, [name]) as aside:
-        (aside / name).write_bytes(draw_difference(pair.maps, words))
+        titles = (content["a"]["run"], content["b"]["run"], f"{format_percent(content['differing']['share'])} differ")
+        panels.draw_difference(aside / name, maps, titles)
     content["picture"] = str(folder / name)
     put_out(content, show_comparison, as_json=as_json)
     return DONE
@@ -115,168 +116,114 @@ def _class_map(catalogue: Catalogue, archive: Archive, run: Run) -> ClassMap:
     return load_class_map(archive.locate(address))
 
 
-class _Pair(NamedTuple):
-    """Two maps with one list of classes, matched by name, and how often each meets each."""
-
-    maps: MapPair
-    joint: NDArray[np.int64]  # (class of A, class of B), last: none
-    confidence: list[NDArray[np.float32]]
-
-
-def _pair_of(found: list[ClassMap]) -> _Pair:
+def _by_one_list(found: list[ClassMap]) -> list[ClassMap]:
+    """Number the classes of both maps by one list, matched by name; 255 stays no class."""
     shapes = [one.classes.shape for one in found]
     if shapes[0] != shapes[1]:
         raise ShapeError(f"the maps are {shapes[0]} and {shapes[1]} px (y, x); give two runs of one field and size")
-    names = tuple(dict.fromkeys(name for one in found for name in one.names))
     colours = {name: colour for one in reversed(found) for name, colour in zip(one.names, one.colours, strict=True)}
+    names = tuple(dict.fromkeys(name for one in found for name in one.names))
+    palette = np.array([colours[name] for name in names], np.uint8).reshape(-1, 3)
     numbered = []
     for one in found:
         table = np.full(256, UNLABELLED, np.uint8)
         table[: len(one.names)] = [names.index(name) for name in one.names]
-        numbered.append(np.asarray(table[one.classes], np.uint8))
-    old, new = numbered
-    none, count = len(names), len(names) + 1
-    codes = np.minimum(old, none).astype(np.intp) * count + np.minimum(new, none)
-    joint = np.bincount(codes.ravel(), minlength=count * count).reshape(count, count)
-    palette = np.array([colours[name] for name in names], np.uint8).reshape(-1, 3)
+        numbered.append(ClassMap(table[one.classes], one.confidence, names, palette))
+    return numbered
+
+
+def _comparison(runs: tuple[Run, Run], maps: list[ClassMap]) -> dict[str, Any]:
+    old, new = (one.classes for one in maps)
+    names = [*(name.replace("_", " ") for name in maps[0].names), "no class"]
+    joint = np.zeros((len(names),) * 2, np.int64)  # (class of A, class of B), last: none
+    np.add.at(joint, tuple(np.minimum(one, len(names) - 1).ravel().astype(np.intp) for one in (old, new)), 1)
     changed = joint - np.diag(np.diag(joint))
-    order = np.argsort(-changed, axis=None, kind="stable")[: np.count_nonzero(changed)]
-    numbers = [*range(none), UNLABELLED]
-    pairs = [(numbers[i // count], numbers[i % count], int(changed.flat[i])) for i in order.tolist()]
-    return _Pair(MapPair(old, new, names, palette, pairs), joint, [one.confidence for one in found])
-
-
-def _comparison(catalogue: Catalogue, runs: tuple[Run, Run], pair: _Pair) -> dict[str, Any]:
-    total, same = pair.maps.old.size, int(np.trace(pair.joint))
-    largest = [
-        {"from": pair.maps.name(old), "to": pair.maps.name(new), "pixels": count, "share": count / total}
-        for old, new, count in pair.maps.pairs[:LARGEST_PAIRS]
+    order = np.argsort(-changed, axis=None, kind="stable")[: min(np.count_nonzero(changed), MOST_CHANGES)]
+    pairs = [divmod(int(one), len(names)) for one in order]
+    differing = int(changed.sum())
+    asked = [flatten({name: one for name, one in run.settings.items() if name not in NOT_ASKED}) for run in runs]
+    made = [_versions_and_keys(run) for run in runs]
+    sides = [
+        {
+            **{name: run.settings.get(name) for name in ("scene", "seed")},
+            "created": run.created,
+            **score_of(run.receipt),
+        }
+        for run in runs
     ]
-    asked = [{name: value for name, value in run.settings.items() if name not in NOT_ASKED} for run in runs]
     return {
-        **{
-            side: {
-                "run": run.folder.name,
-                "created": run.created,
-                "scene": run.settings.get("scene"),
-                "seed": run.settings.get("seed"),
-                **score_of(run.receipt),
-            }
-            for side, run in zip("ab", runs, strict=True)
-        },
-        "classes": _classes(runs, pair),
-        "differing": {"pixels": total - same, "share": (total - same) / total, "pairs": len(pair.maps.pairs)},
-        "largest": largest,
-        "confidence": _confidence(*pair.confidence),
-        "settings": list(_changes(*(flatten(one) for one in asked))),
-        "versions": list(_changes(*(_versions(catalogue, run) for run in runs))),
-        "savings": {name: [_spent(run.receipt, name) for run in runs] for name in SAVINGS},
+        **{side: {"run": run.folder.name, **one} for side, run, one in zip("ab", runs, sides, strict=True)},
+        "classes": _classes(runs, joint, names),
+        "differing": {"pixels": differing, "share": differing / old.size},
+        "largest": [
+            {"from": names[i], "to": names[j], "pixels": int(changed[i, j]), "share": float(changed[i, j] / old.size)}
+            for i, j in pairs
+        ],
+        "settings": _changes(*asked),
+        "made": _changes(*made),
+        "savings": {name: [_spent(run.receipt, name) for run in runs] for name in COST_LABELS},
     }
 
 
-def _classes(runs: tuple[Run, Run], pair: _Pair) -> list[dict[str, Any]]:
-    """Area in each map, its change and the agreement of both, for each class that is in one of them."""
-    hectares = [known for run in runs if (known := areas_on_ground(run.receipt)) is not None]
-    rows, columns, total = pair.joint.sum(axis=1), pair.joint.sum(axis=0), pair.maps.old.size
+def _classes(runs: tuple[Run, Run], joint: NDArray[np.int64], names: list[str]) -> list[dict[str, Any]]:
+    """Area in each map and the agreement of both, for each class that is in one of them; hectares where both know."""
+    areas = [known for run in runs if (known := areas_on_ground(run.receipt)) is not None]
+    hectares = [{str(name).replace("_", " "): area for name, area in one.items()} for one in areas]
     found = []
-    for number, name in enumerate((*pair.maps.names, "no class")):
-        both, pixels = int(pair.joint[number, number]), [int(rows[number]), int(columns[number])]
-        either = sum(pixels) - both
-        if either:
-            row = {"name": name, "pixels": pixels, "share": [count / total for count in pixels], "iou": both / either}
-            if len(hectares) == 2 and number < len(pair.maps.names):
+    for number, name in enumerate(names):
+        both, pixels = int(joint[number, number]), [int(joint[number].sum()), int(joint[:, number].sum())]
+        if either := sum(pixels) - both:
+            row: dict[str, Any] = {"name": name, "pixels": pixels, "iou": both / either}
+            row["share"] = [count / int(joint.sum()) for count in pixels]
+            if len(hectares) == 2 and number < len(names) - 1:
                 row["ha"] = [float(area.get(name, 0.0)) for area in hectares]
             found.append(row)
     return found
 
 
-def _confidence(old: NDArray[np.float32], new: NDArray[np.float32]) -> dict[str, float | None]:
-    """Mean confidence of both where both have a class, the mean change, and the share of pixels where it rose."""
-    known = np.isfinite(old) & np.isfinite(new)
-    if not known.any():
-        return {"a": None, "b": None, "change": None, "rose": None}
-    before, after = old[known].astype(np.float64), new[known].astype(np.float64)
-    a, b = float(before.mean()), float(after.mean())
-    return {"a": a, "b": b, "change": float(after.mean() - before.mean()), "rose": float(np.mean(after > before))}
+def _versions_and_keys(run: Run) -> dict[str, str]:
+    """What the receipt says of software, and the key of every stage: equal keys are the same store."""
+    versions = run.receipt.get("versions")
+    found = {str(name): str(value) for name, value in versions.items()} if isinstance(versions, Mapping) else {}
+    return found | {f"stage.{row.get('name')}": str(row.get("key")) for row in run.stages}
 
 
-def _versions(catalogue: Catalogue, run: Run) -> dict[str, str]:
-    """Of software, of each stage that made something, and of the weights by their content."""
-    found = {str(name): str(value) for name, value in dict(run.receipt.get("versions", {})).items()}
-    for row in run.stages:
-        for uri in catalogue.by_key.get(str(row.get("key")), []):
-            if uri in catalogue.stores:
-                found[f"stage.{row.get('name')}"] = catalogue.stores[uri].version
-                if "weights" in catalogue.stores[uri].params:
-                    found["weights"] = str(catalogue.stores[uri].params["weights"])
-    return found
+def _changes(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[dict[str, Any]]:
+    both = ((name, old.get(name, ABSENT), new.get(name, ABSENT)) for name in sorted(old.keys() | new.keys()))
+    return [{"name": name, "old": before, "new": after} for name, before, after in both if before != after]
 
 
-def _changes(old: Mapping[str, Any], new: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
-    for name in sorted(old.keys() | new.keys()):
-        if old.get(name, ABSENT) != new.get(name, ABSENT):
-            yield {"name": name, "old": old.get(name, ABSENT), "new": new.get(name, ABSENT)}
-
-
-def _spent(receipt: Mapping[str, Any], name: str) -> float | int | None:
+def _spent(receipt: Mapping[str, Any], name: str) -> float | None:
     savings = receipt.get("savings")
     entry = savings.get(name) if isinstance(savings, Mapping) else None
-    done = entry.get("done") if isinstance(entry, Mapping) else None
-    return done if known_number(done) is not None else None
-
-
-def panel_words(side: Mapping[str, Any]) -> str:
-    """A run and how good it is, in words."""
-    scores = (("mIoU", side["miou"]), ("overall", side["overall_accuracy"]))
-    return ", ".join([str(side["run"]), *(f"{name} {format_points(one)}" for name, one in scores if one is not None)])
-
-
-def change_words(differing: Mapping[str, Any]) -> str:
-    """How much differs, in words."""
-    return f"{format_count(differing['pixels'])} px, {format_percent(differing['share'])}"
+    return known_number(entry.get("done")) if isinstance(entry, Mapping) else None
 
 
 def show_comparison(content: dict[str, Any], console: Console) -> None:
     """Print what `compare` found."""
-
-    def say(text: str) -> None:
-        console.print(escape(text), soft_wrap=True)
-
-    say(f"A: {panel_words(content['a'])}\nB: {panel_words(content['b'])}")
-    classes = content["classes"]
-    hectares = ("ha in A", "ha in B") if any("ha" in row for row in classes) else ()
-    table = _table("Classes", "class", "px in A", "px in B", "in A", "in B", *hectares, "IoU of A and B", left=1)
-    for row in classes:
-        cells = [*map(format_count, row["pixels"]), *map(format_percent, row["share"])]
-        cells += [f"{area:.4g}" for area in row["ha"]] if "ha" in row else [DASH] * len(hectares)
-        table.add_row(escape(row["name"].replace("_", " ")), *cells, format_points(row["iou"]))
+    table = _table("", "A", "B")
+    for name, show in (("run", str), ("miou", format_points), ("overall_accuracy", format_points)):
+        table.add_row(name.replace("_", " "), *(escape(show(content[side][name])) for side in "ab"))
+    for name, (label, cost) in COST_LABELS.items():
+        table.add_row(label, *map(cost, content["savings"][name]))
+    for name in ("settings", "made"):
+        for row in content[name]:
+            table.add_row(*(escape(str(row[part])) for part in ("name", "old", "new")))
     console.print(table)
-    say(f"{change_words(content['differing'])} differ")
-    if content["largest"]:
-        table = _table("Largest changes", "A", "B", "pixels", "share", left=2)
-        for row in content["largest"]:
-            figures = (format_count(row["pixels"]), format_percent(row["share"]))
-            table.add_row(escape(row["from"]), escape(row["to"]), *figures)
-        console.print(table)
-    sure = content["confidence"]
-    if sure["a"] is not None:
-        both = f"{sure['a']:.3f} in A, {sure['b']:.3f} in B ({sure['change']:+.3f})"
-        say(f"confidence {both}, higher at {format_percent(sure['rose'])} of pixels")
-    table = _table("Spent", "cost", "A", "B", left=1)
-    for name, (label, show) in SAVINGS.items():
-        table.add_row(label, *(show(value) for value in content["savings"][name]))
+    table = _table("class", "px in A", "px in B", "in A", "in B", "IoU of A and B")
+    for row in content["classes"]:
+        cells = [*map(area_words, row["ha"])] if "ha" in row else [*map(format_count, row["pixels"])]
+        table.add_row(escape(row["name"]), *cells, *map(format_percent, row["share"]), format_points(row["iou"]))
     console.print(table)
-    changes = [(kind, row) for kind in ("settings", "versions") for row in content[kind]]
-    if changes:
-        table = _table("What was not the same", "what", "name", "A", "B", left=4)
-        for kind, row in changes:
-            table.add_row(kind.removesuffix("s"), *(escape(str(row[name])) for name in ("name", "old", "new")))
-    console.print(table if changes else "settings and versions are the same")
-    say(f"  {content['picture']}")
+    told = content["differing"]
+    console.print(f"{format_count(told['pixels'])} px, {format_percent(told['share'])} differ")
+    for row in content["largest"]:
+        console.print(escape(f"  {row['from']} to {row['to']}: {format_count(row['pixels'])} px"), soft_wrap=True)
+    console.print(escape(f"  {content['picture']}"), soft_wrap=True)
 
 
-def _table(title: str, *columns: str, left: int) -> Table:
-    table = Table(title=title, title_justify="left", title_style="bold", header_style="dim", box=SIMPLE_HEAD)
+def _table(*columns: str) -> Table:
+    table = Table(header_style="dim", box=SIMPLE_HEAD)
     for number, column in enumerate(columns):
-        table.add_column(column, justify="left" if number < left else "right", overflow="fold")
+        table.add_column(column, justify="right" if number else "left", overflow="fold")
     return table

@@ -19,8 +19,8 @@ from flows.archive.product_choice import ProductChoice, class_numbers
 from pipeline.errors import SettingsError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.georeference import crs_wkt, degree_m, pixel_side_m, to_degrees, to_plane
-from pipeline.planning.orientation import find_rows
 from pipeline.products.areas import CellGrid, Heading, ToAxes, cell_polygons, count_classes, dose_cells, pixel_axes
+from pipeline.products.crop_rows import find_rows
 from pipeline.products.regions import class_polygons, grow_class, merge_small
 from storage.arrays.class_maps import ClassNames
 from storage.arrays.ground_maps import open_image

@@ -2,41 +2,64 @@
 
 from __future__ import annotations
 
+import base64
 import difflib
-from collections.abc import Mapping, Sequence
+import io
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
-from operator import itemgetter
+from dataclasses import dataclass
+from dataclasses import field as dataclass_field
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
+import numpy as np
 from rich.markup import escape
 
-from flows.archive.field_visits import (
-    Chart,
-    VisitPicture,
-    line_chart,
-    look_of,
-    moment_words,
-    read_moment,
-    visit_pictures,
-)
 from flows.archive.stale_runs import called
 from flows.cli.app import ArchiveName, AsJson, OutFile, check_outside, stderr
 from flows.publish.receipt import areas_on_ground
-from flows.publish.report import render_page
+from flows.publish.receipt_table import days_words
+from flows.settings.survey_settings import BUILT_IN_SCENES
 from flows.tasks.scores import score_of
-from flows.terminal.figures import DASH, LEAST_HECTARES, area_words, counted, format_percent, known_number
+from flows.terminal.figures import DASH, area_words, counted, format_percent, format_seconds, known_number
 from flows.terminal.processes import DONE
 from flows.terminal.progress import print_json
-from pipeline.errors import ArchiveError, SettingsError
+from pipeline.errors import ArchiveError, SettingsError, visible
+from pipeline.lazy import deferred
+from pipeline.simulator.scenes.farm.farm_scene import USUAL_HOUR
 from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run
 from storage.archive.whole_files import write_whole
-from storage.arrays.class_maps import load_class_map, load_class_names
+from storage.arrays.class_maps import BeliefStore, ClassMap, load_class_map
 from storage.remote.opening import open_archive
+
+if TYPE_CHECKING:
+    import matplotlib.figure as mpl_figure
+
+    import flows.publish.field_map as pictures
+    import flows.publish.panels as panels
+    import flows.publish.report as pages
+else:
+    mpl_figure = deferred("matplotlib.figure")
+    pictures = deferred("flows.publish.field_map")
+    panels = deferred("flows.publish.panels")
+    pages = deferred("flows.publish.report")
+
+MOST_ROWS = 1000  # of the table; older ones are counted
+MOST_VISITS = 24  # that a page shows: the newest
+MOST_PX = 400  # of a visit's picture
+MOST_CLASSES = 128  # that are told apart, the last of them standing for none
+CHANGED_SHARE = 0.25  # of a patch's pixels, from which it is said to have changed
+PALE = 0.8  # of what did not change
+SAVINGS = {"capture_s": "time at the camera", "lines": "lines", "bytes_stored": "stored data", "multiply_adds": "model"}
+SCORES = {"miou": "mIoU", "overall_accuracy": "overall"}
+DRAWN_YEARS = range(1900, 2200)
+_MOST_VALUE = 1e100  # that can be drawn; receipts may claim anything
+Row = Mapping[str, Any]
+Points = Mapping[str, Sequence[tuple[datetime, float]]]  # of a series by its name
 
 
 @dataclass(frozen=True)
@@ -45,105 +68,13 @@ class FieldHistory:
 
     field: str
     archive: str
-    runs: Sequence[Mapping[str, Any]]
-    visits: Sequence[VisitPicture] = ()
+    runs: Sequence[Row]
+    visits: Sequence[Mapping[str, str]] = ()
+    colours: Mapping[str, str] = dataclass_field(default_factory=dict)  # of the classes on the maps, as CSS writes them
 
     def to_dict(self) -> dict[str, Any]:
         """Return what is written as JSON."""
         return {"field": self.field, "archive": self.archive, "runs": list(self.runs)}
-
-
-def read_histories(archive: Archive, field: str | None = None) -> list[FieldHistory]:
-    """Return the histories of all fields by name, or of one. Raises ArchiveError: no field is called so."""
-    catalogue = Catalogue.read(archive.root)
-    names = sorted({called(run) for run in catalogue.runs})
-    if field is not None and field not in names:
-        near = difflib.get_close_matches(field, names, n=1)
-        hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(names) or 'none'}"
-        raise ArchiveError(f"no field of {archive.name} is called {field!r}; {hint}")
-    wanted = names if field is None else [field]
-    return [_history(archive, catalogue, name) for name in wanted]
-
-
-def _history(archive: Archive, catalogue: Catalogue, name: str) -> FieldHistory:
-    own = [run for run in catalogue.runs if called(run) == name]
-    rows = [_row(archive, catalogue, run) for run in own]
-    found = sorted(zip(own, rows, strict=True), key=lambda one: day_of(one[1]) or 0.0)
-    visits = visit_pictures(archive, [(run, _called(row)) for run, row in found])
-    return FieldHistory(name, archive.name, [row for _, row in found], visits)
-
-
-def _called(row: Mapping[str, Any]) -> str:
-    """What a visit is called, and when it was where its name does not say so."""
-    when = _short(str(row["looked"] or row["created"]))
-    visit = str(row["visit"] or "")
-    return when if not visit or read_moment(visit) is not None else f"{visit}, {when}"
-
-
-def _row(archive: Archive, catalogue: Catalogue, run: Run) -> dict[str, Any]:
-    receipt = run.receipt
-    savings = found if isinstance(found := receipt.get("savings"), Mapping) else {}
-    shares, unit = _covered(archive, catalogue, run)
-    colours: dict[str, str] = {}  # in which the run's map shows its classes, as CSS writes them
-    if (address := run.products.get("class_map")) is not None:
-        with suppress(OSError, LookupError, ValueError):
-            shown = load_class_names(archive.locate(address))
-            hexes = [f"#{bytes(map(int, rgb)).hex()}" for rgb in shown.colours]
-            colours = dict(zip(shown.names, hexes, strict=False))
-    return {
-        "run": run.uri,
-        "created": run.created,
-        "visit": run.settings.get("visit"),
-        "looked": None if (at := look_of(run)) is None else moment_words(at),
-        "capture_seconds": _seconds(savings),
-        **score_of(receipt),
-        "savings": {
-            name: known_number(entry.get("ratio")) if isinstance(entry := savings.get(name), Mapping) else None
-            for name in ("capture_s", "lines", "bytes_stored", "multiply_adds")
-        },
-        "areas": shares,
-        "colours": colours,
-        "unit": unit,
-        "problem": run.problem,
-    }
-
-
-def _seconds(savings: Mapping[str, Any]) -> dict[str, float | None]:
-    """Seconds at the camera, of this run and of scanning everything."""
-    entry = savings.get("capture_s")
-    told = entry if isinstance(entry, Mapping) else {}
-    return {"done": known_number(told.get("done")), "full": known_number(told.get("full"))}
-
-
-def _covered(archive: Archive, catalogue: Catalogue, run: Run) -> tuple[dict[str, float], str]:
-    """What each class covers: hectares where the survey was put on the ground, else shares of the map."""
-    hectares = areas_on_ground(run.receipt)
-    if hectares is not None:
-        return {str(name): float(area) for name, area in hectares.items() if known_number(area) is not None}, "ha"
-    address = run.products.get("class_map")
-    store = None if address is None else catalogue.stores.get("/".join(address.split("/")[:3]))
-    if address is None or store is None or store.problem is not None:
-        return {}, "share"
-    try:
-        found = load_class_map(archive.locate(address))
-    except (OSError, LookupError, ValueError):
-        return {}, "share"
-    counts = {name: int((found.classes == number).sum()) for number, name in enumerate(found.names)}
-    total = sum(counts.values()) or 1
-    return {name: count / total for name, count in counts.items()}, "share"
-
-
-def day_of(row: Mapping[str, Any]) -> float | None:
-    """When a row's run looked or else was published, in seconds since 1970; None where that is not known."""
-    moment = next((at for name in ("looked", "created") if (at := read_moment(row.get(name))) is not None), None)
-    return None if moment is None else moment.timestamp()
-
-
-MOST_ROWS = 1000  # of each table; older ones are counted
-PLAYER_SCRIPTS = ("scripts/swipe.js", "scripts/player.js")
-SAVINGS = {"capture_s": "time at the camera", "lines": "lines", "bytes_stored": "stored data", "multiply_adds": "model"}
-SCORES = {"miou": "mIoU", "overall_accuracy": "overall"}
-Rows = Sequence[Mapping[str, Any]]
 
 
 def report(archive: ArchiveName, *, field: str | None = None, out: OutFile, as_json: AsJson = False) -> int:
@@ -181,26 +112,189 @@ def report(archive: ArchiveName, *, field: str | None = None, out: OutFile, as_j
     return DONE
 
 
+def read_histories(archive: Archive, field: str | None = None) -> list[FieldHistory]:
+    """Return the histories of all fields by name, or of one. Raises ArchiveError: no field is called so."""
+    catalogue = Catalogue.read(archive.root)
+    names = sorted({called(run) for run in catalogue.runs})
+    if field is not None and field not in names:
+        near = difflib.get_close_matches(field, names, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(names) or 'none'}"
+        raise ArchiveError(f"no field of {archive.name} is called {field!r}; {hint}")
+    found = []
+    for name in names if field is None else [field]:
+        own = sorted((run for run in catalogue.runs if called(run) == name), key=lambda run: str(look_of(run) or ""))
+        maps = {run.uri: shown for run in own if (shown := _map_of(archive, catalogue, run)) is not None}
+        rows = [_row(run, maps.get(run.uri)) for run in own]
+        mapped = [(run, row) for run, row in zip(own, rows, strict=True) if run.uri in maps][-MOST_VISITS:]
+        visits = [_visit(archive, run, row, maps[run.uri]) for run, row in mapped]
+        colours = {
+            one: f"#{bytes(map(int, rgb)).hex()}"
+            for shown in maps.values()
+            for one, rgb in zip(shown.names, shown.colours, strict=False)
+        }
+        found.append(FieldHistory(name, archive.name, rows, visits, colours))
+    return found
+
+
+def _map_of(archive: Archive, catalogue: Catalogue, run: Run) -> ClassMap | None:
+    """Return a run's class map; None where it left none that can be read."""
+    address = run.products.get("class_map")
+    store = None if address is None else catalogue.stores.get("/".join(address.split("/")[:3]))
+    if address is not None and store is not None and store.problem is None and run.problem is None:
+        with suppress(OSError, LookupError, ValueError):
+            return load_class_map(archive.locate(address))
+    return None
+
+
+def _row(run: Run, shown: ClassMap | None) -> Row:
+    savings = found if isinstance(found := run.receipt.get("savings"), Mapping) else {}
+    entries = {name: one if isinstance(one := savings.get(name), Mapping) else {} for name in SAVINGS}
+    hectares, areas = areas_on_ground(run.receipt), dict[str, float]()
+    if hectares is not None:
+        areas = {str(name): float(area) for name, area in hectares.items() if known_number(area) is not None}
+    elif shown is not None:
+        counts = [int((shown.classes == number).sum()) for number in range(len(shown.names))]
+        areas = {name: count / (sum(counts) or 1) for name, count in zip(shown.names, counts, strict=True)}
+    return {
+        "run": run.uri,
+        "created": run.created,
+        "visit": run.settings.get("visit"),
+        "looked": None if (at := look_of(run)) is None else at.isoformat().replace("+00:00", "Z"),
+        "capture_seconds": {name: known_number(entries["capture_s"].get(name)) for name in ("done", "full")},
+        **score_of(run.receipt),
+        "savings": {name: known_number(entry.get("ratio")) for name, entry in entries.items()},
+        "areas": areas,
+        "unit": "share" if hectares is None else "ha",
+        "problem": run.problem,
+    }
+
+
+def read_moment(value: object) -> datetime | None:
+    """Return a moment that was written in ISO 8601, in UTC; None where it is none."""
+    with suppress(ValueError, OverflowError):
+        found = datetime.fromisoformat(value) if isinstance(value, str) else None
+        return None if found is None else found.replace(tzinfo=found.tzinfo or UTC).astimezone(UTC)
+    return None
+
+
+def look_of(run: Run) -> datetime | None:
+    """Return the moment that a run's visit is called by, else the day that its farm was drawn on.
+
+    Of others when they began, or were published. The day is of the year in which the run was published. None where
+    nothing of that can be read.
+    """
+    named = read_moment(run.settings.get("visit"))
+    if named is not None:
+        return named
+    began = next((at for at in map(read_moment, (run.receipt.get("started"), run.created)) if at is not None), None)
+    day, hour = run.settings.get("day"), run.settings.get("hour")
+    if began is None or run.settings.get("scene") not in BUILT_IN_SCENES or not isinstance(day, int):
+        return began
+    of_day = float(hour) if isinstance(hour, int | float) else USUAL_HOUR
+    if not (1 <= day <= 366 and 0 <= of_day <= 24):
+        return began
+    return datetime(began.year, 1, 1, tzinfo=UTC) + timedelta(days=day - 1, hours=of_day)
+
+
+def _visit(archive: Archive, run: Run, row: Row, shown: ClassMap) -> dict[str, str]:
+    """Return when a visit was, its map, what changed of it among pale colours (empty of a first one), and words."""
+    thin = slice(None, None, -(-max(shown.classes.shape) // MOST_PX))
+    palette = pictures.palette_bytes(shown.names[: MOST_CLASSES - 1], shown.colours[: MOST_CLASSES - 1])[:MOST_CLASSES]
+    numbers, changes = np.minimum(shown.classes[thin, thin], MOST_CLASSES - 1), ""
+    address = run.products.get("belief")
+    with suppress(OSError, LookupError, ValueError):
+        store = None if address is None else BeliefStore(archive.locate(address))
+        changed = None if store is None else store.changed()
+        if store is not None and changed is not None:
+            seats = (changed >= CHANGED_SHARE).repeat(store.patch_px, axis=0).repeat(store.patch_px, axis=1)
+            pale = np.rint(255 * PALE + (1 - PALE) * palette).astype(np.uint8)
+            kept = seats[: shown.classes.shape[0], : shown.classes.shape[1]][thin, thin]
+            table = np.concatenate([palette, pale])
+            changes = pictures.png_address(numbers + np.where(kept, 0, MOST_CLASSES).astype(np.uint8), table)
+    when = _short(str(row["looked"] or row["created"]))
+    visit = str(row["visit"] or "")
+    when = when if not visit or read_moment(visit) is not None else f"{visit}, {when}"
+    return {
+        "when": when,
+        "map": pictures.png_address(numbers, palette),
+        "changes": changes,
+        "words": _words(run.receipt),
+    }
+
+
+def _words(receipt: Mapping[str, Any]) -> str:
+    """Seconds spent, and what became of the prior map."""
+    capture, memory = (receipt.get("savings") or {}).get("capture_s") or {}, receipt.get("memory")
+    seconds = known_number(capture.get("done"))
+    parts = [] if seconds is None else [f"{format_seconds(seconds)} at the camera"]
+    if not isinstance(memory, Mapping):
+        return ", ".join([*parts, "a first look"])
+    if memory.get("put_aside"):
+        return ", ".join([*parts, f"its prior map put aside ({memory['put_aside']})"])
+    share = memory["changed_px"] / memory["compared_px"] if memory.get("compared_px") else 0.0
+    return ", ".join([*parts, f"goes on from {days_words(memory['days'])}", f"{format_percent(share)} changed"])
+
+
 def render_history(history: FieldHistory, runs_at: str) -> str:
-    """The page; ``runs_at`` is the way from it to the archive's folder, empty where there is none."""
-    return render_page(
+    """Return the page; ``runs_at`` is the way from it to the archive's folder, empty where there is none."""
+    moments = ((read_moment(row.get("looked") or row["created"]), row) for row in history.runs)
+    dated = [(moment, row) for moment, row in moments if moment is not None and moment.year in DRAWN_YEARS]
+
+    def series(labels: Mapping[str, str], of: str | None = None) -> Points:
+        parts = {name: [(at, row[of].get(name) if of else row[name]) for at, row in dated] for name in labels}
+        return {labels[name]: [(at, one) for at, one in points if one is not None] for name, points in parts.items()}
+
+    colours = {name.replace("_", " "): colour for name, colour in history.colours.items()}
+    charts: list[tuple[str, Points, bool]] = []
+    for unit, title in (("share", "Share of the map of each class"), ("ha", "Hectares of each class")):
+        own = [(at, row["areas"]) for at, row in dated if row["unit"] == unit]
+        names = dict.fromkeys(name for _, areas in own for name, area in areas.items() if area)
+        areas = {name.replace("_", " "): [(at, one[name]) for at, one in own if name in one] for name in names}
+        charts.append((title, areas, unit == "share"))
+    charts.append(("Share of everything", series(SAVINGS, "savings"), True))
+    charts.append(("Score against the truth", series(SCORES), True))
+    return pages.render_page(
         "history.html",
-        PLAYER_SCRIPTS if history.visits else (),
         kicker="SpectralZoom field",
         title=history.field,
         lead=f"{counted(len(history.runs), 'run')} in the archive.",
         about=f"{history.archive}; times in UTC",
-        areas=_areas(history.runs),
-        savings=_savings(history.runs),
-        visits=[asdict(one) for one in history.visits],
-        runs=[_run(row, runs_at) for row in reversed(history.runs[-MOST_ROWS:])],
+        charts=[{"title": title, "picture": picture} for title, picture in _drawn(charts, colours)],
+        visits=history.visits,
+        runs=[_shown(row, runs_at) for row in reversed(history.runs[-MOST_ROWS:])],
         older_runs=len(history.runs) - MOST_ROWS,
     )
 
 
-def render_index(histories: Sequence[FieldHistory], archive: str, pages: Mapping[str, str]) -> str:
-    """Return a page of all fields of an archive; ``pages`` are the files of their histories."""
-    return render_page(
+def _drawn(charts: Sequence[tuple[str, Points, bool]], colours: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    """Draw each chart that has a point: its title, and the data address of a PNG; same points, same bytes."""
+    for title, series, is_share in charts:
+        known = {
+            name: sorted((at, value) for at, value in points if abs(value) < _MOST_VALUE)
+            for name, points in series.items()
+        }
+        if not any(known.values()):
+            continue
+        figure = mpl_figure.Figure(figsize=(9.5, 3.2), dpi=100, layout="constrained", facecolor=panels.PAPER)
+        axes = figure.subplots()
+        for name, points in known.items():
+            if points:
+                label = visible(name).replace("$", r"\$")
+                axes.plot(*zip(*points, strict=True), marker="o", markersize=4, label=label, color=colours.get(name))
+        axes.set_ylim(bottom=0)
+        if is_share:
+            axes.yaxis.set_major_formatter(lambda value, _: f"{100 * value:.3g} %")
+        axes.grid(color=panels.GRID)
+        axes.tick_params(axis="x", labelrotation=20)
+        figure.legend(loc="outside right upper", frameon=False, fontsize=8)
+        file = io.BytesIO()
+        panels.save_png(figure, file)
+        yield title, f"data:image/png;base64,{base64.b64encode(file.getvalue()).decode('ascii')}"
+
+
+def render_index(histories: Sequence[FieldHistory], archive: str, names: Mapping[str, str]) -> str:
+    """Return a page of all fields of an archive; ``names`` are the files of their histories."""
+    return pages.render_page(
         "fields.html",
         kicker="SpectralZoom archive",
         title="Fields",
@@ -209,7 +303,7 @@ def render_index(histories: Sequence[FieldHistory], archive: str, pages: Mapping
         fields=[
             {
                 "name": one.field,
-                "page": pages[one.field],
+                "page": names[one.field],
                 "runs": len(one.runs),
                 "newest": _short(max((str(row["created"]) for row in one.runs), default="")) or DASH,
             }
@@ -218,78 +312,7 @@ def render_index(histories: Sequence[FieldHistory], archive: str, pages: Mapping
     )
 
 
-@dataclass(frozen=True)
-class ClassCharts:
-    """Charts of the classes' areas, one each with a scale of its own: a class of few pixels is seen too."""
-
-    title: str
-    charts: Sequence[Chart]
-
-
-def _areas(runs: Rows) -> list[ClassCharts]:
-    """Areas on the ground in hectares, small ones in square metres; else shares of the map. Colours are the map's."""
-    colours = {name.replace("_", " "): rgb for row in runs for name, rgb in row["colours"].items()}
-    found = []
-    for unit in sorted({str(row["unit"]) for row in runs if row["areas"]}):
-        series = _by_class(runs, unit)
-        most = max((value for points in series.values() for _, value in points), default=1.0)
-        title, shown, times = "Share of the map of each class", "%", 1.0
-        if unit != "share":
-            small = most < LEAST_HECTARES
-            title, shown, times = (
-                ("Square metres of each class", "m²", 1e4) if small else ("Hectares of each class", "ha", 1.0)
-            )
-        moments = [moment for points in series.values() for moment, _ in points]
-        span = (min(moments, default=0.0), max(moments, default=0.0))
-        charts = [
-            line_chart(
-                {name: [(at, times * value) for at, value in points]}, name, shown, colours, small=True, span=span
-            )
-            for name, points in series.items()
-        ]
-        found.append(ClassCharts(title, charts))
-    return found
-
-
-def _by_class(runs: Rows, unit: str) -> dict[str, list[tuple[float, float]]]:
-    found: dict[str, list[tuple[float, float]]] = {}
-    for row in runs:
-        moment = day_of(row)
-        for name, area in row["areas"].items() if row["unit"] == unit and moment is not None else ():
-            found.setdefault(name.replace("_", " "), []).append((float(moment or 0), area))
-    return {name: points for name, points in found.items() if any(value for _, value in points)}
-
-
-def _savings(runs: Rows) -> list[Chart]:
-    dated = [(moment, {**row, **row["savings"]}) for row in runs if (moment := day_of(row)) is not None]
-    spent, scores = (
-        {
-            label: points
-            for name, label in labels.items()
-            if (points := [(moment, row[name]) for moment, row in dated if row.get(name) is not None])
-        }
-        for labels in (SAVINGS, SCORES)
-    )
-    drawn = [line_chart(spent, "Share of everything", "%")]
-    drawn += [line_chart(scores, "Score against the truth", "%")] if scores else []
-    return [*drawn, line_chart(_summed_seconds(runs), "Seconds at the camera, all visits so far", "s")]
-
-
-def _summed_seconds(runs: Rows) -> dict[str, list[tuple[float, float]]]:
-    """What all visits up to each took, and what scanning everything every time would have."""
-    told = ((moment, row["capture_seconds"]) for row in runs if (moment := day_of(row)) is not None)
-    dated = sorted(told, key=itemgetter(0))
-    dated = [(moment, seconds) for moment, seconds in dated if None not in seconds.values()]
-    names, spent = {"done": "these visits", "full": "everything, every time"}, {"done": 0.0, "full": 0.0}
-    points: dict[str, list[tuple[float, float]]] = {label: [] for label in names.values()}
-    for moment, seconds in dated:
-        for name, label in names.items():
-            spent[name] += seconds[name]
-            points[label].append((moment, spent[name]))
-    return {label: found for label, found in points.items() if found}
-
-
-def _run(row: Mapping[str, Any], runs_at: str) -> dict[str, Any]:
+def _shown(row: Row, runs_at: str) -> dict[str, Any]:
     largest = sorted(row["areas"].items(), key=lambda item: -item[1])[:3]
     show = area_words if row["unit"] == "ha" else format_percent
     name = quote(str(row["run"]).removeprefix("runs/"), errors="surrogateescape")
@@ -309,7 +332,7 @@ def _short(text: str) -> str:
 
 
 def way_to(archive: Path, page: Path) -> str:
-    """The way from a page's folder to the archive's, as a link; an absolute one where they have nothing in common."""
+    """Return the way from a page's folder to the archive's, as a link; an absolute one where nothing is in common."""
     folder, root = page.absolute().parent, archive.absolute()
     for up, parent in enumerate((folder, *folder.parents)):
         if root.is_relative_to(parent) and parent != Path(parent.anchor):

@@ -5,7 +5,6 @@ What the archive holds is found by its key, raw light above all; only what new w
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -20,8 +19,6 @@ from flows.archive.compare_command import find_run
 from flows.archive.stale_runs import (
     Generation,
     asked_again,
-    check_stage,
-    file_key,
     from_raw_cubes,
     is_called,
     is_current,
@@ -29,9 +26,8 @@ from flows.archive.stale_runs import (
     newest_runs,
     renewals,
     renewed_prior,
-    would_remake,
 )
-from flows.cli.app import ArchiveName, AsJson, OutFolder, Scheduler, Switch, Workers, check_outside, stderr
+from flows.cli.app import ArchiveName, AsJson, Scheduler, Switch, Workers, stderr
 from flows.publish.receipt import Receipt
 from flows.publish.run_folder import extend_with_accuracy, load_receipt
 from flows.publish.survey_command import run_survey, show_published
@@ -49,12 +45,11 @@ from flows.terminal.figures import counted, format_points, format_seconds
 from flows.terminal.processes import DONE, FAILED, PARTLY
 from flows.terminal.progress import StageProgress, put_out
 from models.network.machine import keep_freed_memory, use_one_thread
-from pipeline.errors import ArchiveError, PipelineError, SceneError, SettingsError, WeightsError, visible
+from pipeline.errors import ArchiveError, PipelineError, SceneError, SettingsError, WeightsError
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run, read_run
-from storage.archive.whole_files import new_file, to_json, write_whole
 from storage.parallel.crew import THREADS, Crew
 from storage.remote.opening import open_archive
 
@@ -66,14 +61,12 @@ def reprocess(
     archive: ArchiveName,
     *,
     since: str | None = None,
-    stage: str | None = None,
     field: str | None = None,
     failed: Switch = False,
     weights: Path | None = None,
     scheduler: Scheduler = "threads",
     workers: Workers = None,
     dry_run: Switch = False,
-    out: OutFolder = None,
     as_json: AsJson = False,
 ) -> int:
     """Survey every field of an archive again: light is found there, only what has changed is made anew.
@@ -82,8 +75,6 @@ def reprocess(
     ----------
     since
         Only fields whose newest run is of this date (UTC) or later: 2026-05-01
-    stage
-        Only where this stage would be made anew: segment, draw_map
     field
         Only fields whose survey, scene file or newest run is called so; * stands for any letters.
     failed
@@ -92,11 +83,8 @@ def reprocess(
         Other model weights for all of them.
     dry_run
         Only say what would run.
-    out
-        Folder for the summary, reprocess-TIME.json; without one beside the archive, where anything was to be done.
     """
-    crew = Crew(scheduler, workers)
-    request = ReprocessRequest(archive, since, stage, field, failed, weights, dry_run, out, crew)
+    request = ReprocessRequest(archive, since, field, failed, weights, dry_run, Crew(scheduler, workers))
     return run_reprocess(request, stderr, as_json=as_json)
 
 
@@ -106,50 +94,35 @@ class ReprocessRequest:
 
     archive: str | Path
     since: str | None = None  # ISO date (UTC); the newest run of the field is of this day or later
-    stage: str | None = None  # only where it would be made anew
     field: str | None = None  # what survey, scene file or run is called; * for any letters
     failed: bool = False  # only where the newest run is damaged or lacks stores
     weights: Path | None = None
     dry_run: bool = False
-    out: Path | None = None  # folder for reprocess-TIME.json; beside the archive without one
     crew: Crew = THREADS  # who makes blocks; what the old runs were made by need not be there
 
 
 def run_reprocess(
     request: ReprocessRequest, console: Console, *, survey: Survey | None = None, as_json: bool = False
 ) -> int:
-    """Survey again what was asked for; progress on ``console``, the summary on stdout and in a file.
+    """Survey again what was asked for; progress on ``console``, the summary on stdout. Raises as `reprocess_fields`."""
+    content = reprocess_fields(request, console, survey)
+    put_out(content, _show, as_json=as_json)
+    failed = sum(row["state"] == "failed" for row in content["fields"])
+    return DONE if not failed else FAILED if failed == len(content["fields"]) else PARTLY
+
+
+def reprocess_fields(request: ReprocessRequest, console: Console, survey: Survey | None = None) -> dict[str, Any]:
+    """Survey again what was asked for, and return a row a field.
 
     Fields whose newest run is already as it would become are skipped: the same command goes on after an interruption.
-    The file is there before the first field is begun, and its ``finished`` is null until all have been. Raises
-    SettingsError: a date or stage that is none, no field is called so, or ``out`` lies in the archive; ArchiveError:
-    the archive cannot be read or written, or there is no room for the summary.
+    Raises SettingsError: a date that is none, or no field is called so; ArchiveError: the archive cannot be read or
+    written.
     """
     opened = open_archive(request.archive, create=False, write=not request.dry_run)
-    folder = opened.around if request.out is None else check_outside(request.out, opened.root)
     catalogue = Catalogue.read(opened.root)
-    wanted = _chosen(catalogue, request, opened.name)
+    wanted = _chosen(catalogue, request)
     rows: list[dict[str, Any]] = []
-    content: dict[str, Any] = {
-        "archive": opened.name,
-        "started": f"{datetime.now(UTC):%Y%m%dT%H%M%S}",
-        "finished": None,
-        "dry_run": request.dry_run,
-        "asked": {  # as it can be told years later
-            "since": request.since,
-            "stage": request.stage,
-            "field": request.field,
-            "failed": request.failed,
-            "weights": None if request.weights is None else str(request.weights.absolute()),
-            "weights_key": None if request.weights is None else file_key(request.weights),
-        },
-        "fields": rows,
-    }
     renewed = renewals(catalogue)
-    file = None
-    if wanted and not request.dry_run:
-        file = new_file(folder, f"reprocess-{content['started']}", ".json")
-        write_whole(file, to_json(content))
     with request.crew.open():  # one start of its workers for all fields
         for number, generation in enumerate(wanted, 1):
             told = f"{number} of {len(wanted)}: {generation.field} ({generation.run.folder.name})"
@@ -158,28 +131,10 @@ def run_reprocess(
             if rows[-1]["new"] is not None:
                 renewed[generation.run.folder.name] = rows[-1]["new"]
             console.print(escape(_words(rows[-1])), soft_wrap=True)
-            if file is not None:
-                write_whole(file, to_json(content))  # also of what was done before an interruption
-    content["finished"] = f"{datetime.now(UTC):%Y%m%dT%H%M%S}"
-    if file is not None and request.out is None and all(row["state"] == "skipped" for row in rows):
-        file.unlink(missing_ok=True)  # nothing was done, and nobody asked for the file
-        file = None
-    elif file is not None:
-        write_whole(file, to_json(content))
-    put_out(content, lambda told, screen: _show(told, file), as_json=as_json)
-    failed = sum(row["state"] == "failed" for row in rows)
-    return DONE if not failed else FAILED if failed == len(rows) else PARTLY
+    return {"archive": opened.name, "dry_run": request.dry_run, "fields": rows}
 
 
-def _chosen(catalogue: Catalogue, request: ReprocessRequest, out: str) -> list[Generation]:
-
-    def remakes(one: Generation) -> bool:
-        try:
-            settings = asked_again(one.run, out, request.weights)
-        except PipelineError:
-            return True  # said when its turn comes
-        return would_remake(catalogue, one.run, str(request.stage), settings)
-
+def _chosen(catalogue: Catalogue, request: ReprocessRequest) -> list[Generation]:
     if request.weights is not None and not request.weights.is_file():
         raise SettingsError(f"--weights {request.weights}: there is no such file; give weights that train has written")
     since = None if request.since is None else _moment(request.since)
@@ -193,9 +148,6 @@ def _chosen(catalogue: Catalogue, request: ReprocessRequest, out: str) -> list[G
         fields = [one for one in fields if _moment(one.run.created or "0001-01-01") >= since]
     if request.failed:
         fields = [one for one in fields if not is_whole(catalogue, one.run)]
-    if request.stage is not None:
-        check_stage(request.stage)
-        fields = [one for one in fields if remakes(one)]
     return fields
 
 
@@ -271,7 +223,7 @@ def _words(row: Mapping[str, Any]) -> str:
     return words + (f": {row['message']}" if row["message"] else "")
 
 
-def _show(content: Mapping[str, Any], file: Path | None) -> None:
+def _show(content: Mapping[str, Any], console: Console) -> None:
     rows = content["fields"]
     counts = {state: sum(row["state"] == state for row in rows) for state in STATES}
     told = ", ".join(f"{count} {state}" for state, count in counts.items() if count)
@@ -279,8 +231,8 @@ def _show(content: Mapping[str, Any], file: Path | None) -> None:
         *map(_words, rows),
         f"{counted(len(rows), 'field')}: {told}" if rows else "no field matches: nothing to do",
     ]
-    lines += [] if file is None else [f"  {file}"]
-    sys.stdout.write(visible("\n".join(lines)) + "\n")
+    for line in lines:
+        console.print(escape(line), soft_wrap=True)
 
 
 def run_judge(

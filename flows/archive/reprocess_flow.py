@@ -10,8 +10,7 @@ from prefect import flow
 from prefect.client.schemas.objects import ConcurrencyLimitConfig, ConcurrencyLimitStrategy
 from prefect.types.entrypoint import EntrypointType
 
-from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
-from flows.terminal.processes import FAILED, PARTLY
+from flows.archive.reprocess_command import ReprocessRequest, reprocess_fields
 from flows.terminal.progress import on_stderr
 from pipeline.errors import ArchiveError
 
@@ -20,7 +19,6 @@ from pipeline.errors import ArchiveError
 def reprocess(
     archive: str,
     since: str | None = None,
-    stage: str | None = None,
     field: str | None = None,
     failed: bool = False,
     weights: str | None = None,
@@ -32,10 +30,12 @@ def reprocess(
     archive or a parameter cannot be used, or no field could be reprocessed.
     """
     named = None if weights is None else Path(weights)
-    code = run_reprocess(ReprocessRequest(archive, since, stage, field, failed, named, dry_run), on_stderr())
-    if code == FAILED:
-        raise ArchiveError("no field could be reprocessed; reprocess-TIME.json beside the archive says why")
-    return "some fields failed; reprocess-TIME.json beside the archive says why" if code == PARTLY else "done"
+    request = ReprocessRequest(archive, since, field, failed, named, dry_run)
+    rows = reprocess_fields(request, on_stderr())["fields"]
+    refused = [f"{row['field']}: {row['message']}" for row in rows if row["state"] == "failed"]
+    if refused and len(refused) == len(rows):
+        raise ArchiveError(f"no field could be reprocessed: {'; '.join(refused)}")
+    return f"some fields failed: {'; '.join(refused)}" if refused else "done"
 
 
 def deployment(archive: str, number: int = 1) -> Any:

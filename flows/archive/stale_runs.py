@@ -179,34 +179,12 @@ def is_current(catalogue: Catalogue, run: Run, settings: Settings) -> bool:
     return of_this_law and not stale and is_whole(catalogue, run) and not is_pending(run.receipt)
 
 
-def would_remake(catalogue: Catalogue, run: Run, stage: str, settings: Settings) -> bool:
-    """Whether a stage (by its or its store's name) would be made anew, as versions and weights in manifests tell."""
-    keys = {row.get("key") for row in run.stages if str(row.get("name")) == stage}
-    below = ((uri, uri.split("/")) for uri in catalogue.named_and_below[run.uri])
-    own = [uri for uri, parts in below if parts[1] == stage or parts[-1] in keys]
-    return bool(stale_stores(catalogue, set(own) | catalogue.ancestors(own), weights_key(settings)))
-
-
-def check_stage(stage: str) -> None:
-    """Raise SettingsError unless a stage is called so."""
-    known = sorted({*versions(), *STAGES})
-    if stage not in known:
-        raise SettingsError(f"--stage {stage}: there is no such stage; there are {', '.join(known)}")
-
-
 def weights_key(settings: Settings) -> str | None:
     """What the weights are called by what they hold, as stages know it; None where they cannot be read."""
     try:
-        return file_key(weights_path(settings))
-    except SettingsError:  # they came from elsewhere, and nobody says which they are
-        return None
-
-
-def file_key(path: Path) -> str | None:
-    """What a file of weights is called by what it holds; None where it cannot be read."""
-    try:
+        path = weights_path(settings)
         return _file_key(path, path.stat().st_mtime_ns, path.stat().st_size)
-    except (OSError, WeightsError):
+    except (OSError, SettingsError, WeightsError):  # they came from elsewhere, and nothing says which they are
         return None
 
 

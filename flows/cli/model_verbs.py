@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 from flows.archive.reprocess_command import run_judge
-from flows.cli.app import AsJson, OutFile, OutFolder, Switch, parse_numbers, parse_wholes, split_list, stderr
+from flows.cli.app import AsJson, OutFile, OutFolder, parse_numbers, parse_wholes, split_list, stderr
 from flows.evaluate.command import run_evaluate
 from flows.evaluate.frames import SHARES, USUAL, EvaluateRequest
 from flows.terminal.progress import print_json
@@ -118,7 +118,7 @@ def train(
     columns
         How many numbers a pixel's spectrum is brought to, whatever bands a camera has.
     preset
-        Which network: `two-scale`, what surveys are made with, or a control to set beside it, with evaluate --control:
+        Which network: `two-scale`, what surveys are made with, or a control to set beside it:
         `paper`, the network of the paper; `dense`, one of ours that reads all of the scene finely, without a coarse
         pass; `upsampled`, the same given the coarse pass alone; `coarser`, the same given a grid coarser by 2.
     positions
@@ -227,12 +227,7 @@ def evaluate(
     scenes: int | None = None,
     seed: int = 0,
     draws: int = 2000,
-    timed_frames: int = 2,
-    timed_runs: int = 10,
-    control: Annotated[tuple[Path, ...], Parameter(negative="")] = (),
     rig: bool = True,
-    equal_time: Switch = False,
-    pooled: bool = True,
     labels: str | None = None,
     bands: str | None = None,
     wavelengths: str | None = None,
@@ -257,7 +252,7 @@ def evaluate(
         A file of weights. Several are seeds of one training, or of frames left out in turn: each frame is judged by
         those that never saw it.
     out
-        Folder for evaluation.json, the plots (evaluation.png, rig.png) and pictures of the worst and the best frame.
+        Folder for evaluation.json and its plot, evaluation.png.
     shares
         Shares of the seats (patches to look at finely) to try, with commas; 0.05,0.1,0.15,0.2,0.35 by default. No seat
         (none) and every seat (all) are always tried.
@@ -272,20 +267,8 @@ def evaluate(
         Of noise, random placements and the bootstrap.
     draws
         How often frames are drawn anew for the intervals (bootstrap).
-    timed_frames
-        How many frames to time, and to price the capture of; 0 leaves both out.
-    timed_runs
-        How often each is timed, after three rounds that are not counted; the median is given.
-    control
-        Weights of another design to compare with, made by train --preset; repeat it for more. The better of all and a
-        dense one is the baseline.
     rig
         Also compare plans of lines at equal capture seconds: ours, evenly spaced blocks and random blocks.
-    equal_time
-        Also judge each row with the exposure that makes its capture take as long as the full scan.
-    pooled
-        Of several frames, also judge gain and entropy with one threshold for the scores of all frames, which buys the
-        share of the seats of all of them together: bare frames then get fewer, rich ones more.
     labels
         For one scene, or a run: the file of its labels.
     bands
@@ -294,7 +277,7 @@ def evaluate(
         For one scene: wavelengths of its bands [nm], with commas.
     device
         Where the networks of WEIGHTS compute: `cpu`, `cuda`, `mps`, or `auto`, the first of the last two that torch can
-        use here, else the processor. Those of --control compute on the processor.
+        use here, else the processor.
     controls
         For a run: also judge other placements of the same number of seats; as its survey was asked for by default.
     """
@@ -303,7 +286,7 @@ def evaluate(
     if address is not None:
         return _evaluate_run(*address, flags)
     if controls is not None:
-        raise SettingsError("--controls is for a run of an archive; weights are judged beside others by --control FILE")
+        raise SettingsError("--controls is for a run of an archive; leave it out where weights are judged")
     choices = {
         "labels": labels,
         "bands": parse_wholes(bands, "--bands"),
@@ -320,12 +303,7 @@ def evaluate(
         scenes,
         seed,
         draws,
-        timed_frames,
-        timed_runs,
-        control,
         rig,
-        equal_time,
-        pooled,
         choices,
         device,
     )

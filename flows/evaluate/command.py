@@ -2,47 +2,49 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import sys
-from collections.abc import Sequence
-from dataclasses import asdict
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from rich.console import Console
 
-from flows.evaluate.costs import Prices
 from flows.evaluate.frames import (
     COST,
     Candidate,
     EvaluateRequest,
-    Jobs,
     Show,
     checked_request,
+    look_at,
     open_candidates,
     open_frames,
     scene_of,
     sort_frames,
 )
-from flows.evaluate.rows import design_of, known_or_none, open_controls
-from flows.evaluate.series import REFERENCE, Record, seeds_of
-from flows.evaluate.summary import summarise, summarise_equal_time, summarise_rig
-from flows.evaluate.table import SHOWN_SHARE, print_evaluation
-from flows.evaluate.work import Made, Work
+from flows.evaluate.judge import BUDGETS, Record, Trial, judge_frame, seeds_of, summarise
 from flows.terminal.processes import writing
 from flows.terminal.progress import StageProgress, on_stdout
-from flows.training.data import alike_notes
-from models.evaluation.metrics import LEVEL, agreement, false_pixels, iou_per_class, mean_iou
-from models.network.machine import keep_freed_memory
-from models.weights.files import describe_weights, unsealed_note
+from flows.training.data import TrainingData, alike_notes
+from models.evaluation.metrics import LEVEL
+from models.network.machine import PROCESSOR, choose_device, keep_freed_memory
+from models.weights.files import Weights, load_weights
 from pipeline.lazy import deferred
-from storage.archive.whole_files import to_json
+from pipeline.planning.line_blocks import WIDTHS
+from pipeline.simulator.scenes.scene import RasterScene
+from storage.archive.whole_files import to_json, write_whole
 
 if TYPE_CHECKING:
-    import flows.evaluate.plots as plots
+    import flows.evaluate.table as table
     import flows.publish.panels as panels
 else:
-    plots = deferred("flows.evaluate.plots")
+    table = deferred("flows.evaluate.table")  # matplotlib
     panels = deferred("flows.publish.panels")
+
+KEPT_VERSION = 3  # of what a kept result says
 
 
 def run_evaluate(request: EvaluateRequest, console: Console, *, as_json: bool = False) -> dict[str, Any]:
@@ -52,12 +54,9 @@ def run_evaluate(request: EvaluateRequest, console: Console, *, as_json: bool = 
     if as_json:
         sys.stdout.write(to_json(content))
     else:
-        print_evaluation(content, on_stdout())
+        table.print_evaluation(content, on_stdout())
     for note in content["data_notes"]:
         console.print(f"note: {note}", markup=False, soft_wrap=True)
-    for path in (*request.weights, *request.controls):
-        if not describe_weights(path).sealed:
-            console.print(f"note: {unsealed_note(path)}", markup=False, soft_wrap=True)
     for path in content["files"]:
         console.print(path, soft_wrap=True)
     return content
@@ -66,145 +65,105 @@ def run_evaluate(request: EvaluateRequest, console: Console, *, as_json: bool = 
 def evaluate_weights(request: EvaluateRequest, show: Show = lambda what, done, words: None) -> dict[str, Any]:
     """Judge weights on every frame of a data set that they were not trained on.
 
-    Raises SettingsError: shares, policies, weights or controls that cannot be; SceneError: no frame is left, one that
-    was asked for by name has no weights left, or one has no labels.
+    Raises SettingsError: shares, policies or weights that cannot be; SceneError: no frame is left, one that was asked
+    for by name has no weights left, or one has no labels.
     """
     request = checked_request(request)
     keep_freed_memory()
     candidates = open_candidates(request.weights)
-    controls = open_controls(request.controls, candidates)
     data = open_frames(request.dataset, request.frames, request.scenes, candidates[0].camera, request.choices)
     if request.out is not None:
         with writing(request.out):
             request.out.mkdir(parents=True, exist_ok=True)  # before minutes are spent on what cannot be kept
-    jobs = sort_frames(request, data, candidates, controls, show)
-    work = Work(request, data, candidates, controls)
-    made = work.judge(jobs, show)
-    content = {"dataset": data.law, **_files(candidates, controls, jobs), **_figures(request, work, made)}
-    content["data_notes"] = [*data.notes, *alike_notes(jobs.alike)]
-    content["files"] = publish_evaluation(work, content, made["frame"], show)
+    jobs = sort_frames(request, data, candidates, show)
+    trial = Trial(request.shares, request.policies, request.seed, request.rig)
+    runs = _judged(request, data, candidates, jobs.frames, trial, show)
+    names = [*jobs.frames, *jobs.left_out]
+    asked = {**asdict(trial), "draws": request.draws, "level": LEVEL}
+    content = {
+        "dataset": data.law,
+        "weights": [
+            {
+                "file": one.path.name,
+                "key": one.key,
+                "frames": len(covers := jobs.covered(number)),
+                "covers": covers,
+                "left_out": sorted(set(names) - set(covers)),
+            }
+            for number, one in enumerate(candidates)
+        ],
+        "frames": list(jobs.frames),
+        "left_out": jobs.left_out,
+        "settings": {**asked, "camera": asdict(candidates[0].camera), "cost_model": asdict(COST)},
+        "seeds": [[candidates[number].path.name for number in one] for one in seeds_of(runs)],
+        **summarise(runs, candidates[0].described.class_names, trial, request.draws),
+        "data_notes": [*data.notes, *alike_notes(jobs.alike)],
+        "files": [],
+    }
+    if request.out is not None:
+        content["files"] = [str(request.out / name) for name in ("evaluation.json", "evaluation.png")]
+        with writing(request.out):
+            panels.save_png(table.evaluation_figure(content), request.out / "evaluation.png")
+        write_whole(request.out / "evaluation.json", to_json(content))
     return content
 
 
-def _files(candidates: Sequence[Candidate], controls: Sequence[Candidate], jobs: Jobs) -> dict[str, Any]:
-    names = [job.name for job in jobs.frames] + jobs.left_out
+def _judged(
+    request: EvaluateRequest,
+    data: TrainingData,
+    candidates: Sequence[Candidate],
+    frames: dict[str, tuple[int, ...]],
+    trial: Trial,
+    show: Show,
+) -> list[list[Record]]:
+    """Judge every frame by its weights, of each weights the records; what was kept is not made again."""
+    device, loaded = choose_device(request.device), dict[int, Weights]()
+    kept = KeptResults(None if request.out is None else request.out / "frames")
+    runs: list[list[Record]] = [[] for _ in candidates]
+    for number, (name, fit) in enumerate(frames.items()):
+        scene = scene_of(data, name)
+        for at, index in enumerate(fit):
+            one = candidates[index]
+            show("judging frames", (number + at / len(fit)) / len(frames), f"{name}, {one.path.name}")
 
-    def told(one: Candidate, number: int, *, control: bool) -> Record:
-        covers = jobs.covered(number, control=control)
-        gone = sorted(set(names) - set(covers))
-        return {"file": one.path.name, "key": one.key, "frames": len(covers), "covers": covers, "left_out": gone}
+            def judged(
+                scene: RasterScene = scene, index: int = index, one: Candidate = one, name: str = name
+            ) -> Record:
+                if index not in loaded:
+                    loaded[index] = load_weights(one.path).on(device)
+                look = look_at(scene, name, loaded[index], one.camera, request.seed)
+                return judge_frame(trial, look, loaded[index], one.camera)
 
-    return {
-        "weights": [told(one, number, control=False) for number, one in enumerate(candidates)],
-        "controls": [
-            {"design": design_of(one), **told(one, number, control=True)} for number, one in enumerate(controls)
-        ],
-        "frames": [job.name for job in jobs.frames],
-        "left_out": jobs.left_out,
-    }
-
-
-def _figures(request: EvaluateRequest, work: Work, made: Made) -> dict[str, Any]:
-    trial = {"shares": request.shares, "policies": request.policies, "seed": request.seed, "draws": request.draws}
-    camera, names = asdict(work.camera), work.candidates[0].described.class_names
-    designs = [design_of(one) for one in work.controls]
-    runs, rig, prices = made["frame"], made["rig"], Prices(made["time"][0], made["capture"][0])
-    return {
-        "settings": {**trial, "level": LEVEL, "mode": "frame", "camera": camera, "cost_model": asdict(COST)},
-        "seeds": [[work.candidates[number].path.name for number in one] for one in seeds_of(runs)],
-        **summarise(runs, names, trial, prices, made["control"], designs),
-        "rig": summarise_rig(rig, trial) if request.rig else {"rows": [], "left_out": []},
-        "equal_time": summarise_equal_time(made["equal"], runs, rig, trial) if request.equal_time else [],
-        "timed": prices.timed,
-        "captured": prices.captured,
-        "per_frame": [
-            {
-                "frame": record["frame"],
-                "weights": number,
-                "seats": record["seats"],
-                "positive_seats": record["positive_seats"],
-                "rows": [_of_frame(row) for row in record["rows"]],
+            # the farm's labels follow from its key and are not drawn for this
+            labels = None if data.files is None or scene.labels is None else zlib.crc32(scene.labels.tobytes())
+            follows_from = {
+                **{"weights": one.key, "frame": name, "scene": scene.key, "labels": labels, **asdict(trial)},
+                **{"camera": asdict(one.camera), "cost": asdict(COST), "budgets": BUDGETS, "widths": WIDTHS},
+                **({} if device == PROCESSOR else {"device": device}),
             }
-            for number, records in enumerate(runs)
-            for record in records
-        ],
-        "notes": NOTES,
-        "files": [],
-    }
+            runs[index].append(kept.made(follows_from, judged))
+    show("judging frames", 1.0, f"{len(frames)} frames")
+    return runs
 
 
-NOTES = {
-    "bytes": "estimated: samples x bands x 2 bytes, before compression",
-    "samples": "coarse pixels and the pixels of the seats, seats free of each other (frame mode)",
-    "multiply_adds": "closed form; glance, scores and map; none and all are the map alone",
-    "cpu_s": "one thread, from spectral columns to the map: glance, scores and map; none, all and a dense control are "
-    "the map alone, their fastest path; median of the rounds, all rows in turn",
-    "capture_s": "by the cost model, coarse pass included; frame: as if each seat took its share of the full scan; "
-    "rig: the same seats by runs of lines, or the full scan where cheaper; all is the full scan alone",
-    "pooled": "one threshold for the scores of all frames of a seed: the best seats of all of them together, as many as"
-    " the share of them; intervals over frames hold the threshold. CPU and frame seconds are those of the share on "
-    "every frame, on which a frame has as many seats in the mean",
-    "intervals": "paired bootstrap over frames, and over seeds of the training where there are several",
-    "baseline": "the better of all and the dense control",
-    "curves": f"over multiply-adds; reference of the hypervolume: {REFERENCE}",
-    "equal_time": "exposure changed until the plan takes what the full scan takes; both clip at the same full well; "
-    "seats by runs of lines as above, lines: plans of the rig, by budget instead of K",
-    "rig": "lines: every plan pays coarse pass, set-ups and reloads; uniform lines and random lines are blocks of as "
-    "many rows of seats as show most seats for the seconds",
-    "oracle": "uses labels",
-}
+@dataclass(frozen=True)
+class KeptResults:
+    """A folder of results by what they follow from: a run that was killed goes on. Without a folder nothing is kept."""
 
+    folder: Path | None
 
-def _of_frame(row: Record) -> Record:
-    counts = np.array(row["counts"])
-    return {
-        **{name: row[name] for name in ("policy", "draw", "share", "seats")},
-        **{name: known_or_none(figure) for name, figure in agreement(counts).items()},
-        "per_class_iou": [known_or_none(iou) for iou in iou_per_class(counts)],
-        "false_pixels": false_pixels(counts).tolist(),
-    }
-
-
-def publish_evaluation(work: Work, content: dict[str, Any], runs: list[list[Record]], show: Show) -> list[str]:
-    """Write figures, plots and pictures into the folder, where there is one; names of the files."""
-    out = work.request.out
-    if out is None:
-        return []
-    policies, shares = work.trial.policies, work.trial.shares
-    shown = ("none", 0.0)
-    if policies and shares:
-        shown = policies[0], min(shares, key=lambda share: abs(share - SHOWN_SHARE))
-    files = [out / "evaluation.json", out / "evaluation.png"]
-    with writing(out):
-        panels.save_png(plots.evaluation_figure(content), files[1])
-        if content["rig"]["rows"]:
-            files.append(out / "rig.png")
-            panels.save_png(plots.rig_figure(content), files[-1])
-        for title, name, index in ends(runs, *shown):
-            show("drawing", len(files) / 6, title)
-            path, scene = out / f"{title}.png", scene_of(work.data, name)
-            look = work.look(scene, name, index)
-            panels.save_png(plots.frame_figure(f"{title} frame", look, work.loaded(index), *shown), path)
-            files.append(path)
-        content["files"] = [str(path) for path in files]
-        temporary = files[0].with_name("evaluation.json.part")
-        temporary.write_text(to_json(content), encoding="utf-8")
-        temporary.replace(files[0])
-    show("drawing", 1.0, "")
-    return [str(path) for path in files]
-
-
-def ends(runs: list[list[Record]], policy: str, share: float) -> list[tuple[str, str, int]]:
-    """Title, frame and weights of the lowest and the highest mIoU of a frame's own; one frame alone is the worst."""
-    judged: dict[str, tuple[float, int]] = {}
-    for number, records in enumerate(runs):
-        for record in records:
-            row = next(row for row in record["rows"] if (row["policy"], row["share"]) == (policy, share))
-            own = mean_iou(np.array(row["counts"]))
-            if not np.isnan(own):
-                judged.setdefault(record["frame"], (own, number))
-    if not judged:
-        return []
-    worst, best = (choose(judged, key=lambda name: judged[name][0]) for choose in (min, max))
-    named = [("worst", worst)] if worst == best else [("worst", worst), ("best", best)]
-    return [(title, name, judged[name][1]) for title, name in named]
+    def made(self, follows_from: Record, make: Callable[[], Record]) -> Record:
+        """Give the result that was kept, or make it and keep it: whole or not at all. A damaged one is made again."""
+        if self.folder is None:
+            return make()
+        text = json.dumps([KEPT_VERSION, follows_from], sort_keys=True)
+        path = self.folder / f"{hashlib.sha256(text.encode()).hexdigest()[:20]}.json"
+        try:
+            known: Record = json.loads(path.read_text(encoding="utf-8"))["result"]
+            return known
+        except (OSError, ValueError, LookupError, TypeError):
+            result = make()
+        with writing(self.folder):
+            self.folder.mkdir(parents=True, exist_ok=True)
+        write_whole(path, json.dumps({"follows_from": follows_from, "result": result}))
+        return result

@@ -22,9 +22,9 @@ from models.evaluation.metrics import DRAWS
 from models.network.machine import PROCESSOR
 from models.network.spectral import patches_of
 from models.policies.policies import NETWORK_POLICIES, POLICIES
-from models.reading.inference import CoarseLook, Glance, glance_of_columns
+from models.reading.inference import Glance, glance_of_columns
 from models.training.examples import normalised
-from models.weights.files import AnyWeights, Description, Weights, content_key, describe_weights
+from models.weights.files import Description, Weights, content_key, describe_weights
 from pipeline.errors import PipelineError, SceneError, SettingsError, WeightsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
@@ -51,12 +51,7 @@ class EvaluateRequest:
     scenes: int | None = None  # of the built-in farm
     seed: int = 0
     draws: int = DRAWS
-    timed_frames: int = 2
-    timed_runs: int = 10  # after warm-ups
-    controls: tuple[Path, ...] = ()
-    rig: bool = True
-    equal_time: bool = False
-    pooled: bool = True
+    rig: bool = True  # also plans of lines at equal seconds
     choices: dict[str, Any] = field(default_factory=dict)  # of load_data_set: labels, bands, wavelengths
     device: str = PROCESSOR  # where the networks of surveys compute; or auto
 
@@ -71,12 +66,7 @@ def checked_request(request: EvaluateRequest) -> EvaluateRequest:
             raise SettingsError(
                 f"--policies: {policy!r} is none that can be judged on a data set; choose of {', '.join(JUDGED)}"
             )
-    for flag, value, least in (
-        ("--seed", request.seed, 0),
-        ("--draws", request.draws, 1),
-        ("--timed-frames", request.timed_frames, 0),
-        ("--timed-runs", request.timed_runs, 1),
-    ):
+    for flag, value, least in (("--seed", request.seed, 0), ("--draws", request.draws, 1)):
         if value < least:
             raise SettingsError(f"{flag} must be at least {least}, got {value}")
     shares = tuple(sorted({share for share in request.shares if 0 < share < 1}))
@@ -141,22 +131,14 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Sight:
-    """One frame in the columns of certain weights of any design."""
+class Look:
+    """One frame in the spectral features of certain weights, with their coarse prediction."""
 
     name: str
-    seen: CoarseLook
-    fine: NDArray[np.float32]  # (seat, p, p, column) normalised, every seat of the padded grid
+    seen: Glance
+    fine: NDArray[np.float32]  # (patch, p, p, column) normalised, every patch of the padded grid
     labels: NDArray[np.uint8]  # (y, x) in the weights' classes
     bands: int
-    picture: NDArray[np.float32]  # (y, x, column) as seen, not normalised
-
-
-@dataclass(frozen=True)
-class Look(Sight):
-    """One frame as certain weights see it, with their glance."""
-
-    seen: Glance
 
 
 def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
@@ -172,8 +154,8 @@ def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
     for other in found:
         if other.described.config.preset != "two-scale":
             raise SettingsError(
-                f"{other.path} holds the control {other.described.config.preset!r}; give it as --control, beside"
-                " --weights of two scales"
+                f"{other.path} holds the control network {other.described.config.preset!r}, which reads no patches; "
+                "give weights of two scales, such as `train` makes without --preset"
             )
     for other in found[1:]:
         if other.camera != found[0].camera:
@@ -210,14 +192,7 @@ def open_frames(
 
 
 def look_at(scene: RasterScene, name: str, weights: Weights, camera: LineCamera, seed: int) -> Look:
-    """Look at a frame with the camera of the training, and glance at it with the weights."""
-    sight = sight_of(scene, name, weights, camera, seed)
-    seen = glance_of_columns(weights, sight.seen.columns, sight.seen.grid)
-    return Look(**(vars(sight) | {"seen": seen}))
-
-
-def sight_of(scene: RasterScene, name: str, weights: AnyWeights, camera: LineCamera, seed: int) -> Sight:
-    """Give a frame in the columns of weights; the noise follows from the seed and the frame's name."""
+    """Look at a frame with the camera of the training; the noise follows from the seed and the frame's name."""
     config = weights.config
     grid = SceneGrid(*scene.shape, config.patch, config.factor)
     rng = np.random.default_rng([seed, 0xE7A1, zlib.crc32(name.encode())])
@@ -226,38 +201,24 @@ def sight_of(scene: RasterScene, name: str, weights: AnyWeights, camera: LineCam
     example = normalised(observed, weights.normalisation, reached)
     labels = judged_labels(scene, Description(config, weights.basis, weights.class_names, weights.record))
     assert labels is not None  # sort_frames
-    return Sight(
-        name,
-        CoarseLook(grid, np.ascontiguousarray(example.coarse, np.float32)),
-        patches_of(example.fine, config.patch).astype(np.float32),
-        labels,
-        len(scene.wavelength_nm),
-        observed.fine[: grid.height, : grid.width],
-    )
+    seen = glance_of_columns(weights, np.ascontiguousarray(example.coarse, np.float32), grid)
+    fine = patches_of(example.fine, config.patch).astype(np.float32)
+    return Look(name, seen, fine, labels, len(scene.wavelength_nm))
 
 
 Show = Callable[[str, float, str], None]
 
 
 @dataclass(frozen=True)
-class Job:
-    """A frame, and the numbers of the weights and of the controls that it says something of."""
-
-    name: str
-    weights: tuple[int, ...]
-    controls: tuple[int, ...] = ()
-
-
-@dataclass(frozen=True)
 class Jobs:
-    """Frames to judge, and those that all of the weights were trained on."""
+    """Frames to judge with the numbers of the weights that judge them, and those that all weights were trained on."""
 
-    frames: list[Job]
-    left_out: list[str]
+    frames: dict[str, tuple[int, ...]] = field(default_factory=dict)
+    left_out: list[str] = field(default_factory=list)
     alike: dict[str, str] = field(default_factory=dict)  # frame -> class, where all its labels are one
 
-    def covered(self, number: int, *, control: bool = False) -> list[str]:
-        return [job.name for job in self.frames if number in (job.controls if control else job.weights)]
+    def covered(self, number: int) -> list[str]:
+        return [name for name, fit in self.frames.items() if number in fit]
 
 
 def scene_of(data: TrainingData, name: str) -> RasterScene:
@@ -265,21 +226,15 @@ def scene_of(data: TrainingData, name: str) -> RasterScene:
     return next(data.scenes((name,)))
 
 
-def sort_frames(
-    request: EvaluateRequest,
-    data: TrainingData,
-    weights: Sequence[Candidate],
-    controls: Sequence[Candidate],
-    show: Show,
-) -> Jobs:
-    """Look at every frame for who was trained on it.
+def sort_frames(request: EvaluateRequest, data: TrainingData, weights: Sequence[Candidate], show: Show) -> Jobs:
+    """Sort the frames by the weights that were not trained on them.
 
-    Raises SceneError: no frame or no labelled pixel is left, a frame that was asked for by name has no weights left, a
-    control has no frame left, or a frame that cannot be judged; SettingsError: files that were trained on different
-    pixels of one frame.
+    Raises SceneError: no frame or no labelled pixel is left, a frame that was asked for by name has no weights left, or
+    a frame that cannot be judged; SettingsError: files that were trained on different pixels of one frame.
     """
-    jobs, labelled = Jobs([], []), False
+    jobs, labelled = Jobs(), False
     chosen = any(request.choices.get(what) is not None for what in ("bands", "wavelengths"))
+    in_turn = len({one.held_out for one in weights}) > 1
     for number, name in enumerate(data.train):
         show("looking for frames", number / len(data.train), name)
         scene = scene_of(data, name)
@@ -291,51 +246,38 @@ def sort_frames(
             jobs.alike[name] = alone
         for one in weights:
             check_labels(scene, one.described)
-        job = Job(name, *(_fit(some, scene, name, data.law, chosen) for some in (weights, controls)))
-        fit = [*(weights[at] for at in job.weights), *(controls[at] for at in job.controls)]
-        for one in fit[1:]:
-            if one.pixels_of(scene) != fit[0].pixels_of(scene):
-                raise SettingsError(
-                    f"{one.path} and {fit[0].path} were trained on different pixels of {scene.name}, so that others "
-                    "are left to judge each of them on; evaluate them one by one"
-                )
-        if not job.weights:
+        fit = [
+            at
+            for at, one in enumerate(weights)
+            if not one.trained_on(scene, name, data.law, bands_chosen=chosen)
+            and not (in_turn and one.validated_on(name, data.law))
+        ]
+        if not fit:
             jobs.left_out.append(name)
             continue
-        jobs.frames.append(job)
-        labels = judged_labels(scene, weights[job.weights[0]].described)
+        first = weights[fit[0]]
+        for one in (weights[at] for at in fit[1:]):
+            if one.pixels_of(scene) != first.pixels_of(scene):
+                raise SettingsError(
+                    f"{one.path} and {first.path} were trained on different pixels of {scene.name}, so that others "
+                    "are left to judge each of them on; evaluate them one by one"
+                )
+        jobs.frames[name] = tuple(fit)
+        labels = judged_labels(scene, first.described)
         labelled = labelled or (labels is not None and bool((labels != UNLABELLED).any()))
     show("looking for frames", 1.0, f"{len(jobs.frames)} of {len(data.train)}")
-    _check_left(request, jobs, weights, controls)
+    files, left = ", ".join(str(one.path) for one in weights), ", ".join(jobs.left_out)
+    how = "judge by others, or train with some held out: spectralzoom train ... --hold-out NAMES"
+    if not jobs.frames:
+        raise SceneError(
+            f"{files} was trained on all {len(jobs.left_out)} frames of {request.dataset}, and frames trained on are "
+            f"refused: {how}"
+        )
+    if request.frames and jobs.left_out:
+        raise SceneError(
+            f"no weights are left for {left} of --frames: {files} was trained on it, and frames trained on are "
+            f"refused: {how}"
+        )
     if not labelled:
         raise SceneError(f"no labelled pixel is left on the {len(jobs.frames)} frames of {request.dataset} to judge by")
     return jobs
-
-
-def _fit(some: Sequence[Candidate], scene: RasterScene, name: str, law: str, chosen: bool) -> tuple[int, ...]:
-    in_turn = len({one.held_out for one in some}) > 1
-    return tuple(
-        number
-        for number, one in enumerate(some)
-        if not one.trained_on(scene, name, law, bands_chosen=chosen) and not (in_turn and one.validated_on(name, law))
-    )
-
-
-def _check_left(
-    request: EvaluateRequest, jobs: Jobs, weights: Sequence[Candidate], controls: Sequence[Candidate]
-) -> None:
-    files = ", ".join(str(one.path) for one in weights)
-    told = (
-        "frames trained on are refused: judge by others, or train with some held out: spectralzoom train ... --hold-out"
-        " NAMES"
-    )
-    if not jobs.frames:
-        raise SceneError(f"{files} was trained on all {len(jobs.left_out)} frames of {request.dataset}, and {told}")
-    if request.frames and jobs.left_out:
-        raise SceneError(
-            f"no weights are left for {', '.join(jobs.left_out)} of --frames: {files} was trained on "
-            f"{'it' if len(jobs.left_out) == 1 else 'them'}, and {told}"
-        )
-    for number, one in enumerate(controls):
-        if not jobs.covered(number, control=True):
-            raise SceneError(f"the control {one.path} was trained on all {len(jobs.frames)} frames judged, and {told}")

@@ -1,271 +1,117 @@
-"""An evaluation as tables: accuracy with intervals, costs, placement, budgets and classes."""
+"""An evaluation as tables and as a plot: accuracy with intervals, costs, plans of lines, classes."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
+from matplotlib.figure import Figure
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from flows.evaluate.rows import ENDS
-from flows.tasks.scores import SHOWN, SHOWN_WORDS, definitions_differ
-from flows.terminal.figures import DASH, format_count, format_percent, format_points
+from flows.evaluate.judge import ENDS
+from flows.publish.panels import GRID, INK, PAPER
+from flows.terminal.figures import (
+    DASH,
+    counted,
+    format_bytes,
+    format_count,
+    format_percent,
+    format_points,
+    format_seconds,
+)
 
-SHOWN_SHARE = 0.10  # of the seats, or the nearest one tried: what is shown where one share has to do
+SHOWN_SHARE = 0.10  # of the patches, or the nearest one tried: what is shown where one share has to do
+CAPTION = (
+    "K: share of the valid patches, each free of the others. mIoU over the counts of all frames, mean over the classes "
+    "of the labels; overall: share of pixels that are right; ± the spread of seeds, else of random draws. [ ] 95 % of "
+    "{draws} draws: paired bootstrap over frames, and over seeds where there are several. * uses labels. captured: the "
+    "chosen patches' share of the gain of the oracle's. Data before compression; multiply-adds in closed form; seconds "
+    "by the cost model, coarse pass included, by runs of lines or the full scan where that is cheaper."
+)
 
 
 def print_evaluation(content: dict[str, Any], console: Console) -> None:
-    """Print what was judged, accuracy, costs, placement, budgets and classes, and what the figures mean."""
-    for line in _head(content):
-        console.print(escape(line), soft_wrap=True)
-    tables = (_accuracy(content), *_both_definitions(content), _costs(content), _compute(content), _placement(content))
-    for table in (*tables, *budget_tables(content), _classes(content)):
-        console.print(table)
-    console.print(escape(_caption(content)), soft_wrap=True, style="dim")
-
-
-def _head(content: dict[str, Any]) -> list[str]:
-    frames, weights = content["frames"], content["weights"]
-    seeds = f"{len(weights)} sets of weights" if len(weights) > 1 else weights[0]["file"]
+    """Print what was judged, accuracy with costs, plans of lines and classes, and what the figures mean."""
+    weights = content["weights"]
+    named = f"{len(weights)} sets of weights" if len(weights) > 1 else weights[0]["file"]
     left = f"; left out as seen in training: {len(content['left_out'])}" if content["left_out"] else ""
-    lines = [f"{content['dataset']}: {len(frames)} frame{'s' if len(frames) != 1 else ''}, {seeds}{left}"]
-    several = [*(weights if len(weights) > 1 else []), *content["controls"]]
-    for one in several:
-        kind = f"control {one['design']}, " if "design" in one else ""
-        lines.append(f"  {kind}{one['file']}: {one['frames']} frames: {', '.join(one['covers']) or 'none'}")
+    lines = [f"{content['dataset']}: {counted(len(content['frames']), 'frame')}, {named}{left}"]
     if len(weights) > 1:
+        lines += [f"  {one['file']}: {one['frames']} frames: {', '.join(one['covers']) or 'none'}" for one in weights]
         together = "; ".join(" + ".join(names) for names in content["seeds"])
         lines.append(f"  seeds of the training: {len(content['seeds'])} ({together})")
-    base = content["baseline"]
-    lines.append(f"baseline: {base['policy']} ({base['why']})")
-    return lines
-
-
-def _name(row: dict[str, Any]) -> str:
-    return f"{row['policy']}{'*' if row['uses_labels'] else ''}"
-
-
-def _named(row: dict[str, Any]) -> tuple[str, str]:
-    return _name(row), format_percent(row["share"])
-
-
-def _style(row: dict[str, Any]) -> str:
-    return "dim" if row["uses_labels"] or row["control"] else ""
+    for line in lines:
+        console.print(escape(line), soft_wrap=True)
+    console.print(_accuracy(content))
+    console.print(_costs(content))
+    if content["rig"]:
+        console.print(_rig(content))
+    console.print(_classes(content))
+    console.print(escape(CAPTION.format(draws=content["settings"]["draws"])), soft_wrap=True, style="dim")
 
 
 def _accuracy(content: dict[str, Any]) -> Table:
-    """Of one frame alone, more accuracies over its pixels take the place of the mean over frames."""
-    alone = len(content["frames"]) == 1
-    of_frames = ("average", "kappa") if alone else ("per\nframe",)
-    names = ("K", "mIoU", "overall", *of_frames, "bound-\nary", "in / out", "to baseline", "to random", "gap")
+    names = ("K", "mIoU", "overall", "average", "kappa", "to all", "to random", "gap", "captured")
     table = _table("placement", *names)
     for row in content["rows"]:
-        spread = row["spread"] if row["spread"] is not None else row["draws_spread"]
-        own = (
-            [format_points(row["average_accuracy"]), _ratio(row["kappa"])] if alone else [format_points(row["miou_i"])]
-        )
         table.add_row(
-            *_named(row),
-            format_points(row["miou"]) + ("" if spread is None else f" ±{100 * spread:.1f}"),
+            f"{row['policy']}{'*' if row['uses_labels'] else ''}",
+            format_percent(row["share"]),
+            _miou(row),
             format_points(row["pixel_accuracy"]),
-            *own,
-            format_points(row["boundary_iou"]),
-            f"{format_points(row['inside_miou'])} / {format_points(row['outside_miou'])}",
-            format_difference(row["against_baseline"]),
+            format_points(row["average_accuracy"]),
+            f"{row['kappa']:.2f}",
+            format_difference(row["against_all"]),
             format_difference(row["against_random"]),
-            format_percent(row["gap_closed"] if row["policy"] not in ENDS and not row["control"] else None),
-            style=_style(row),
+            format_percent(row["gap_closed"]),
+            format_percent(row["captured_gain"]),
+            style="dim" if row["uses_labels"] else "",
         )
     return table
-
-
-def _both_definitions(content: dict[str, Any]) -> Iterator[Table]:
-    """The mean over the classes that a map shows, where that is another: the figure of before."""
-    if definitions_differ(content["rows"]):
-        table = _table("placement", "K", "mIoU", SHOWN)
-        for row in content["rows"]:
-            means = (format_points(row[name]) for name in ("miou", "miou_of_shown_classes"))
-            table.add_row(*_named(row), *means, style=_style(row))
-        yield table
 
 
 def _costs(content: dict[str, Any]) -> Table:
-    of = "of base"
-    table = _table(
-        "placement", "K", "samples", of, "MB", "madds", of, "CPU s", of, "frame s", "of full", "rig s", "of full"
-    )
+    table = _table("placement", "K", "data", "of all", "multiply-adds", "of all", "seconds", "of full scan")
     for row in content["rows"]:
-        done = {name: entry["done"] for name, entry in row["cost"].items() if name != "fine_lines"}
-        share = {name: format_percent(row["cost"][name]["ratio"]) for name in done}
+        cost = row["cost"]
         table.add_row(
-            *_named(row),
-            format_count(done["samples"]),
-            share["samples"],
-            DASH if done["bytes"] is None else f"{done['bytes'] / 1e6:.3g}",
-            format_count(done["multiply_adds"]),
-            share["multiply_adds"],
-            DASH if done["cpu_s"] is None else f"{done['cpu_s']:.3f}",
-            share["cpu_s"],
-            _whole(done["frame_s"]),
-            share["frame_s"],
-            _whole(done["rig_s"]),
-            share["rig_s"],
-            style=_style(row),
+            row["policy"],
+            format_percent(row["share"]),
+            format_bytes(cost["bytes"]["done"]),
+            format_percent(cost["bytes"]["ratio"]),
+            format_count(cost["multiply_adds"]["done"]),
+            format_percent(cost["multiply_adds"]["ratio"]),
+            *_seconds(cost),
         )
     return table
 
 
-def _whole(seconds: float | None) -> str:
-    return DASH if seconds is None else f"{seconds:.0f}"
+def _miou(row: dict[str, Any]) -> str:
+    spread = row["spread"] if row["spread"] is not None else row["draws_spread"]
+    return format_points(row["miou"]) + ("" if spread is None else f" ±{100 * spread:.1f}")
 
 
-def _compute(content: dict[str, Any]) -> Table:
-    parts = ("glance", "score", "encode", "decode")
-    table = _table("multiply-adds", "K", *parts)
-    for row in content["rows"]:
-        adds = row["cost"]["multiply_adds"]
-        cells = (format_count(adds[part]) for part in parts)
-        table.add_row(*_named(row), *cells, style=_style(row))
-    return table
-
-
-def _placement(content: dict[str, Any]) -> Table:
-    """One line a policy: how its order of the seats agrees with the oracle's, and what the seats of each K gain."""
-    rows: dict[str, list[dict[str, Any]]] = {}
-    for row in content["rows"]:
-        if row["policy"] not in ENDS and not row["control"]:
-            rows.setdefault(row["policy"], []).append(row)
-    shares = [f"{format_percent(share)}\ncaptured AP" for share in content["settings"]["shares"]]
-    table = _table(
-        "placement\n", "rank\n", "AP\ngain > 0", *shares, "area\nof gap", "hyper-\nvolume", "to 95 %\nof all"
-    )
-    curves = {one["policy"]: one for one in content["curves"]}
-    for policy, own in rows.items():
-        found = [f"{_ratio(row['captured_gain'])} {_ratio(row['ap_top'])}" for row in own]
-        curve = curves.get(policy, {})
-        volume, enough = curve.get("hypervolume"), curve.get("cost_to_enough")
-        summed = [
-            _ratio(curve.get("auc_gap")),
-            DASH if volume is None else f"{100 * volume:.2f}",
-            format_percent(enough),
-        ]
-        table.add_row(_name(own[0]), _ratio(own[0]["spearman"]), _ratio(own[0]["ap_gain"]), *found, *summed)
-    return table
-
-
-def _ratio(value: float | None) -> str:
-    return DASH if value is None else f"{value:.2f}"
-
-
-def _classes(content: dict[str, Any]) -> Table:
-    shown = [row for row in content["rows"] if row["policy"] in ENDS]
-    first = [row for row in content["rows"] if row["policy"] == content["rows"][1]["policy"]]
-    shown.insert(1, min(first, key=lambda row: abs(row["share"] - SHOWN_SHARE)))
-    shown += [row for row in content["rows"] if row["control"] and row["share"] in (0, 1)]
-    shown = [row for number, row in enumerate(shown) if row not in shown[:number]]
-    heads = [f"{row['policy']} {format_percent(row['share'])}\n{what}" for row in shown for what in ("IoU", "boundary")]
-    table = _table("class", "labelled px", *heads)
-    for name, support in content["support"].items():
-        cells = []
-        for row in shown:
-            false = row["false_classes"].get(name)  # how often the map shows a class that the labels lack
-            iou = format_points(row["per_class_iou"][name])
-            cells += [iou if false is None else f"{format_count(false)} px false"]
-            cells += [format_points(row["per_class_boundary_iou"][name])]
-        table.add_row(escape(name), format_count(support), *cells)
-    return table
-
-
-def _caption(content: dict[str, Any]) -> str:
-    averaged = {row["classes_averaged"] for row in content["rows"]}
-    classes = " to ".join(str(number) for number in sorted({min(averaged), max(averaged)}))
-    timed, notes = len(content["timed"]), content["notes"]
-    before = f"{SHOWN_WORDS} " if definitions_differ(content["rows"]) else ""
-    return (
-        "K: share of the valid seats, free of each other (frame mode). mIoU over the counts of all frames, mean over "
-        f"the {classes} classes of the labels (per frame, in / out: those they have there); overall: share of pixels "
-        f"that are right. {before}± the spread of seeds, else of random draws. [ ] 95 % of "
-        f"{content['settings']['draws']} draws: {notes['intervals']}. * uses labels.\n"
-        "rank: Spearman of scores and gain; AP: average precision for seats with a gain, and for the oracle's own K; "
-        "captured: the chosen seats' share of the gain that the oracle's seats have.\n"
-        f"area of gap, hypervolume (points), least cost to reach 95 % of the mIoU of all: {notes['curves']}.\n"
-        f"MB: {notes['bytes']}. madds: multiply-adds. CPU: {notes['cpu_s']} ({timed} timed).\n"
-        f"capture ({len(content['captured'])} priced): {notes['capture_s']}."
-    )
-
-
-def budget_tables(content: dict[str, Any]) -> Iterator[Table]:
-    """Give tables of one threshold for all frames, of the rig's plans and of equal time, as far as they were judged."""
-    if any(row["thresholds"] for row in content["rows"]):
-        yield _pooled(content)
-    if content["rig"]["rows"] or content["rig"]["left_out"]:
-        yield _rig(content)
-    if content["equal_time"]:
-        yield _equal_time(content)
-
-
-def format_difference(interval: dict[str, float | None] | None, digits: int = 1) -> str:
-    """Points of mIoU with the bounds of the interval, as far as there are any."""
-    if interval is None or interval["difference"] is None:
-        return ""
-    text = f"{100 * interval['difference']:+.{digits}f}"
-    low, high = interval["low"], interval["high"]
-    return text if low is None or high is None else f"{text} [{100 * low:+.{digits}f}, {100 * high:+.{digits}f}]"
-
-
-def _table(first: str, *columns: str, title: str | None = None, caption: str = "") -> Table:
-    table = Table(
-        title=title,
-        title_justify="left",
-        title_style="",
-        caption=caption or None,
-        caption_justify="left",
-        header_style="dim",
-        box=SIMPLE_HEAD,
-        collapse_padding=True,
-    )
-    table.add_column(first, no_wrap=True)
-    for name in columns:
-        table.add_column(name, justify="right", no_wrap=True)
-    return table
-
-
-def _pooled(content: dict[str, Any]) -> Table:
-    names = ("K", "least", "most", "threshold", "mIoU", "to K on every frame")
-    title = "pooled: one threshold for the scores of all frames, and the seats that a frame then has"
-    table = _table("placement", *names, title=title, caption=content["notes"]["pooled"])
-    for row in content["rows"]:
-        if row["thresholds"]:
-            seats = row["seats_per_frame"]
-            table.add_row(
-                row["policy"],
-                format_percent(row["share"]),
-                str(seats["least"]),
-                str(seats["most"]),
-                ", ".join(DASH if one is None else f"{one:.3g}" for one in row["thresholds"]),
-                format_points(row["miou"]),
-                format_difference(row["against_share_per_frame"], 2),
-            )
-    return table
+def _seconds(cost: dict[str, Any]) -> tuple[str, str]:
+    """Seconds of capture and their share of the full scan's; unknown beyond the mirror's range."""
+    if "capture_s" not in cost:
+        return DASH, DASH
+    done, full = cost["capture_s"]["done"], cost["full_s"]["done"]
+    return format_seconds(done), format_percent(done / full)
 
 
 def _rig(content: dict[str, Any]) -> Table:
-    rig = content["rig"]
-    names = ("budget", "seconds", "of full", "lines", "of full", "seats", "mIoU", "overall", "to uniform", "to random")
-    table = _table("plan", *names, title="rig mode: mIoU at equal capture seconds", caption=_left_out(rig["left_out"]))
-    for row in sorted(rig["rows"], key=lambda row: row["budget"]):
+    names = ("budget", "frames", "seconds", "of full scan", "lines", "mIoU", "overall", "to uniform", "to random")
+    table = _table("plan", *names, title="plans of lines: mIoU at equal capture seconds")
+    for row in sorted(content["rig"], key=lambda row: row["budget"]):
         table.add_row(
             row["policy"],
             format_percent(row["budget"]),
-            _whole(row["seconds"]),
-            _part(row["seconds"], row["full_s"]),
-            _whole(row["lines"]),
-            _part(row["lines"], row["full_lines"]),
-            _whole(row["seats"]),
-            format_points(row["miou"]),
+            str(row["frames"]),
+            *_seconds(row["cost"]),
+            format_count(row["cost"]["lines"]["done"]),
+            _miou(row),
             format_points(row["pixel_accuracy"]),
             format_difference(row["against_uniform"]),
             format_difference(row["against_random"]),
@@ -273,36 +119,58 @@ def _rig(content: dict[str, Any]) -> Table:
     return table
 
 
-def _left_out(missing: list[dict[str, Any]]) -> str:
-    budgets: dict[float | None, list[str]] = {}
-    for one in missing:
-        budgets.setdefault(one["budget"], []).append(one["why"])
-    return "\n".join(
-        f"left out on {len(why)} frame{'s' if len(why) > 1 else ''}, "
-        f"{'all budgets' if budget is None else format_percent(budget)}: {why[0]}"
-        for budget, why in budgets.items()
-    )
-
-
-def _equal_time(content: dict[str, Any]) -> Table:
-    names = ("K", "exposure", "seconds", "of full", "mIoU", "overall", "to all", "equal exposure", "to equal exposure")
-    title = "equal time: as many capture seconds as all takes"
-    table = _table("placement", *names, title=title, caption=content["notes"]["equal_time"])
-    for row in content["equal_time"]:
-        table.add_row(
-            row["policy"],
-            format_percent(row["share"]),
-            f"x {row['exposure']:.2f}",
-            _whole(row["seconds"]),
-            _part(row["seconds"], row["full_s"]),
-            format_points(row["miou"]),
-            format_points(row["pixel_accuracy"]),
-            format_difference(row["against_all"]),
-            format_points(row["equal_exposure_miou"]),
-            format_difference(row["against_equal_exposure"]),
-        )
+def _classes(content: dict[str, Any]) -> Table:
+    shown = [row for row in content["rows"] if row["policy"] in ENDS]
+    first = [row for row in content["rows"] if row["policy"] == content["rows"][1]["policy"]]
+    nearest = min(first, key=lambda row: abs(row["share"] - SHOWN_SHARE))
+    shown = [shown[0], *([] if nearest in shown else [nearest]), *shown[1:]]
+    heads = (f"{row['policy']} {format_percent(row['share'])}" for row in shown)
+    table = _table("class", "labelled px", *heads, title="IoU by class")
+    for name, support in content["support"].items():
+        cells = []
+        for row in shown:
+            false = row["false_classes"].get(name)  # how often the map shows a class that the labels lack
+            cells += [format_points(row["per_class_iou"][name]) if false is None else f"{format_count(false)} px false"]
+        table.add_row(escape(name), format_count(support), *cells)
     return table
 
 
-def _part(done: float | None, full: float | None) -> str:
-    return DASH if done is None or not full else format_percent(done / full)
+def format_difference(interval: dict[str, float | None] | None) -> str:
+    """Points of mIoU with the bounds of the interval, as far as there are any."""
+    if interval is None or interval["difference"] is None:
+        return ""
+    text = f"{100 * interval['difference']:+.1f}"
+    low, high = interval["low"], interval["high"]
+    return text if low is None or high is None else f"{text} [{100 * low:+.1f}, {100 * high:+.1f}]"
+
+
+def _table(first: str, *columns: str, title: str | None = None) -> Table:
+    table = Table(
+        title=title, title_justify="left", title_style="", header_style="dim", box=SIMPLE_HEAD, collapse_padding=True
+    )
+    table.add_column(first, no_wrap=True)
+    for name in columns:
+        table.add_column(name, justify="right", no_wrap=True)
+    return table
+
+
+def evaluation_figure(content: dict[str, Any]) -> Figure:
+    """Draw mIoU over the bytes of the captures and, where lines were planned, over their seconds: a line a policy."""
+    panels = [("rows", "bytes", "MB a frame, before compression", 1e6)]
+    panels += [("rig", "capture_s", "capture seconds a frame, coarse pass included", 1.0)] if content["rig"] else []
+    figure = Figure(figsize=(7.0 * len(panels), 5.0), dpi=110, layout="constrained", facecolor=PAPER)
+    ends = {row["policy"]: 100 * row["miou"] for row in content["rows"] if row["policy"] in ENDS}
+    for axes, (kind, cost, label, unit) in zip(
+        figure.subplots(1, len(panels), squeeze=False).flat, panels, strict=True
+    ):
+        for name, style in (("none", ":"), ("all", "-")):
+            axes.axhline(ends[name], color=INK, linewidth=1.0, linestyle=style, label=name)
+        for policy in dict.fromkeys(row["policy"] for row in content[kind] if row["policy"] not in ENDS):
+            own = [row for row in content[kind] if row["policy"] == policy]
+            points = sorted((row["cost"][cost]["done"] / unit, 100 * row["miou"]) for row in own)
+            axes.plot(*zip(*points, strict=True), marker="o", markersize=5, label=policy)
+        axes.set(xlabel=label, ylabel="mIoU [%]", facecolor=PAPER)
+        axes.grid(color=GRID)
+        axes.legend(frameon=False)
+    figure.suptitle(f"{content['dataset']}: {counted(len(content['frames']), 'frame')}", x=0.01, ha="left", color=INK)
+    return figure

@@ -1,225 +1,206 @@
-"""The map of a report that one can move in: its layers, taken from the stores of a run, and how a page holds them."""
+"""The map of a report: the pictures of a run as layers that lie upon each other, each in the page itself."""
 
 from __future__ import annotations
 
+import base64
+import io
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
 from numpy.typing import NDArray
+from PIL import Image
 
-from flows.publish.page_data import (
-    NOTHING,
-    PagePlaces,
-    PageSpectra,
-    class_means,
-    grey_png,
-    in_base64,
-    indexed_png,
-    jpeg,
-)
 from flows.publish.panels import UNLABELLED_COLOUR, class_palette
+from flows.publish.quicklook import QuicklookData, colours_of
+from flows.publish.receipt import Receipt
+from flows.publish.receipt_table import days_words
+from flows.tasks.memory import Prior
+from flows.tasks.open_survey import Products
+from flows.tasks.run import SurveyRun
+from flows.terminal.figures import counted, format_percent, format_seconds
 from pipeline.geometry.grid import UNLABELLED
+from pipeline.geometry.scan import Sweep, exposing
+from pipeline.planning.fine_pass import FinePlan
+from storage.archive.keys import StageRef
+from storage.arrays.class_maps import BeliefStore
+from storage.arrays.layout import open_group, read_array
+from storage.arrays.quicklooks import choose_bands
 
 MOST_PX = 2048  # of a map's longer side; of larger ones every n-th pixel is shown
-PERCENT = 100
-CHANGED_RGB, SEAT_RGB = (196, 38, 46), (0, 190, 200)
+QUALITY = 84  # of JPEG
+LEVELS = 100  # of a ramp of colours; the next number is see-through
+CHANGED_RGB, PATCH_RGB = (196, 38, 46), (0, 190, 200)
 Bytes = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
-class SweepShown:
-    """A sweep as a rectangle of the field, rows and columns (y0, y1, x0, x1) half open [px], and what is said of it."""
+class MapLayer:
+    """A layer of the map: a picture, or boxes (y0, y1, x0, x1) half open [px] with what is said of each."""
 
-    box: tuple[int, int, int, int]
-    kind: str
-    words: str
+    title: str
+    picture: str = ""  # as an address of data
+    boxes: Sequence[tuple[tuple[int, int, int, int], str]] = ()
+    shown: bool = False
+    opacity: float = 1.0
 
 
 @dataclass(frozen=True)
 class FieldMap:
-    """What the map shows. Images are on the scene's pixels, those of seats on seats of ``patch_px``."""
+    """What the page shows: size (width, height) [px], layers from the lowest up, classes with colour and share."""
 
-    names: tuple[str, ...]
-    colours: NDArray[np.integer] | None  # (class, 3); None for the palette of pages
-    classes: Bytes  # (y, x), 255 none
-    picture: Bytes  # (y, x, 3) true colour, or what stands for it
-    picture_words: str
-    patch_px: int
-    confidence: NDArray[np.floating] | None = None  # (y, x) 0..1
-    truth: NDArray[np.integer] | None = None  # (y, x), 255 none
-    before: Bytes | None = None  # (y, x) classes as remembered, 255 none
-    before_words: str = ""
-    changed: NDArray[np.floating] | None = None  # (row, column) of seats, share of pixels of another class
-    age_days: NDArray[np.floating] | None = None  # (y, x) since a pixel was looked at
-    seats: NDArray[np.bool_] | None = None  # (row, column) looked at twice
-    sweeps: Sequence[SweepShown] = ()
-    spectra: PageSpectra | None = None
-    places: PagePlaces | None = None
+    size: tuple[int, int]
+    layers: Sequence[MapLayer]
+    classes: Sequence[dict[str, str]]
+
+    @property
+    def data(self) -> dict[str, Any]:
+        """What the page's script is given."""
+        return {"size": list(self.size), "layers": [asdict(layer) for layer in self.layers]}
 
 
 @dataclass(frozen=True)
-class MapLayer:
-    """A layer of the page: what its switch is called, whether it is on, and how opaque it is, in percent."""
+class RememberedField:
+    """What a map that goes on from an earlier run has of it."""
 
-    key: str
-    title: str
-    on: bool = False
-    opacity: int = PERCENT
-
-
-def map_facts(field: FieldMap) -> dict[str, Any]:
-    """What the page's template needs: ``layers``, ``classes`` of the legend, ``still`` as PNG, ``notes``, ``data``."""
-    height, width = field.classes.shape
-    step = -(-max(height, width) // MOST_PX)
-    thin = slice(None, None, step)
-    shown = field.classes[thin, thin]
-    palette = np.rint(255 * class_palette(len(field.names), field.colours)).astype(np.uint8)
-    table = np.tile(np.rint(255 * np.array(UNLABELLED_COLOUR)).astype(np.uint8), (256, 1))
-    table[: len(palette)] = palette
-    images = {"classes": shown, "truth": field.truth, "before": field.before}
-    data: dict[str, Any] = {
-        "size": [width, height],
-        "step": step,
-        "patch": field.patch_px,
-        "colours": table[[*range(len(palette)), UNLABELLED]].tolist(),
-        "names": [name.replace("_", " ") for name in field.names],
-        "colour": in_base64(jpeg(field.picture[thin, thin])),
-        "sweeps": [{"box": list(one.box), "kind": one.kind, "words": one.words} for one in field.sweeps],
-    }
-    for key in ("truth", "before"):
-        if (image := images[key]) is not None:
-            data[key] = in_base64(indexed_png(image[thin, thin].astype(np.uint8), table))
-    if field.confidence is not None:
-        data["confidence"] = in_base64(_percent_png(field.confidence[thin, thin]))
-    data |= _seat_layers(field)
-    if field.spectra is not None:
-        data["spectra"] = _spectra_facts(field.spectra, field.classes, len(field.names))
-    if field.places is not None:
-        data["places"] = _places_facts(field.places)
-    return {
-        "layers": _layers(field),
-        "classes": _legend(field, table),
-        "still": in_base64(indexed_png(shown, table)),
-        "notes": _notes(field, step),
-        "data": data,
-    }
+    run: str
+    days: float  # between that capture and this one
+    classes: Bytes  # (y, x) of that run's map, by the numbers of today's; 255 for those that today has not
+    changed: NDArray[np.float32]  # (patch_y, patch_x) shares of pixels of another class
+    age_days: NDArray[np.float32]  # (y, x) since a pixel was captured, NaN where it never was
 
 
-def _layers(field: FieldMap) -> list[MapLayer]:
-    """The switches of what there is, in the order in which they lie upon each other, the uppermost first."""
-    there = {
-        "sweeps": MapLayer("sweeps", "Sweeps, in their order") if field.sweeps else None,
-        "seats": MapLayer("seats", "Looked at twice", opacity=60) if field.seats is not None else None,
-        "changed": MapLayer("changed", "Changed since", opacity=80) if field.changed is not None else None,
-        "age": MapLayer("age", "Days since it was looked at", opacity=80) if field.age_days is not None else None,
-        "before": MapLayer("before", f"Before: {field.before_words}") if field.before is not None else None,
-        "truth": MapLayer("truth", "Truth") if field.truth is not None else None,
-        "confidence": MapLayer("confidence", "Confidence") if field.confidence is not None else None,
-        "classes": MapLayer("classes", "Class map", on=True),
-        "colour": MapLayer("colour", field.picture_words, on=True),
-    }
-    return [layer for layer in there.values() if layer is not None]
+def remembered(prior: Prior | None, drawn: StageRef, receipt: Receipt) -> RememberedField | None:
+    """Return what the prior map shows; None where a map goes on from no other run, or put it aside.
+
+    ``drawn`` is the store of the class map and of the class probabilities.
+    """
+    memory = receipt.get("memory")
+    if memory is None or prior is None or memory["put_aside"]:
+        return None
+    names = np.full(256, UNLABELLED, np.uint8)
+    for number, earlier in enumerate(prior.classes):
+        if earlier >= 0:
+            names[earlier] = number
+    belief = BeliefStore(drawn.path / "belief.zarr")
+    changed = belief.changed()
+    assert changed is not None
+    before = read_array(open_group(prior.belief.path / "class_map.zarr"), "classes")
+    return RememberedField(prior.run, prior.days, names[before], changed, belief.age())
 
 
-def _legend(field: FieldMap, table: Bytes) -> list[dict[str, Any]]:
-    counts = np.bincount(field.classes.ravel(), minlength=256)
-    shares = counts / max(field.classes.size, 1)
+def field_map(
+    run: SurveyRun, products: Products, plan: FinePlan, glance: QuicklookData, before: RememberedField | None
+) -> FieldMap:
+    """Gather the layers of a run; ``glance`` is what its quicklook shows."""
+    height, width = glance.class_map.shape
+    thin = slice(None, None, -(-max(height, width) // MOST_PX))
+    palette = palette_bytes(glance.class_names, glance.class_colours)
+
+    def classes(image: NDArray[np.integer]) -> str:
+        return png_address(image[thin, thin].astype(np.uint8), palette)
+
+    title = choose_bands(glance.wavelength_nm)[1].capitalize()
+    colours = np.rint(255 * colours_of(glance, glance.rectified)).astype(np.uint8)
+    layers = [MapLayer(title, jpeg_address(colours[thin, thin]), shown=True)]
+    layers.append(MapLayer("Class map", classes(glance.class_map), shown=True))
+    if glance.confidence is not None:
+        layers.append(MapLayer("Confidence, dark 0 to bright 1", _ramp_address(glance.confidence[thin, thin], 1.0)))
+    if glance.truth is not None:
+        layers.append(MapLayer("Truth", classes(glance.truth)))
+    if before is not None:
+        layers.append(MapLayer(f"Before: {days_words(before.days)}", classes(before.classes)))
+        oldest = float(np.nanmax(before.age_days)) if np.isfinite(before.age_days).any() else 0.0
+        ages = _ramp_address(before.age_days[thin, thin], oldest)
+        layers.append(MapLayer(f"Days since it was captured, 0 to {oldest:.2g}", ages, opacity=0.8))
+        table = np.array([(*CHANGED_RGB, round(255 * share / LEVELS)) for share in range(LEVELS + 1)], np.uint8)
+        shares = np.rint(LEVELS * np.clip(np.nan_to_num(before.changed), 0, 1)).astype(np.uint8)
+        layers.append(MapLayer("Changed since", png_address(_on_field(run, shares)[thin, thin], table), opacity=0.8))
+    if not run.plan.plain:
+        seats = np.zeros(run.grid.seat_shape, np.uint8)
+        seats.ravel()[plan.seats] = 1
+        table = np.array([(0, 0, 0, 0), (*PATCH_RGB, 255)], np.uint8)
+        layers.append(MapLayer("Looked at twice", png_address(_on_field(run, seats)[thin, thin], table), opacity=0.6))
+    if sweeps := _sweep_boxes(run, products, plan):
+        layers.append(MapLayer("Sweeps, in their order", boxes=sweeps))
+    counts = np.bincount(glance.class_map.ravel(), minlength=256) / max(glance.class_map.size, 1)
+    covered = [*counts[: len(glance.class_names)].tolist(), float(counts[len(glance.class_names) :].sum())]
     rows = [
-        {"number": number, "name": name.replace("_", " "), "share": float(share), "colour": _css(colour)}
-        for number, (name, share, colour) in enumerate(zip(field.names, shares, table, strict=False))
+        {"name": name.replace("_", " "), "share": format_percent(share), "colour": "#" + bytes(colour.tolist()).hex()}
+        for name, share, colour in zip((*glance.class_names, "no class"), covered, palette, strict=False)
+        if share
     ]
-    others = [image for image in (field.truth, field.before) if image is not None]
-    if counts[len(field.names) :].any() or any((image >= len(field.names)).any() for image in others):
-        share = float(shares[len(field.names) :].sum())
-        none = {"number": len(field.names), "name": "no class", "share": share, "colour": _css(table[UNLABELLED])}
-        rows.append(none)
-    return rows
+    return FieldMap((width, height), layers, rows)
 
 
-def _css(colour: Bytes) -> str:
-    return "#" + bytes(colour.tolist()).hex()
+def palette_bytes(names: Sequence[str], colours: NDArray[np.integer] | None) -> Bytes:
+    """Return the (256, 3) colours of class numbers; all beyond the classes are grey."""
+    palette = np.tile(np.rint(255 * np.array(UNLABELLED_COLOUR)).astype(np.uint8), (256, 1))
+    palette[: len(names)] = np.rint(255 * class_palette(len(names), colours)).astype(np.uint8)
+    return palette
 
 
-def _percent_png(confidence: NDArray[np.floating]) -> bytes:
-    """Confidence in whole percent, 255 where there is none."""
-    known = np.isfinite(confidence)
-    numbers = np.where(known, np.rint(PERCENT * np.clip(np.where(known, confidence, 0), 0, 1)), NOTHING)
-    return indexed_png(numbers.astype(np.uint8), _ramp(PERCENT + 1))
+def png_address(numbers: Bytes, colours: Bytes) -> str:
+    """Return the data address of a PNG of (y, x) numbers, each in its row of ``colours`` (number, 3 or 4)."""
+    picture, table = Image.fromarray(np.ascontiguousarray(numbers)), np.zeros((256, 4), np.uint8)
+    table[:, 3] = 255
+    table[: len(colours), : colours.shape[1]] = colours
+    picture.putpalette(table[:, :3].tobytes())
+    file = io.BytesIO()
+    picture.save(file, "PNG", transparency=table[:, 3].tobytes())
+    return f"data:image/png;base64,{base64.b64encode(file.getvalue()).decode('ascii')}"
 
 
-def _ramp(count: int) -> Bytes:
-    """(256, 4) colours of numbers 0 to ``count`` - 1 from dark to bright, others see-through."""
-    table = np.zeros((256, 4), np.uint8)
-    table[:count] = np.rint(255 * colormaps["viridis"](np.linspace(0, 1, count))).astype(np.uint8)
-    return table
+def jpeg_address(picture: Bytes) -> str:
+    """Return the data address of a JPEG of a (y, x, 3) photograph."""
+    file = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(picture)).save(file, "JPEG", quality=QUALITY)
+    return f"data:image/jpeg;base64,{base64.b64encode(file.getvalue()).decode('ascii')}"
 
 
-def _seat_layers(field: FieldMap) -> dict[str, Any]:
-    rows, columns = (-(-size // field.patch_px) for size in field.classes.shape)
-    found: dict[str, Any] = {}
-    if field.seats is not None:
-        table = np.array([(0, 0, 0, 0), (*SEAT_RGB, 255)], np.uint8)
-        found["seats"] = in_base64(indexed_png(field.seats[:rows, :columns].astype(np.uint8), table))
-    if field.changed is not None:
-        table = np.array([(*CHANGED_RGB, round(255 * share / PERCENT)) for share in range(PERCENT + 1)], np.uint8)
-        shares = np.nan_to_num(field.changed[:rows, :columns])
-        found["changed"] = in_base64(indexed_png(np.rint(PERCENT * np.clip(shares, 0, 1)).astype(np.uint8), table))
-    if field.age_days is not None:
-        ages = field.age_days[field.patch_px // 2 :: field.patch_px, field.patch_px // 2 :: field.patch_px]
-        known = np.isfinite(ages)
-        most = float(ages[known].max()) if known.any() else 0.0
-        levels = np.where(known, np.rint(PERCENT * np.where(known, ages, 0) / (most or 1.0)), NOTHING)
-        found["age"] = in_base64(indexed_png(levels.astype(np.uint8), _ramp(PERCENT + 1)))
-        found["oldest"] = most
-    return found
+def _ramp_address(values: NDArray[np.floating], most: float) -> str:
+    """Draw (y, x) values from 0 to ``most`` from dark to bright; what is not known is see-through."""
+    table = np.zeros((LEVELS + 2, 4), np.uint8)
+    table[: LEVELS + 1] = np.rint(255 * colormaps["viridis"](np.linspace(0, 1, LEVELS + 1)))
+    known = np.isfinite(values)
+    levels = np.rint(LEVELS * np.clip(np.where(known, values, 0) / (most or 1.0), 0, 1))
+    return png_address(np.where(known, levels, LEVELS + 1).astype(np.uint8), table)
 
 
-def _spectra_facts(spectra: PageSpectra, classes: Bytes, count: int) -> dict[str, Any]:
-    means, sizes = class_means(spectra, classes, count)
-    height, width, bands = spectra.levels.shape
-    return {
-        "png": in_base64(grey_png(spectra.levels.reshape(height, width * bands))),  # bands of a pixel lie side by side
-        "shape": [height, width, bands],
-        "low": spectra.low.tolist(),
-        "step": spectra.step.tolist(),
-        "nm": np.round(spectra.wavelength_nm, 2).tolist(),
-        "pixel": spectra.pixel_px,
-        "means": [_listed(row, 5) if size else None for row, size in zip(means, sizes, strict=True)],
-        "sizes": sizes.tolist(),
-    }
+def _on_field(run: SurveyRun, patches: Bytes) -> Bytes:
+    """Return numbers of patches (row, column) on the pixels of the field (y, x)."""
+    p = run.grid.patch
+    return patches.repeat(p, axis=0).repeat(p, axis=1)[: run.grid.height, : run.grid.width]
 
 
-def _listed(values: NDArray[np.floating], digits: int) -> list[float | None]:
-    """Numbers one after the other, None where there is none."""
-    return [round(value, digits) if np.isfinite(value) else None for value in values.ravel().tolist()]
+def _sweep_boxes(run: SurveyRun, products: Products, plan: FinePlan) -> list[tuple[tuple[int, int, int, int], str]]:
+    """Return the sweeps in the order in which they were taken: where each looked, and when."""
+    passes = (("capture_coarse", run.plan.coarse), ("capture_fine", plan.sweeps))
+    taken = [(sweep, products[stage].path / f"{sweep.name}.zarr") for stage, sweeps in passes for sweep in sweeps]
+    return [
+        (block_of(sweep, run), f"{number} of {len(taken)}: {_sweep_words(run, sweep, path)}")
+        for number, (sweep, path) in enumerate(taken, 1)
+    ]
 
 
-def _places_facts(places: PagePlaces) -> dict[str, Any]:
-    rows, columns = places.on_map.shape[:2]
-    return {
-        "crs": places.crs,
-        "nodes": [rows, columns],
-        "map": _listed(places.on_map, 3),
-        "lonlat": _listed(places.lon_lat, 8),
-    }
+def _sweep_words(run: SurveyRun, sweep: Sweep, path: Path) -> str:
+    """Return which sweep it was, its lines, and how long they took by their own times."""
+    group, exposure = open_group(path), exposing(run.camera, sweep).exposure_ms
+    times, started = read_array(group, "time"), group.attrs.get("started")
+    seconds = float(times.max() - times.min()) + exposure / 1000
+    begun = "" if started is None else f", from {started} on"
+    kind = "scan" if run.plan.plain else f"{sweep.kind} sweep"
+    return f"{kind}, {counted(sweep.lines, 'line')} of {exposure:g} ms in {format_seconds(seconds)}{begun}"
 
 
-def _notes(field: FieldMap, step: int) -> list[str]:
-    """What has to be known to read the map, a sentence each."""
-    found = [] if step == 1 else [f"The map is large: one of {step} x {step} px is shown."]
-    spectra = field.spectra
-    if spectra is not None:
-        bands = f"{len(spectra.wavelength_nm)} bands"
-        if spectra.bands_each > 1:
-            bands += f", each the mean of {spectra.bands_each} of the camera's"
-        found.append(
-            f"A spectrum is the mean over {spectra.pixel_px} x {spectra.pixel_px} px of the coarse look, in {bands}, "
-            f"each kept in {NOTHING} steps from its least to its greatest value. A class's mean is over those of which "
-            "it covers half or more."
-        )
-    if field.places is not None:
-        found.append(f"Map coordinates are {field.places.crs}.")
-    return found
+def block_of(sweep: Sweep, run: SurveyRun) -> tuple[int, int, int, int]:
+    """Return rows and columns (y0, y1, x0, x1) that a sweep's line centres and samples span, cut to the scene."""
+    size = (run.grid.width, run.grid.height) if sweep.along == "x" else (run.grid.height, run.grid.width)
+    across = np.array([-0.5, 0.5]) * run.camera.samples + sweep.strip_px + size[0] / 2
+    scan = np.array([0, sweep.lines * sweep.step]) + sweep.start_px + size[1] / 2 - 0.5
+    x0, x1 = np.clip(np.rint(across), 0, size[0]).astype(int).tolist()
+    y0, y1 = np.clip(np.rint(scan), 0, size[1]).astype(int).tolist()
+    return (y0, y1, x0, x1) if sweep.along == "x" else (x0, x1, y0, y1)

@@ -11,26 +11,70 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flows.publish.receipt_table import FOREIGN
 from flows.settings.values import LOOK_WHOLE
 from flows.tasks.memory import told_of_memory
 from flows.tasks.run import SurveyRun
 from flows.tasks.stages.maps import strange_pixels
-from flows.terminal.figures import area_words, counted, format_count, format_percent
 from models.evaluation.expected_scores import expected_counts
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace, areas_by_number
+from pipeline.ground.field_places import M2_PER_HECTARE, FieldPlace, FieldScale, areas_by_number
 from pipeline.ground.georeference import class_areas_m2, crs_name, pixel_side_m
 from pipeline.ground.zones import figures_of_plots
+from pipeline.planning.fine_pass import FinePlan
 from storage.archive.keys import StageRef
 from storage.arrays.class_maps import BeliefStore, ClassMap
 from storage.arrays.ground_maps import GroundMap
 
 OLDER_DAYS = (1, 7, 30)  # since a look, of which the hectares are told
-MOST_CHANGES = 4  # told in words
 PLOTS_FILE = "plots.csv"
-LEADING = 3  # classes of a plot that are told in words
-FOREIGN = 0.2  # share of a map that is unknown from which on its weights are the wrong ones
 STRIP_ROWS = 256  # of a belief that are read at a time
+
+
+def field_figures(run: SurveyRun, fine: FinePlan | None) -> dict[str, Any]:
+    """Figures of the field and of the captures as JSON tells them; None for what nobody knows.
+
+    ``fine`` is the fine pass where it is planned already, else it takes what the budget leaves at most. Hectares are
+    those that the survey keeps to, and those an hour are of all of the camera's seconds. A raster has no camera: no
+    view but by a pose, no seconds, no lines.
+    """
+    scale, fine_s = run.zones.place.scale(run.camera.ifov_rad), run.plan.fine_s if fine is None else fine.seconds
+    seconds = run.plan.coarse_s + fine_s
+    kept = _kept(run, scale)
+    footprint, captured = scale.footprint, run.raster is None
+    camera_s = {"coarse": run.plan.coarse_s, "fine": fine_s, "all": seconds, "full_scan": run.plan.full_s}
+    lines = {
+        "coarse": sum(sweep.lines for sweep in run.plan.coarse),
+        "fine": None if fine is None else fine.lines,
+        "full_scan": sum(sweep.lines for sweep in run.plan.full),
+    }
+    return {
+        "size_px": [scale.shape[1], scale.shape[0]],
+        "view_deg": [scale.view_deg[1], scale.view_deg[0]] if captured or footprint is not None else None,
+        "ground_pixel_m": scale.pixel_m,
+        "range_m": None
+        if footprint is None
+        else dict(zip(("nearest", "median", "farthest"), footprint.range_m, strict=True)),
+        "footprint_m": None if footprint is None else {"width": footprint.width_m, "depth": footprint.depth_m},
+        "footprint_east_north_m": None if footprint is None else footprint.outline_m.tolist(),
+        "hectares": kept.hectares,
+        "kept_share": None if run.zones.kept is None else float(run.zones.kept.kept.mean()),
+        "camera_s": camera_s if captured else None,
+        "fine_planned": fine is not None or run.plan.plain,
+        "lines": lines if captured else None,
+        "hectares_per_hour": kept.hectares_per_hour(seconds) if captured else None,
+        "full_scan_hectares_per_hour": kept.hectares_per_hour(run.plan.full_s) if captured else None,
+    }
+
+
+def _kept(run: SurveyRun, scale: FieldScale) -> FieldScale:
+    """The scale of what zones leave of the field."""
+    if run.zones.kept is None or scale.area_m2 is None:
+        return scale
+    rows, columns = (slice(0, size) for size in scale.shape)
+    areas = run.zones.place.pixel_areas_m2(rows, columns)
+    assert areas is not None
+    return FieldScale(scale.shape, scale.view_deg, scale.pixel_m, float(np.nansum(areas[run.zones.kept.kept])))
 
 
 def find_ground(run: SurveyRun, posed: GroundMap | None, found: ClassMap, belief: BeliefStore) -> dict[str, Any]:
@@ -93,26 +137,6 @@ def changed_hectares(place: FieldPlace, old_class: NDArray[np.uint8], found: Cla
     return [[float(areas[pair]) / M2_PER_HECTARE, names[pair // count], names[pair % count]] for pair in largest]
 
 
-def ground_words(ground: Mapping[str, Any]) -> str:
-    """What the classes cover on the ground, what of it changed, and what was not looked at for long."""
-    areas = [f"{_spaced(name)} {area_words(area)}" for name, area in ground["areas_ha"].items() if area]
-    place = f"{ground['crs']}, {ground['resolution_m']:.4g} m a pixel"
-    words = [f"On the ground ({place}) the classes cover {', '.join(areas)}."]
-    if changes := ground.get("changes_ha"):
-        told = [f"{_spaced(old)} to {_spaced(new)} {area_words(area)}" for area, old, new in changes[:MOST_CHANGES]]
-        whole = area_words(sum(area for area, _, _ in changes))
-        words.append(f"Of it {whole} changed since the look before: {', '.join(told)}.")
-    older = {int(days): area for days, area in ground.get("older_ha", {}).items() if area}
-    if older:
-        ago = [f"{area_words(area)} more than {counted(days, 'day')} ago" for days, area in older.items()]
-        words.append(f"Last looked at: {', '.join(ago)}.")
-    return " ".join(words)
-
-
-def _spaced(name: str) -> str:
-    return name.replace("_", " ")
-
-
 def find_zones(run: SurveyRun, drawn: ClassMap) -> dict[str, Any]:
     """``zones``: how much of the field is kept to; ``plots``: a row each. Empty for a survey without either."""
     zones, found = run.zones, dict[str, Any]()
@@ -134,39 +158,6 @@ def _ground_m2(run: SurveyRun, kept: NDArray[np.bool_]) -> float | None:
     rows, columns = (slice(0, size) for size in kept.shape)
     areas = run.zones.place.pixel_areas_m2(rows, columns)
     return None if areas is None else float(np.nansum(areas[kept]))
-
-
-def zone_words(zones: Mapping[str, Any]) -> str:
-    """How much of the field a survey kept to."""
-    ground = "" if zones["kept_m2"] is None else f", {area_words(zones['kept_m2'] / M2_PER_HECTARE)}"
-    share = format_percent(zones["kept_px"] / zones["field_px"])
-    no_go = f"; no-go zones touch {format_count(zones['no_go_px'])} px" if zones["no_go_px"] else ""
-    return (
-        f"The survey keeps to {format_count(zones['kept_px'])} px, {share} of the field{ground}{no_go}. Of the rest "
-        "no detail was asked for and no map is drawn."
-    )
-
-
-def plot_rows(plots: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
-    """The table of plots in words: name, ground, leading classes, confidence."""
-    return [
-        {
-            "plot": plot["plot"],
-            "area": f"{format_count(plot['pixels'])} px"
-            if plot["area_m2"] is None
-            else area_words(plot["area_m2"] / M2_PER_HECTARE),
-            "classes": _leading(plot["shares"]) if plot["mapped_pixels"] else "not mapped",
-            "confidence": format_percent(plot["confidence"]),
-        }
-        for plot in plots
-    ]
-
-
-def _leading(shares: Mapping[str, float | None]) -> str:
-    """The classes that cover most of a plot."""
-    known = [(share, name) for name, share in shares.items() if share]
-    most = sorted(known, key=lambda one: -one[0])[:LEADING]
-    return ", ".join(f"{name.replace('_', ' ')} {format_percent(share)}" for share, name in most)
 
 
 def plots_csv(plots: Sequence[Mapping[str, Any]]) -> str:

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any
 
+import matplotlib as mpl
 import numpy as np
-from matplotlib import patheffects
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import hsv_to_rgb, to_rgb
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch, Rectangle
+from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from flows.terminal.figures import area_words
 from pipeline.geometry.grid import UNLABELLED
+from storage.arrays.class_maps import ClassMap
 from storage.arrays.ground_maps import GroundMap
 from storage.arrays.quicklooks import stretch
 
@@ -36,7 +37,6 @@ STYLE: Any = {
     "savefig.facecolor": "#fbfaf7",
 }
 UNLABELLED_COLOUR = (0.86, 0.86, 0.84)
-HALO: list[patheffects.AbstractPathEffect] = [patheffects.withStroke(linewidth=3, foreground="black")]
 # Okabe and Ito (2008), then Paul Tol's muted scheme (2021) without near twins: told apart by colour-blind readers
 _SAFE = (
     "#E69F00",
@@ -106,26 +106,29 @@ def outline(chosen: NDArray[np.bool_], patch_px: int, shape: tuple[int, int]) ->
     return segments
 
 
-def draw_scale(axes: Axes, shape: tuple[int, ...], pixel_mrad: float | None) -> None:
-    """Draw a bar of a round number of px in the lower left corner, with its angle; None of a raster, which has none."""
-    height, width = shape[:2]
-    inch_x, inch_y = (size / inches for size, inches in zip((width, height), panel_inches(axes), strict=True))
-    most = max(width / 4, 1)
-    power = 10 ** int(np.floor(np.log10(most)))
-    length = int(max(step * power for step in (1, 2, 5) if step * power <= most))
-    left, bottom = 0.14 * inch_x - 0.5, height - 0.5 - 0.14 * inch_y
-    bar = Rectangle((left, bottom - 0.07 * inch_y), length, 0.07 * inch_y, facecolor="white", edgecolor="black")
-    axes.add_patch(bar)
-    text = f"{length} px" if pixel_mrad is None else f"{length} px = {length * pixel_mrad:.3g} mrad"
-    label = axes.text(left, bottom - 0.12 * inch_y, text, color="white", size=11, va="bottom", weight="bold")
-    label.set_path_effects(HALO)
-
-
-def panel_inches(axes: Axes) -> tuple[float, float]:
-    """(width, height) of a panel on the page [in]."""
-    box, page = axes.get_window_extent(), axes.get_figure(root=True)
-    dpi = 100.0 if page is None else page.dpi
-    return float(box.width / dpi), float(box.height / dpi)
+def draw_difference(path: Path, maps: Sequence[ClassMap], titles: Sequence[str]) -> None:
+    """Draw two maps of one field with one list of classes, and red where they differ, as a PNG of three panels."""
+    old, new = (one.classes for one in maps)
+    differs = old != new
+    tall = min(max(old.shape[0] / old.shape[1], 0.3), 2.0)
+    step = -(-max(old.shape) // GROUND_MOST_PX)
+    beyond = tuple((0, -size % step) for size in old.shape)
+    blocks = np.pad(differs, beyond).reshape(-(-old.shape[0] // step), step, -1, step)
+    palette = class_palette(len(maps[0].names), maps[0].colours)
+    changed = np.where(np.asarray(blocks.any(axis=(1, 3)))[..., None], (0.77, 0.15, 0.18), (0.96, 0.96, 0.95))
+    with mpl.rc_context({"text.parse_math": False}):  # names may hold dollar signs
+        figure = Figure(figsize=(14, 4.6 * tall + 1.2), dpi=GROUND_DPI, layout="constrained")
+        pictures = (*(class_rgb(one[::step, ::step], palette) for one in (old, new)), changed)
+        for axes, picture, title in zip(figure.subplots(1, 3), pictures, titles, strict=True):
+            axes.imshow(picture, interpolation="nearest")
+            axes.set_title(title, fontsize=9, loc="left")
+            axes.set_axis_off()
+        marks = [
+            Patch(facecolor=colour, edgecolor="0.4", linewidth=0.5, label=name.replace("_", " "))
+            for name, colour in zip(maps[0].names, palette.tolist(), strict=True)
+        ]
+        figure.legend(handles=marks, loc="outside lower center", ncols=6, fontsize=8, frameon=False)
+        save_png(figure, path)
 
 
 def draw_ground(found: GroundMap) -> bytes:

@@ -13,8 +13,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from flows.publish.receipt import Receipt, is_pending
-from flows.publish.receipt_table import COST_LABELS, cost_rows
-from flows.publish.receipt_words import headline, sentences
+from flows.publish.receipt_table import cost_rows, finding_rows, headline
 from flows.publish.report import render_markdown
 from flows.publish.run_folder import Published, asked_settings, extend_with_accuracy, load_receipt, publish_run
 from flows.settings.survey_settings import OF_THE_MACHINE
@@ -74,7 +73,7 @@ def _add_accuracy(plan: OpenSurvey, run: RunRef, accuracy: StageRef) -> RunRef:
 
 
 def _ref(published: Published, *, pending: bool = False) -> RunRef:
-    return RunRef(f"runs/{published.folder.name}", published.folder, published.looked_twice, pending)
+    return RunRef(f"runs/{published.folder.name}", published.folder, published.captured_again, pending)
 
 
 def _has_labels(plan: OpenSurvey) -> bool:
@@ -136,10 +135,10 @@ def survey_markdown(published: Published, where: str) -> str:
     return render_markdown(
         "survey.md",
         survey=published.receipt["survey"],
-        headline=headline(published.receipt, published.looked_twice),
+        headline=headline(published.receipt, published.captured_again),
         picture=base64.b64encode(picture).decode("ascii"),
         rows=savings_rows(published.receipt),
-        findings=sentences(published.receipt),
+        findings=[f"{name}: {words}" for name, words in finding_rows(published.receipt)],
         where=where,
     )
 
@@ -153,7 +152,7 @@ def savings_rows(receipt: Receipt) -> list[dict[str, str]]:
             "everything": row["full"],
             "share": format_percent(row["ratio"]),
         }
-        for row in cost_rows(receipt["savings"])[: len(COST_LABELS)]
+        for row in cost_rows(receipt["savings"])
     ]
 
 
@@ -164,13 +163,11 @@ def small_jpeg(png: bytes) -> bytes:
     with Image.open(io.BytesIO(png)) as opened:
         picture = opened.convert("RGB")
     for width in WIDTHS_PX:
-        smaller = picture.copy()
+        smaller, file = picture.copy(), io.BytesIO()
         smaller.thumbnail((width, 10 * width))
-        for quality in (85, 70):
-            file = io.BytesIO()
-            smaller.save(file, "JPEG", quality=quality, optimize=True)
-            if len(file.getvalue()) * 4 / 3 <= MOST_BYTES - 4:
-                return file.getvalue()
+        smaller.save(file, "JPEG", quality=80, optimize=True)
+        if len(file.getvalue()) * 4 / 3 <= MOST_BYTES - 4:
+            break
     return file.getvalue()
 
 

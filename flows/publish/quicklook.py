@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,19 +15,7 @@ from matplotlib.image import AxesImage
 from matplotlib.patches import Patch, Rectangle
 from numpy.typing import NDArray
 
-from flows.publish.panels import (
-    HALO,
-    MUTED,
-    STYLE,
-    UNLABELLED_COLOUR,
-    class_palette,
-    class_rgb,
-    draw_scale,
-    grey_of,
-    outline,
-    panel_inches,
-    save_png,
-)
+from flows.publish.panels import MUTED, STYLE, UNLABELLED_COLOUR, class_palette, class_rgb, grey_of, outline, save_png
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.geometry.scan import Axis
 from storage.arrays.quicklooks import choose_bands, develop, stretch
@@ -57,7 +44,6 @@ class QuicklookData:
     class_colours: NDArray[np.integer] | None = None  # (class, 3) 0..255; None for a colour-blind safe palette
     truth: NDArray[np.integer] | None = None  # (y, x), 255 unlabelled
     confidence: NDArray[np.floating] | None = None  # (y, x) 0..1, shown where there is no truth
-    pixel_mrad: float | None = 0.105714
     along: Axis = "x"  # of the scene along which the raw lines lie
     note: str = ""  # at the end of the title line, such as the accuracy
     scan: bool = False  # a plain scan, which looked nowhere twice
@@ -74,52 +60,25 @@ _STYLE: Any = {**STYLE, "axes.titlesize": 14, "axes.titleweight": "bold", "axes.
 _DPI = 100
 _SEAT_COLOUR = "#7df9ff"
 _BLOCK: dict[str, Any] = {"facecolor": "none", "edgecolor": "white", "linewidth": 1.2, "linestyle": (0, (4, 2))}
-_MARGIN_IN, _GAP_IN, _HEAD_IN, _LEGEND_ROW_IN = 0.35, 0.3, 0.85, 0.31
 _FLAT, _TALL = 0.3, 2.0  # height over width beyond which the panels are stacked, or stand abreast
 
 
 def _compose(data: QuicklookData) -> Figure:
     height, width = data.class_map.shape
-    page_width, rows = _arrange(height / width)
-    caption = 1.25 if height / width > _TALL else 0.72  # inches: narrow panels need another line of words or two
-    legend_columns = max(1, int(page_width / 2.9))
-    legend_in = 0.45 + _LEGEND_ROW_IN * -(-(len(data.class_names) + 1) // legend_columns)
-    page_height = _HEAD_IN + sum(tall + caption for tall, _ in rows) + legend_in
-    figure = Figure(figsize=(page_width, page_height), dpi=_DPI)
-    about = [f"{width} × {height} px", data.about, f"seed {data.seed}"]  # noqa: RUF001
-    about += [data.note] if data.note else []
-    title_y = 1 - 0.42 / page_height
-    figure.text(_MARGIN_IN / page_width, title_y, data.survey, size=23, weight="bold", va="center")
-    figure.text(
-        1 - _MARGIN_IN / page_width, title_y, "   ·   ".join(about), size=13, color=MUTED, va="center", ha="right"
-    )
+    tallness = height / width
+    counts = (1,) * 5 if tallness < _FLAT else (5,) if tallness > _TALL else (3, 2)
+    page = 18.0 if len(counts) != 2 else min(18.0, 12.5 / (tallness * sum(1 / count for count in counts)))
+    tall = [min(max(page * tallness / count, 1.1), 12.0) + 0.9 for count in counts]  # with words above
+    figure = Figure(figsize=(page, sum(tall) + 1.6), dpi=_DPI, layout="constrained")
+    about = [f"{width} × {height} px", data.about, f"seed {data.seed}", *([data.note] if data.note else [])]  # noqa: RUF001
+    figure.suptitle(f"{data.survey}   ·   {'   ·   '.join(about)}", x=0.01, ha="left", size=15, weight="bold")
     panels = iter((_draw_raw, _draw_rectified, _draw_attention, _draw_classes, _draw_truth))
-    top = page_height - _HEAD_IN
-    for tall, places in rows:
-        for left, wide in places:
-            bottom = top - caption - tall
-            box = (left / page_width, bottom / page_height, wide / page_width, tall / page_height)
-            next(panels)(figure.add_axes(box), data)
-        top -= tall + caption
-    _draw_legend(figure, data, legend_columns)
+    rows = figure.subfigures(len(counts), 1, height_ratios=tall, squeeze=False).ravel()
+    for row, count in zip(rows, counts, strict=True):
+        for axes in row.subplots(1, count, squeeze=False).ravel():
+            next(panels)(axes, data)
+    _draw_legend(figure, data, max(1, int(page / 2.9)))
     return figure
-
-
-def _arrange(tallness: float) -> tuple[float, list[tuple[float, list[tuple[float, float]]]]]:
-    """Page width and rows of panels, (height, [(left, width)]) in inches: stacked for flat fields, abreast for tall."""
-    if tallness < _FLAT:
-        wide = 18 - 2 * _MARGIN_IN
-        return 18.0, [(max(wide * tallness, 1.1), [(_MARGIN_IN, wide)])] * 5
-    counts = (5,) if tallness > _TALL else (3, 2)
-    page = 18.0 if tallness > _TALL else min(18.0, 12.5 / (tallness * sum(1 / count for count in counts)))
-    rows = []
-    for count in counts:
-        wide = (page - 2 * _MARGIN_IN - (count - 1) * _GAP_IN) / count
-        tall = min(wide * tallness, 12.0)
-        wide = tall / tallness
-        step = (page - 2 * _MARGIN_IN + _GAP_IN) / count
-        rows.append((tall, [(_MARGIN_IN + number * step, wide) for number in range(count)]))
-    return page, rows
 
 
 def _draw_raw(axes: Axes, data: QuicklookData) -> None:
@@ -147,7 +106,6 @@ def _draw_raw(axes: Axes, data: QuicklookData) -> None:
 def _draw_rectified(axes: Axes, data: QuicklookData) -> None:
     _, words = choose_bands(data.wavelength_nm)
     _show(axes, colours_of(data, data.rectified))
-    draw_scale(axes, data.class_map.shape, data.pixel_mrad)
     _caption(axes, "Raster" if data.raster else "Rectified", words)
 
 
@@ -185,11 +143,10 @@ def _draw_attention(axes: Axes, data: QuicklookData) -> None:
     chosen = np.zeros(rows * columns, bool)
     chosen[np.asarray(data.seats, np.intp)] = True
     segments = outline(chosen.reshape(rows, columns), data.patch_px, (height, width))
-    wide = 0.75 if panel_inches(axes)[0] * data.patch_px / width < 0.1 else 1.5
-    for colour, thickness in (("black", 2 * wide), (_SEAT_COLOUR, wide)):
+    for colour, thickness in (("black", 2.0), (_SEAT_COLOUR, 1.0)):
         axes.add_collection(LineCollection(segments, colors=colour, linewidths=thickness, capstyle="projecting"))
     _frame(axes, (height, width))
-    _heat_key(axes, heat)
+    _heat_key(heat, ("low", "high"))
     words = f"{len(data.seats)} seats chosen by {data.policy} (cyan)"
     if data.scan:
         return _caption(axes, "2  What is kept in detail", words)
@@ -206,7 +163,6 @@ def _score_range(score: NDArray[np.floating]) -> tuple[NDArray[np.float64], floa
 
 def _draw_classes(axes: Axes, data: QuicklookData) -> None:
     _show(axes, class_rgb(data.class_map, _palette(data)), interpolation="nearest")
-    draw_scale(axes, data.class_map.shape, data.pixel_mrad)
     _caption(axes, "3  Class map", "what the model says grows where")
 
 
@@ -217,7 +173,6 @@ def _draw_truth(axes: Axes, data: QuicklookData) -> None:
         labelled = (data.truth != UNLABELLED) & (data.class_map != UNLABELLED)
         right = float(np.mean(data.truth[labelled] == data.class_map[labelled])) if labelled.any() else float("nan")
         words = f"{100 * right:.1f} % of the labelled pixels agree" if labelled.any() else "no pixel is labelled"
-        draw_scale(axes, data.truth.shape, data.pixel_mrad)
         return _caption(axes, "4  Truth", words)
     if data.confidence is not None and data.policy is not None:
         return _draw_confidence(axes, data.confidence, "4  Confidence", " (no labels given)")
@@ -231,7 +186,7 @@ def _draw_confidence(axes: Axes, confidence: NDArray[np.floating] | None, title:
         return _caption(axes, title, "the map has none")
     image = axes.imshow(confidence, cmap="viridis", vmin=0, vmax=1)
     _frame(axes, confidence.shape)
-    _heat_key(axes, image, ("0", "1"))
+    _heat_key(image, ("0", "1"))
     return _caption(axes, title, f"of the model in its own map{why}")
 
 
@@ -246,19 +201,7 @@ def _draw_legend(figure: Figure, data: QuicklookData, columns: int) -> None:
     if any((image == UNLABELLED).any() for image in others):
         marks.append(Patch(facecolor=UNLABELLED_COLOUR, edgecolor="#555555", linewidth=0.6))
         names.append("unlabelled")
-    figure.legend(
-        marks,
-        names,
-        loc="lower center",
-        ncol=min(columns, len(names)),
-        frameon=False,
-        fontsize=13,
-        handlelength=1.4,
-        handleheight=1.2,
-        columnspacing=2.0,
-        bbox_to_anchor=(0.5, 0.0),
-        borderaxespad=0.6,
-    )
+    figure.legend(marks, names, loc="outside lower center", ncol=min(columns, len(names)), frameon=False, fontsize=13)
 
 
 def _palette(data: QuicklookData) -> NDArray[np.float32]:
@@ -275,19 +218,15 @@ def _frame(axes: Axes, shape: tuple[int, ...]) -> None:
 
 
 def _caption(axes: Axes, title: str, words: str) -> None:
-    """A bold title over a line of words, two lines where the panel is narrow."""
-    lines = textwrap.wrap(words, max(20, int(panel_inches(axes)[0] * 11.5)))
-    axes.set_title(title, pad=8 + 16 * len(lines))
-    axes.annotate(
-        "\n".join(lines), (0, 1), (0, 7), xycoords="axes fraction", textcoords="offset points", color=MUTED, size=12
-    )
+    """Write a bold title over a line of words."""
+    axes.set_title(f"{title}\n")
+    axes.annotate(words, (0, 1), (0, 7), xycoords="axes fraction", textcoords="offset points", color=MUTED, size=12)
 
 
-def _heat_key(axes: Axes, image: AxesImage, ends: tuple[str, str] = ("low", "high")) -> None:
-    wide, tall = panel_inches(axes)
-    length = min(1.1, 0.3 * wide)
-    box = axes.inset_axes((1 - (length + 0.5) / wide, 0.14 / tall, length / wide, 0.12 / tall))
-    axes.figure.colorbar(image, cax=box, orientation="horizontal").set_ticks([])
-    for x, text, side in ((-0.05 / length, ends[0], "right"), (1 + 0.05 / length, ends[1], "left")):
-        label = box.text(x, 0.45, text, transform=box.transAxes, ha=side, va="center", color="white", size=11)
-        label.set_path_effects(HALO)
+def _heat_key(image: AxesImage, ends: tuple[str, str]) -> None:
+    """Draw the colours below the panel, with what their ends stand for."""
+    figure = image.axes.get_figure(root=False)
+    assert figure is not None
+    bar = figure.colorbar(image, ax=image.axes, orientation="horizontal", shrink=0.3, pad=0.01, aspect=30)
+    low, high = image.get_clim()
+    bar.set_ticks([low or 0.0, high or 1.0], labels=list(ends))

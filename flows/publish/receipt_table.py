@@ -1,20 +1,31 @@
-"""A receipt in tables: those that a survey or a simulation ends with on a terminal, and their rows for pages."""
+"""A receipt for people: the headline, what was spent as a table, and what was found, a row each."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from flows.publish.findings import plot_rows
-from flows.publish.receipt import Accuracy, Receipt, Savings
-from flows.tasks.scores import SHOWN, SHOWN_WORDS, definitions_differ, false_class_words
-from flows.terminal.figures import DASH, format_bytes, format_count, format_percent, format_points, format_seconds
-from pipeline.simulator.selection.choice import UNIT_WORDS
+from flows.publish.receipt import Receipt, is_pending
+from flows.tasks.scores import worst_class_words
+from flows.terminal.figures import (
+    area_words,
+    counted,
+    format_bytes,
+    format_count,
+    format_metres,
+    format_percent,
+    format_points,
+    format_seconds,
+    three_digits,
+)
+from pipeline.ground.field_places import M2_PER_HECTARE, SECONDS_PER_HOUR
+from pipeline.planning.plain_scans import scan_words
 
 COST_LABELS = {
     "capture_s": ("time at the camera", format_seconds),
@@ -22,178 +33,289 @@ COST_LABELS = {
     "samples": ("samples on the field", format_count),
     "bytes_raw": ("raw data", format_bytes),
     "bytes_stored": ("stored data", format_bytes),
-    "tokens": ("tokens of the model", format_count),
-    "multiply_adds": ("multiply-adds of the model", format_count),
+    "tokens": ("model's tokens", format_count),
+    "multiply_adds": ("model's multiply-adds", format_count),
 }
+MOST_CHANGES = 4  # in words
+LEADING = 3  # classes of a plot in words
+FOREIGN = 0.2  # share of a map that is unknown from which on its weights are the wrong ones
 
 
-def cost_rows(savings: Savings) -> list[dict[str, Any]]:
-    """What was spent against everything, a row each: `Saving` with ``label``, and ``done`` and ``full`` in words."""
-    entries: Mapping[str, Any] = savings
-    rows = [
-        {**entries[name], "label": label, "done": show(entries[name]["done"]), "full": show(entries[name]["full"])}
+def cost_rows(savings: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return what was spent against everything, a row each: a saving with its label, figures in words."""
+    return [
+        {**savings[name], "label": label, "done": show(savings[name]["done"]), "full": show(savings[name]["full"])}
         for name, (label, show) in COST_LABELS.items()
-        if name in entries  # a raster takes no line and no second
+        if name in savings  # a raster takes no line and no second
     ]
-    capture = entries.get("capture_s", {})
-    if (before := capture.get("every_line_s")) is not None:
-        told = {"full": format_seconds(before), "ratio": capture["done"] / before if before else None}
-        rows.insert(1, {**rows[0], **told, "label": "beside every line at full exposure, as before"})
-    if "segment_wall_s" in savings:
-        done, full = savings["segment_wall_s"]["done"], savings["segment_wall_s"]["full"]
-        times = {"done": format_seconds(done), "full": format_seconds(full), "full_is": "measured"}
-        rows.append({**times, "label": "time of the model", "ratio": done / full if full else None})
-    return rows
 
 
 def print_table(receipt: Receipt, console: Console) -> None:
-    """Print the receipt's three tables to the terminal: savings, accuracy (with labels), stages."""
-    table = _table("Savings", "cost", "this survey", "everything", "ratio", "everything is")
+    """Print the savings to the terminal, and what became of a prior map or of weights that do not know the field."""
+    table = Table(header_style="dim", box=SIMPLE_HEAD, show_edge=False)
+    for name in ("cost", "this survey", "everything", "ratio"):
+        table.add_column(name, justify="left" if name == "cost" else "right", no_wrap=name != "cost")
     for row in cost_rows(receipt["savings"]):
-        table.add_row(row["label"], row["done"], row["full"], format_percent(row["ratio"]), row["full_is"])
+        table.add_row(row["label"], row["done"], row["full"], format_percent(row["ratio"]))
     console.print(table)
-    if "accuracy" in receipt:
-        console.print(_accuracy_table(receipt["accuracy"]))
-    if "plots" in receipt:
-        table = _table("Plots", "plot", "area", "classes", "confidence")
-        for plot in plot_rows(receipt["plots"]):
-            table.add_row(*(escape(cell) for cell in plot.values()))
-        console.print(table)
-    table = _table("Stages", "stage", "state", "wall", "peak memory", "written")
-    colours = {"ran": "green", "cached": "cyan", "skipped": "dim", "failed": "bold red"}
-    for stage in receipt["stages"]:
-        state = f"[{colours[stage['state']]}]{stage['state']}[/]"
-        peak, wrote = format_bytes(stage["peak_rss_bytes"]), format_bytes(stage["bytes_out"])
-        table.add_row(escape(stage["name"]), state, format_seconds(stage["wall_s"]), peak, wrote)
-    console.print(table)
+    for name, words in finding_rows({name: receipt[name] for name in ("memory", "unknown") if name in receipt}):
+        if name != "unknown" or receipt["unknown"]["share"] > FOREIGN:
+            console.print(escape(f"{name} {words}"))
 
 
-def _table(title: str, *columns: str) -> Table:
-    table = Table(title=title, title_justify="left", title_style="bold", header_style="dim", box=SIMPLE_HEAD)
-    for number, column in enumerate(columns):
-        table.add_column(column, justify="left" if number == 0 else "right", no_wrap=number > 0)
-    return table
+def headline(receipt: Receipt, captured_again: float | None = None) -> str:
+    """Return the run in a few sentences for a farmer, plain text: how long, how good, and where it is worst.
 
-
-def _accuracy_table(accuracy: Accuracy) -> Table:
-    seats = control_seats(accuracy)
-    rows: list[tuple[str, Mapping[str, Any]]] = [
-        ("none: the coarse look alone", accuracy["none"]),
-        ("this survey", accuracy),
-        *((f"{seats} placed by {escape(policy)}", control) for policy, control in accuracy["controls"].items()),
-        ("all: detail everywhere", accuracy["all"]),
-    ]
-    before = definitions_differ([score for _, score in rows])
-    table = _table("Accuracy against the truth", "seats", "mIoU", "spread", "overall", *([SHOWN] if before else []))
-    for label, score in rows:
-        spread = "" if score.get("spread") is None else f"± {format_points(score['spread'])}"
-        cells = [format_points(score["miou"]), spread, format_points(score.get("overall_accuracy"))]
-        cells += [format_points(score.get("miou_of_shown_classes"))] if before else []
-        table.add_row(*([label, *cells] if score is not accuracy else (f"[bold]{cell}[/]" for cell in (label, *cells))))
-    table.add_row("gap from none to all closed", format_percent(accuracy["gap_closed"]))
-    count = sum(iou is not None for iou in accuracy["per_class_iou"].values())
-    words = [f"mIoU: mean over the {count} classes of the truth. Overall: share of pixels that are right."]
-    words = [f"{words[0]} {SHOWN_WORDS}" if before else words[0], false_class_words(accuracy)]
-    table.caption, table.caption_justify = escape("\n".join(filter(None, words))), "left"
-    return table
-
-
-def control_seats(accuracy: Mapping[str, Any]) -> str:
-    """How the controls' seats are called: their share of all, each free of the others."""
-    share = accuracy.get("controls_mode", {}).get("share_of_seats")
-    return "other seats," if share is None else f"{format_percent(share)} of the seats, free,"
-
-
-WIDE = 100  # characters, from which words fit into the table
-COLOURS = {"on": "green", "off": "dim"}
-_KEY = (
-    "left out: what any stored number would change by at most without the effect [{unit}]; error: by what is done"
-    " instead of the exact; measured: the same on the worst lines of the scene."
-)
-Row = Mapping[str, Any]
-
-
-def print_effects(effects: Iterable[Row], total: Row, console: Console) -> None:
-    """Print a row for every effect of the rig and what all come to; words stand below a narrow terminal's table."""
-    rows = list(effects)
-    there = [row for row in rows if row["reason"] != "absent"]
-    wide = console.width >= WIDE
-    table = Table(header_style="dim", box=SIMPLE_HEAD, collapse_padding=True, pad_edge=wide)
-    for name in ("effect", "computed", "left out", "error", "measured", "CPU", *(["why"] if wide else [])):
-        figure = name in ("left out", "error", "measured", "CPU")
-        table.add_column(name, justify="right" if figure else "left", no_wrap=name != "why", overflow="fold")
-    for row in there:
-        table.add_row(*_figures(row, total), *([escape(_words(row))] if wide else []))
-    console.print(table)
-    console.print(escape(_KEY.format(unit=UNIT_WORDS[total["unit"]])), style="dim")
-    if not wide and not total.get("unweighed"):
-        for row in there:
-            console.print(f"[bold]{escape(row['name'])}[/]: {escape(_words(row))}")
-    absent = [f"{row['name']} ({row['magnitude']})" for row in rows if row["reason"] == "absent"]
-    if absent:
-        console.print(f"[bold]Not there[/]: {escape(', '.join(absent))}.")
-    for sentence in total_words(total):
-        console.print(escape(sentence))
-
-
-def _figures(row: Row, total: Row) -> list[str]:
-    """Name, variant or off, what leaving it out would change, what is changed, measured, seconds."""
-    most, bound = total["tolerance"], row["bound"]
-    beyond = row["state"] == "off" and most is not None and (bound is None or bound > most)
-    colour = "yellow" if beyond else COLOURS[row["state"]]
-    return [
-        escape(row["name"]),
-        f"[{colour}]{escape(row['variant'] or 'off')}[/]",
-        DASH if total.get("unweighed") else format_change(row["left_out"], endless=True),
-        format_change(row["bound"], endless=True),
-        "" if row["measured"] is None else format_change(row["measured"]),
-        "" if not row["cost_s"] else "< 0.01 s" if row["cost_s"] < 0.01 else format_seconds(row["cost_s"]),
-    ]
-
-
-def _words(row: Row) -> str:
-    """How large an effect is, and why it is nevertheless there or left out where its figures do not tell."""
-    said = {
-        "exact": "",
-        "needed": "",
-        "small": "",
-        "unseen": "the scene shows nothing of it: ",
-        "spent": "the tolerance is spent where it saves more: ",
-        "asked": "asked for: ",
-        "unasked": "not asked for: ",
-        "unweighed": "",
-        "always": "always there: ",
-    }[row["reason"]]
-    magnitude: str = row["magnitude"]
-    return said + magnitude.removeprefix(f"{row['name']}: ")
-
-
-def format_change(value: float | None, *, endless: bool = False) -> str:
-    """A change in units of the tolerance; what is not there is a dash, or where ``endless`` has no bound at all."""
-    if value is None:
-        return "none" if endless else DASH
-    return f"{value:.2g}"
-
-
-def total_words(total: Mapping[str, Any]) -> Sequence[str]:
-    """What was asked for and what is left out, against the tolerance, and the seconds that this saves."""
-    unit, count = UNIT_WORDS[total["unit"]], total["on"] + total["off"]
-    tolerance = "any number of" if total["tolerance"] is None else f"{total['tolerance']:g}"
-    words = [f"{total['on']} of {count} effects are computed (asked: {total['asked']}, tolerance {tolerance} {unit})."]
-    if total["bound"] is None:
-        words.append("What is left out has no bound.")
-    else:
-        measured = "" if total["measured"] is None else f", measured on the worst lines {total['measured']:.2g}"
-        if total["measured"] is not None and total["measured"] > total["bound"]:
-            measured += ", more by what arithmetic makes of light with such contrasts"
+    ``captured_again`` is the share of the field that was captured in detail, 0..1; None leaves it out.
+    """
+    savings, scan = receipt["savings"], receipt.get("plan", {}).get("kind") in ("scan", "raster")
+    words = []
+    if captured_again == 0:
         words.append(
-            f"What is left out or cheapened changes a stored number by at most {total['bound']:.2g} {unit}{measured}."
+            "The camera looked twice at nothing: no run of fine lines fits into the time left, or is worth it."
         )
-    if total.get("unweighed"):
-        return [*words[:1], "On a scene so small choosing takes longer than it can save: nothing was looked at."]
-    exact, cheap = (format_seconds(max(total[name], 0.0)) for name in ("saved_s", "saved_cheap_s"))
-    words.append(
-        f"That saves about {exact} of CPU in all sweeps decided on against all effects in full, "
-        f"{cheap} against all as cheap as a tenth of the tolerance lets them be."
+    elif captured_again is not None:
+        words.append(f"The camera looked twice at {format_percent(captured_again)} of the field.")
+    if (capture := savings.get("capture_s")) is None:
+        read, stored = (format_percent(savings[name]["ratio"]) for name in ("multiply_adds", "bytes_stored"))
+        words.append(
+            f"The raster's pixels were taken as they are: its map took {read} of the multiply-adds of reading every "
+            f"pixel, and {stored} of the bytes of keeping them."
+        )
+    else:
+        usual = f"every line of {receipt['settings']['camera']['exposure_ms']:g} ms" if scan else "a scan of everything"
+        best = capture.get("full_scan")
+        whole = f"the cheapest scan that is nearly as good as any ({best})" if best else usual
+        done, full = (format_seconds(capture[name]) for name in ("done", "full"))
+        words.append(f"Capture took {done} instead of {full} for {whole} ({format_percent(capture['ratio'])}).")
+    if is_pending(receipt):
+        words.append("The map is not judged yet: its accuracy is added once it is.")
+    if (accuracy := receipt.get("accuracy")) is not None:
+        alone = scan and "kept" not in receipt  # everything is read
+        others = (
+            {} if alone else {"the coarse look alone gives": accuracy["none"], "detail everywhere": accuracy["all"]}
+        )
+        beside = [f"{name} {format_points(one['miou'])}" for name, one in others.items() if one["miou"] is not None]
+        right = format_points(accuracy.get("overall_accuracy"))
+        words.append(
+            f"The map scores {format_points(accuracy['miou'])} of 100 against the truth ({right} % of its pixels are "
+            f"right){'; ' if beside else ''}{', '.join(beside)}."
+        )
+        words.append(worst_class_words(accuracy, alone=alone))
+    return " ".join(filter(None, words))
+
+
+def finding_rows(found: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return the findings of a receipt as rows of a table: what is said of which thing."""
+    rows = [
+        *(
+            (label, words)
+            for key, label, words_of in _ROWS
+            if (part := found.get(key)) and (words := words_of(part, found))
+        ),
+        *(
+            (f"pointing, {name}", words)
+            for name, one in found.get("pointing", {}).items()
+            if isinstance(one, Mapping) and (words := _pointing_words(one))
+        ),
+        *(
+            (
+                f"sweep {name}",
+                f"lines {', '.join(f'{count} {what}' for what, count in facts.items() if count)}: left out",
+            )
+            for name, facts in found.get("lines", {}).items()
+        ),
+    ]
+    if "scans" not in found and found.get("plan", {}).get("kind", "raster") != "raster":
+        words = "the weights have no scan performance table, so that seconds stand beside every line at full exposure"
+        rows.append(("uniform scans", f"{words}; train --darkest-ms 3 makes one, by scenes kept for validation"))
+    return [(label, words) for label, words in rows if words]
+
+
+def _field_words(field: Mapping[str, Any], _: object) -> str:
+    if field["view_deg"] is None:
+        size = " x ".join(map(format_count, field["size_px"])) + " px"
+    else:
+        size = f"{field['view_deg'][0]:.3g} x {field['view_deg'][1]:.3g} degrees of the view"
+    if field["ground_pixel_m"] is None:
+        return size
+    away = "" if field["range_m"] is None else f", {format_metres(field['range_m']['median'])} away in the middle"
+    ground = f"{size}{away}: {area_words(field['hectares'])} at {format_metres(field['ground_pixel_m'])} a pixel"
+    pace = field["hectares_per_hour"]
+    if pace is None:  # a raster took no time
+        return ground
+    return (
+        f"{ground}, {three_digits(pace)} ha an hour of the camera ({three_digits(SECONDS_PER_HOUR / pace)} s a hectare)"
     )
-    return words
+
+
+def _plan_words(plan: Mapping[str, Any], _: object) -> str:
+    parts = [plan["reason"] if plan["kind"] in ("full", "scan", "raster") else f"{plan['lines']} fine lines"]
+    if plan["out_of_reach"]:
+        parts.append(f"{plan['out_of_reach']} places worth a second look lie beyond the mirror's range")
+    if plan.get("spared_s"):
+        share = f" ({format_percent(plan['spared_share'])} of the full scan's)" if plan["spared_share"] else ""
+        parts.append(
+            f"the threshold of {plan['threshold']:g} a second left {plan['spared_s']:.1f} s{share} unspent: no further "
+            "run of lines pays"
+        )
+    return "; ".join(filter(None, parts))
+
+
+def _recording_words(recording: Mapping[str, Any], _: object) -> str:
+    done_s, full_s = recording["passes_s"], recording["full_scan_s"]
+    own = "the recorded scan" if recording["full_scan_is"] == "recorded" else "a scan of every line"
+    saved = f", {format_percent(1 - done_s / full_s)} less" if 0 < done_s < full_s else ""
+    return (
+        f"{format_count(recording['lines_read'])} of {format_count(recording['lines_recorded'])} recorded lines were "
+        f"read; a camera would take {format_seconds(done_s)} for these passes, by the cost model, and "
+        f"{format_seconds(full_s)} for {own}{saved}"
+    )
+
+
+def _look_words(look: Mapping[str, Any], _: object) -> str:
+    rest = "the rest is as before" if look["remembers"] else "of the rest nothing is known"
+    text = f"lines {look['lines']}, {format_percent(look['share'])} of the field; {rest}"
+    if "expected_gain" in look:
+        text += f"; about {format_percent(look['expected_wrong'])} of the prior map was expected to be wrong there"
+    if look.get("due_left"):
+        text += f"; {format_count(look['due_left'])} of {format_count(look['due'])} places that were due had to wait"
+    return text
+
+
+def _kept_words(kept: Mapping[str, Any], found: Mapping[str, Any]) -> str:
+    read, stored = (kept[name]["done"] / kept[name]["everything"] for name in ("multiply_adds", "bytes"))
+    share = kept["seats"] / kept["of_seats"] if kept["of_seats"] else 0.0
+    text = (
+        f"{format_percent(share)} of the patches, for {format_percent(read)} of the multiply-adds of reading everything"
+        f" and {format_percent(stored)} of the bytes of keeping it"
+    )
+    accuracy = found.get("accuracy") or {}
+    every = (accuracy.get("all") or {}).get("miou")
+    return text if every is None else f"{text}; everything read scores {format_points(every)}"
+
+
+def _memory_words(memory: Mapping[str, Any], _: object) -> str:
+    since, shift = f"{memory['run']}, {days_words(memory['days'])}", float(np.hypot(*memory["shift_px"]))
+    if memory["put_aside"] == "turned":
+        return f"{since}: put aside, the rig was turned since by {abs(memory['turned_deg']):.1f} degrees"
+    alike = "nothing" if memory["agreement"] is None else format_percent(memory["agreement"])
+    if memory["put_aside"]:
+        return f"{since}: put aside, today's capture agrees with {alike} of it: another field, or a rig that was moved"
+    share = format_percent(memory["changed_px"] / memory["compared_px"]) if memory["compared_px"] else "nothing"
+    most = ", ".join(f"{_spaced(old)} to {_spaced(new)}" for _, old, new in memory["changes"][:MOST_CHANGES])
+    beside = f", which lay {shift:.0f} px beside it" if shift else ""
+    return f"{since}{beside}: today's capture agrees with {alike} of it, {share} changed{': ' if most else ''}{most}"
+
+
+def days_words(days: float) -> str:
+    """Return how long ago a capture was."""
+    if days < 1:
+        return f"{24 * days:.1f} hours earlier"
+    return f"{days:.1f} days earlier" if days < 10 else f"{days:.0f} days earlier"
+
+
+def _unknown_words(unknown: Mapping[str, Any], found: Mapping[str, Any]) -> str:
+    text = (
+        f"{format_percent(unknown['share'])} of the map is unknown, unlike all that the weights were trained on; of"
+        f" what they know it would be about {format_percent(unknown['rate'])}"
+    )
+    if pixels := (found.get("accuracy") or {}).get("unknown_px"):
+        text += f"; {format_count(pixels)} such pixels have a label and count as wrong"
+    if unknown["share"] > FOREIGN:
+        text += (
+            ". These weights do not know this field: train some on labelled scenes of it (spectralzoom train DATASET), "
+            "or leave the class out with --unknown off"
+        )
+    return text
+
+
+def _scans_words(scans: Mapping[str, Mapping[str, Any]], found: Mapping[str, Any]) -> str:
+    own = "this one, read whole" if "kept" in found else "this one"
+    titles = {"taken": own, "best_in_time": "best in the same seconds", "reference": "nearly as good as any"}
+    return "; ".join(
+        f"{title}: {scan_words(one['step'], one['exposure_ms'])}, {one['seconds']:.1f} s, about "
+        f"{format_points(one['expected_miou'])} ± {format_points(one.get('expected_spread'))}"
+        for name, title in titles.items()
+        if (one := scans.get(name)) is not None
+    )
+
+
+def _zones_words(zones: Mapping[str, Any], _: object) -> str:
+    ground = "" if zones["kept_m2"] is None else f", {area_words(zones['kept_m2'] / M2_PER_HECTARE)}"
+    no_go = f"; no-go zones touch {format_count(zones['no_go_px'])} px" if zones["no_go_px"] else ""
+    share = format_percent(zones["kept_px"] / zones["field_px"])
+    return f"{format_count(zones['kept_px'])} px, {share} of the field{ground}{no_go}; of the rest no map is drawn"
+
+
+def _ground_words(ground: Mapping[str, Any], _: object) -> str:
+    areas = ", ".join(f"{_spaced(name)} {area_words(area)}" for name, area in ground["areas_ha"].items() if area)
+    words = [f"{ground['crs']}, {ground['resolution_m']:.4g} m a pixel: {areas}"]
+    if changes := ground.get("changes_ha"):
+        told = [f"{_spaced(old)} to {_spaced(new)} {area_words(area)}" for area, old, new in changes[:MOST_CHANGES]]
+        words.append(f"{area_words(sum(area for area, _, _ in changes))} changed: {', '.join(told)}")
+    older = [(int(days), area) for days, area in ground.get("older_ha", {}).items() if area]
+    words += [f"{area_words(area)} last captured more than {counted(days, 'day')} ago" for days, area in older]
+    return "; ".join(words)
+
+
+def _pointing_words(one: Mapping[str, Any]) -> str:
+    put = [float(np.hypot(*offset)) for sweep, offset in one["sweeps"].items() if sweep not in one["not_found"]]
+    parts = []
+    if len(one["sweeps"]) == 1 and one["held"] in one["sweeps"]:
+        parts.append("one sweep, which has no seam to be put right by")
+    elif put:
+        parts.append(f"put right by up to {max(put):.1f} px")
+        parts += (
+            [] if one["residual_rms_px"] is None else [f"{one['residual_rms_px']:.2f} px rms are left at the seams"]
+        )
+    if one["not_found"]:
+        parts.append(f"{', '.join(one['not_found'])} left where the mirror reported: nothing was found")
+    if one["too_narrow"]:
+        parts.append(f"{counted(len(one['too_narrow']), 'overlap')} too narrow to compare")
+    if one.get("partly_seen"):
+        parts.append(f"{counted(one['partly_seen'], 'chosen place')} not seen whole, mapped there by the coarse look")
+    return "; ".join(parts)
+
+
+def plot_rows(plots: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+    """Return the table of plots in words: name, ground, leading classes, confidence."""
+
+    def leading(shares: Mapping[str, float | None]) -> str:
+        known = sorted(((share, name) for name, share in shares.items() if share), key=lambda one: -one[0])
+        return ", ".join(f"{_spaced(name)} {format_percent(share)}" for share, name in known[:LEADING])
+
+    return [
+        {
+            "plot": plot["plot"],
+            "area": f"{format_count(plot['pixels'])} px"
+            if plot["area_m2"] is None
+            else area_words(plot["area_m2"] / M2_PER_HECTARE),
+            "classes": leading(plot["shares"]) if plot["mapped_pixels"] else "not mapped",
+            "confidence": format_percent(plot["confidence"]),
+        }
+        for plot in plots
+    ]
+
+
+def _spaced(name: str) -> str:
+    return name.replace("_", " ")
+
+
+_ROWS: Sequence[tuple[str, str, Any]] = (
+    ("field", "field", _field_words),
+    ("plan", "plan", _plan_words),
+    ("recording", "recording", _recording_words),
+    ("look", "captured", _look_words),
+    ("kept", "kept in detail", _kept_words),
+    ("memory", "goes on from", _memory_words),
+    ("unknown", "unknown", _unknown_words),
+    (
+        "expected",
+        "expected score",
+        lambda one, _: f"about {format_points(one['miou'])} ± {format_points(one['error'])}, with no label asked",
+    ),
+    ("scans", "uniform scans", _scans_words),
+    ("zones", "zones", _zones_words),
+    ("ground", "on the ground", _ground_words),
+)

@@ -6,34 +6,52 @@ Whatever a page shows is escaped here and nowhere else: no markup, and nothing t
 from __future__ import annotations
 
 import base64
+import hashlib
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache, partial
+from importlib.resources import files
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from jinja2.utils import htmlsafe_json_dumps
 from markupsafe import Markup
 
-from flows.publish.field_map import FieldMap, map_facts
-from flows.publish.findings import plot_rows
-from flows.publish.page_data import LEAFLET, part, policy, scripts
-from flows.publish.receipt import Accuracy, Receipt
-from flows.publish.receipt_table import control_seats, cost_rows, format_change, total_words
-from flows.publish.receipt_words import headline, sentences
-from flows.tasks.scores import SHOWN, SHOWN_WORDS, definitions_differ, false_class_words
+from flows.publish.effects_table import format_change, total_words
+from flows.publish.field_map import FieldMap
+from flows.publish.receipt import Receipt
+from flows.publish.receipt_table import cost_rows, finding_rows, headline, plot_rows
+from flows.tasks.scores import false_class_words
 from flows.terminal.figures import format_bytes, format_percent, format_points, format_seconds
 from pipeline.errors import visible
 
+LEAFLET = "vendor/leaflet-1.9.4"  # leafletjs.com, BSD-2-Clause: unchanged from npm's registry
+SHA256 = {
+    f"{LEAFLET}/leaflet.js": "db49d009c841f5ca34a888c96511ae936fd9f5533e90d8b2c4d57596f4e5641a",
+    f"{LEAFLET}/leaflet.css": "a7837102824184820dfa198d1ebcd109ff6d0ff9a2672a074b9a1b4d147d04c6",
+    f"{LEAFLET}/LICENSE": "53e8dc25862014e4324741ca18fbe3611e11d42ef69f59f86ea8c5389647d4cb",
+}
+MAP_SCRIPTS = (f"{LEAFLET}/leaflet.js", "scripts/field_map.js")
 _MARKDOWN = "\\`*_{}[]<>#|"
-MAP_SCRIPTS = (
-    f"{LEAFLET}/leaflet.js",
-    "scripts/png.js",
-    "scripts/swipe.js",
-    "scripts/spectrum.js",
-    "scripts/field_map.js",
-)
+
+
+@cache
+def part(name: str) -> str:
+    """Return a file beside this module as it stands in a page: without what would point at files elsewhere."""
+    text = files("flows.publish").joinpath(name).read_text(encoding="utf-8").replace("\r\n", "\n")
+    elsewhere = "url(" if name.endswith(".css") else "//# sourceMappingURL="  # pictures that no page uses; a debugger's
+    return "\n".join(line for line in text.split("\n") if elsewhere not in line)
+
+
+def policy(names: tuple[str, ...]) -> str:
+    """Return the content security policy of a page: these scripts alone run, and nothing is loaded from anywhere."""
+    sources = [f"'sha256-{base64.b64encode(hashlib.sha256(part(name).encode()).digest()).decode()}'" for name in names]
+    allowed = " ".join(sources) or "'none'"
+    return (
+        f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {allowed}; "
+        "base-uri 'none'; form-action 'none'"
+    )
 
 
 def render_page(template: str, carries: tuple[str, ...] = (), **facts: Any) -> str:
@@ -41,7 +59,8 @@ def render_page(template: str, carries: tuple[str, ...] = (), **facts: Any) -> s
 
     ``carries`` are the scripts that run in the page, after all of it is there; no others do.
     """
-    own = {"policy": policy(carries), "scripts": scripts(carries)}
+    scripts = Markup("\n").join(Markup("<script>{}</script>").format(Markup(part(name))) for name in carries)
+    own = {"policy": policy(carries), "scripts": scripts}
     return visible(_environment(markdown=False).get_template(template).render(facts | own))
 
 
@@ -84,7 +103,7 @@ def _visible_words(content: Any) -> Any:
         return visible(content)
     if isinstance(content, Mapping):
         return {visible(name): _visible_words(item) for name, item in content.items()}
-    if isinstance(content, list) and not (content and isinstance(content[0], int | float)):
+    if isinstance(content, list | tuple):
         return [_visible_words(item) for item in content]
     return content
 
@@ -109,34 +128,35 @@ def render_report(
     quicklook_png: bytes,
     pictures: Iterable[Picture] = (),
     *,
-    looked_twice: float | None = None,
+    captured_again: float | None = None,
     field: FieldMap | None = None,
 ) -> str:
     """The page as text, ``pictures`` below the quicklook; the same receipt, pictures and map give the same bytes.
 
-    ``looked_twice`` is the share of the field captured in detail, 0..1, for the first sentence; None leaves it out.
+    ``captured_again`` is the share of the field captured in detail, 0..1, for the first sentence; None leaves it out.
     ``field`` is the map to move in, above all pictures; None leaves it out, with all scripts.
     """
     shown = [Picture(quicklook_png, "The survey at a glance."), *pictures]
     split: Mapping[str, Any] = receipt["savings"]["multiply_adds"]
     parts = [name for name in ("glance", "score", "encode", "decode") if split["done"] and split[name] is not None]
-    total = receipt.get("effects_total")  # receipts of before have none
+    total, accuracy = receipt.get("effects_total"), receipt.get("accuracy")
     return render_page(
         "report.html",
         () if field is None else MAP_SCRIPTS,
         kicker="SpectralZoom survey",
         title=receipt["survey"],
-        lead=headline(receipt, looked_twice),
+        lead=headline(receipt, captured_again),
         about=f"{receipt['scene']} seen by {receipt['source']}, seed {receipt['seed']}, finished {receipt['finished']}",
         receipt=receipt,
-        field=None if field is None else map_facts(field),
+        field=field,
         leaflet=LEAFLET,
         pictures=[{"data": base64.b64encode(one.png).decode("ascii"), "caption": one.caption} for one in shown],
         costs=cost_rows(receipt["savings"]),
         shares={name: split[name] / split["done"] for name in parts},
-        findings=sentences(receipt),
+        findings=finding_rows(receipt),
         plots=plot_rows(receipt.get("plots", [])),
-        **_scores(receipt.get("accuracy")),
+        accuracy=accuracy,
+        false_classes="" if accuracy is None else false_class_words(accuracy),
         total_words="" if total is None else " ".join(total_words(total)),
         details={
             "Settings": {
@@ -148,17 +168,3 @@ def render_report(
             "Files of this survey": receipt["products"],
         },
     )
-
-
-def _scores(accuracy: Accuracy | None) -> dict[str, Any]:
-    """What the page says of the map against the truth; ``shown`` where the definition of before scores otherwise."""
-    if accuracy is None:
-        return {"accuracy": None}
-    maps: list[Mapping[str, Any]] = [accuracy["none"], *accuracy["controls"].values(), accuracy, accuracy["all"]]
-    return {
-        "accuracy": accuracy,
-        "seats": control_seats(accuracy),
-        "shown": SHOWN if definitions_differ(maps) else "",
-        "shown_words": SHOWN_WORDS,
-        "false_classes": false_class_words(accuracy),
-    }

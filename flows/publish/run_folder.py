@@ -15,14 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.archive.field_figures import field_figures
-from flows.publish.change_pictures import change_pictures, remembered
-from flows.publish.findings import PLOTS_FILE, find_ground, find_map, find_zones, plots_csv
+from flows.publish.field_map import block_of, field_map, remembered
+from flows.publish.findings import PLOTS_FILE, field_figures, find_ground, find_map, find_zones, plots_csv
 from flows.publish.panels import draw_ground
 from flows.publish.quicklook import QuicklookData, draw_quicklook
-from flows.publish.receipt import AccuracyIs, Header, Receipt, build_receipt, check_receipt, with_accuracy
+from flows.publish.receipt import AccuracyIs, Receipt, build_receipt, check_receipt, with_accuracy
 from flows.publish.report import Picture, render_report
-from flows.publish.run_layers import block_of, field_map, read_coarse
 from flows.settings.load import anchor_paths
 from flows.settings.values import LOOK_WHOLE
 from flows.tasks.extent import work_done, work_of_map
@@ -32,7 +30,7 @@ from flows.tasks.run import SurveyRun, now
 from flows.tasks.scan_choice import as_told
 from flows.tasks.seat_budget import BYTES_A_VALUE
 from flows.tasks.stages.accuracy import load_accuracy
-from flows.tasks.stages.attention import load_orientation, load_plan
+from flows.tasks.stages.attention import load_plan
 from flows.tasks.stages.capture import captured
 from flows.tasks.stages.effects import load_manifest
 from flows.tasks.stages.on_ground import STORE
@@ -48,9 +46,9 @@ from storage.archive.keys import StageRef
 from storage.archive.records import read_run
 from storage.archive.run_folders import RunDraft
 from storage.archive.whole_files import to_json
-from storage.arrays.class_maps import BeliefStore, load_class_map, load_class_names
+from storage.arrays.class_maps import BeliefStore, load_class_map
 from storage.arrays.cubes import RawCube
-from storage.arrays.ground_maps import load_ground_map
+from storage.arrays.ground_maps import load_ground_map, open_image
 from storage.arrays.mosaics import load_attention, open_patches
 from storage.arrays.quicklooks import choose_bands
 
@@ -63,7 +61,7 @@ class Published:
 
     receipt: Receipt
     folder: Path
-    looked_twice: float | None  # None of a plain scan; share of the field's seats captured in detail
+    captured_again: float | None  # None of a uniform scan; share of the field's seats captured in detail
 
 
 def publish_run(survey: OpenSurvey) -> Published:
@@ -105,10 +103,8 @@ def load_receipt(folder: Path) -> Receipt:
 
 
 def _publish(run: SurveyRun, draft: RunDraft, products: Products, plan: FinePlan, receipt: Receipt) -> Published:
-    seats = len(run.grid.valid_seats())
-    looked_twice = None if run.plan.plain else float(seen_shares(run, products.patches).sum()) / seats
-    coarse = read_coarse(run, products)
-    glance = quicklook_data(run, products, plan, receipt, coarse.colours)
+    again = None if run.plan.plain else float(seen_shares(run, products.patches).sum()) / len(run.grid.valid_seats())
+    glance = quicklook_data(run, products, plan, receipt)
     draw_quicklook(draft.folder / "quicklook.png", glance)
     draft.write_file("receipt.json", to_json(receipt))
     if "plots" in receipt:
@@ -116,25 +112,19 @@ def _publish(run: SurveyRun, draft: RunDraft, products: Products, plan: FinePlan
     picture = (draft.folder / "quicklook.png").read_bytes()
     maps = (load_ground_map(ref.path / STORE) for ref in products.there("ground"))
     pictures = [Picture(draw_ground(drawn), "The map on the ground, north up.") for drawn in maps]
-    before = remembered(run.prior, products["draw_map"], receipt)
-    field = field_map(run, products, plan, glance, coarse.spectra, before)
-    legend = load_class_names(products["draw_map"].path / "class_map.zarr")
-    pictures += change_pictures(before, field.classes, legend, run.grid.patch)
-    page = render_report(receipt, picture, pictures, looked_twice=looked_twice, field=field)
+    field = field_map(run, products, plan, glance, remembered(run.prior, products["draw_map"], receipt))
+    page = render_report(receipt, picture, pictures, captured_again=again, field=field)
     (draft.folder / "report.html").write_text(page, encoding="utf-8")
     rests_on = run.archive.manifest_hashes(products.values())
     folder = draft.publish(survey=receipt["survey"], settings=receipt["settings"], rests_on=rests_on)
-    return Published(receipt, folder, looked_twice)
+    return Published(receipt, folder, again)
 
 
 def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str) -> Receipt:
     """Put together what the run has to say for itself."""
     run, products = survey.run, survey.products
     accuracy = load_accuracy(products["evaluate"]) if "evaluate" in products else None
-    savings = _savings(run, products, plan)
-    simulation = None if not run.source.simulates else load_manifest(products["choose_effects"])
-    if accuracy is not None and "segment_wall_s" in accuracy:
-        savings["segment_wall_s"] = accuracy.pop("segment_wall_s")
+    effects = load_manifest(products["choose_effects"]) if run.source.simulates else {}
     stores: dict[str, str] = {}
     for name, ref in products.items():
         stores |= STAGES[name].addresses(ref)
@@ -145,18 +135,25 @@ def make_receipt(survey: OpenSurvey, plan: FinePlan, folder: str) -> Receipt:
     for name in LIBRARIES:
         with suppress(PackageNotFoundError):  # run from a source tree that is not installed
             versions[name] = version(name)
-    began, asked = survey.started, asked_settings(run)
-    header = Header(run.name, run.source.name, run.scene.key, run.settings.seed, began, now(), versions, asked)
     return build_receipt(
-        header,
-        survey.records.values(),
-        savings,
-        {**stores, **{name: f"{folder}/{name}" for name in files}},
-        accuracy=accuracy,
+        survey=run.name,
+        source=run.source.name,
+        scene=run.scene.key,
+        seed=run.settings.seed,
+        started=survey.started,
+        finished=now(),
+        versions=versions,
+        settings=asked_settings(run),
+        stages=[asdict(one) for one in survey.records.values()],
+        savings=_savings(run, products, plan),
         accuracy_is=accuracy_is,
         judged=None if accuracy is None else now(),
-        simulation=simulation,
-        findings=find_out(run, products) | {"scans": scans_told(run, run.plan.coarse_s + plan.seconds)},
+        accuracy=accuracy,
+        effects=effects.get("effects"),
+        effects_total=effects.get("total"),
+        products={**stores, **{name: f"{folder}/{name}" for name in files}},
+        scans=scans_told(run, run.plan.coarse_s + plan.seconds),
+        **find_out(run, products),
     )
 
 
@@ -205,23 +202,19 @@ def _model_savings(run: SurveyRun, plan: FinePlan) -> dict[str, Any]:
 
 
 def _seconds_saved(run: SurveyRun, done: float) -> dict[str, Any]:
-    """Seconds of capture beside the cheapest scan that is nearly as good as any, and beside every line as before.
-
-    Where the weights' record tells of no scans, every line at the camera's exposure is all that there is beside it.
-    """
-    before, reference = SavingEntry(done, run.plan.full_s, "predicted").as_dict(), run.scans.reference
+    """Seconds of capture beside the cheapest scan that is nearly as good as any; without a table, every line."""
+    reference = run.scans.reference
     if reference is None:
-        return before
-    now = SavingEntry(done, reference.seconds, "predicted").as_dict()
-    return {**now, "full_scan": reference.words, "every_line_s": run.plan.full_s}
+        return SavingEntry(done, run.plan.full_s, "predicted").as_dict()
+    return SavingEntry(done, reference.seconds, "predicted").as_dict() | {"full_scan": reference.words}
 
 
-def quicklook_data(
-    run: SurveyRun, products: Products, plan: FinePlan, receipt: Receipt, coarse: NDArray[np.float32]
-) -> QuicklookData:
-    """Gather what the four panels show, three bands of it; ``coarse`` are those of the mosaic, (y, x, 3)."""
+def quicklook_data(run: SurveyRun, products: Products, plan: FinePlan, receipt: Receipt) -> QuicklookData:
+    """Gather what the panels show, three bands of it."""
     bands, _ = choose_bands(run.scene.wavelength_nm)
     chosen = list(bands)
+    image = open_image(products.mosaic.path / "mosaic.zarr", "values")
+    coarse = np.concatenate([values[..., chosen] for _, values in image.rows()])
     attention = load_attention(products["attend"].path / "attention.zarr")
     found = load_class_map(products["draw_map"].path / "class_map.zarr")
     order = np.argsort(attention.rank.ravel(), kind="stable")
@@ -252,7 +245,6 @@ def quicklook_data(
         class_colours=found.colours,
         truth=run.labels,
         confidence=found.confidence,
-        pixel_mrad=None if run.raster is not None else run.camera.ifov_rad * 1e3,
         along=run.plan.along,
         note="   ·   ".join(notes),
     )
@@ -319,8 +311,6 @@ def find_out(run: SurveyRun, products: Products) -> dict[str, Any]:
         "full_seconds": plan.full_seconds,
         "out_of_reach": plan.out_of_reach,
     }
-    if run.raster is None:
-        told["orientation"] = load_orientation(products["compare_turned"])
     if plan.threshold is not None:  # what it left, and the score that was not worth more seconds
         told |= {
             "threshold": plan.threshold,

@@ -12,8 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from flows.publish.publishing import published_run
-from flows.publish.receipt_table import print_table
-from flows.publish.receipt_words import headline, sentences
+from flows.publish.receipt_table import headline, print_table
 from flows.publish.run_folder import Published
 from flows.settings.parameters import SurveySettings
 from flows.settings.survey_settings import Settings
@@ -103,12 +102,10 @@ def _prefect_server(settings: Settings) -> Iterator[None]:
 
 
 def show_published(published: Published, out: str, console: Console) -> None:
-    """Print a run's receipt as tables and sentences, and where its files lie."""
+    """Print the headline, what was spent, and where the files lie that say the rest."""
+    console.print(escape(headline(published.receipt, published.captured_again)))
     print_table(published.receipt, console)
-    console.print(escape(headline(published.receipt, published.looked_twice)))
-    for sentence in sentences(published.receipt):
-        console.print(escape(sentence))
     if is_remote(out):
         console.print(f"  {escape(out)}/runs/{published.folder.name}, and on this machine", soft_wrap=True)
-    for name in ("report.html", "quicklook.png", "receipt.json"):
-        console.print(f"  {escape(str(published.folder / name))}", soft_wrap=True)
+    beside = ", with quicklook.png and receipt.json beside it"
+    console.print(f"  {escape(str(published.folder / 'report.html'))}{beside}", soft_wrap=True)

@@ -12,7 +12,7 @@ import numpy as np
 from rich.console import Console
 from rich.markup import escape
 
-from flows.publish.receipt_table import print_effects
+from flows.publish.effects_table import print_effects
 from flows.settings.survey_settings import Settings
 from flows.simulate.effect_comparison import Comparison, compare_with_everything
 from flows.tasks.capture_plan import lay_out_sweeps

@@ -16,7 +16,7 @@ from flows.tasks.rig_lock import rig_to_oneself
 from flows.tasks.run import SurveyRun, now
 from flows.tasks.stage import Stage
 from flows.tasks.stages.accuracy import evaluate
-from flows.tasks.stages.attention import attend, compare_turned
+from flows.tasks.stages.attention import attend
 from flows.tasks.stages.capture import capture_coarse, capture_fine
 from flows.tasks.stages.effects import choose_effects
 from flows.tasks.stages.maps import draw_map
@@ -35,7 +35,7 @@ else:
 RIG_LIMIT = "rig"  # Prefect's global concurrency limit, where the server has one of that name
 OF_THE_SURVEY = (
     *(choose_effects, capture_coarse, register_coarse, locate, rectify, average_raster, attend),
-    *(capture_fine, register_fine, cut_patches, take_patches, draw_map, compare_turned, ground, evaluate),
+    *(capture_fine, register_fine, cut_patches, take_patches, draw_map, ground, evaluate),
 )
 COARSE, DETAIL = ("rectify", "average_raster"), ("cut_patches", "take_patches")  # of a capture, of a raster
 JUDGED = (*COARSE, *DETAIL, "draw_map", "choose_effects", "register_coarse")  # whose stores `evaluate` takes

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from flows.terminal.figures import format_count, format_points, known_number
 
 JUDGING = "evaluate"  # the stage that judges the map
-SHOWN = "of shown"  # the column of the mean by the definition of before
-SHOWN_WORDS = f"{SHOWN.capitalize()}: the mean over all classes that truth or map show, as before."
 MAPS = {"this survey": None, "none": "none", "all": "all"}  # as they are called; where a receipt's accuracy has them
 
 
@@ -23,32 +21,11 @@ class WorstClass(NamedTuple):
 
 
 def score_of(receipt: Mapping[str, Any]) -> dict[str, float | None]:
-    """``miou`` and ``overall_accuracy`` of a run's map, 0..1; None where nothing was judged or it cannot be told.
-
-    Receipts of before hold the mean over the classes that map or truth show. Theirs is worked out anew from the IoU of
-    each class, so that runs of any age may be compared: a class that any of the three maps has right is in the truth,
-    one that neither the truth nor some map shows is not. Where a class is 0 in all maps nobody knows, and there is
-    no score.
-    """
+    """``miou`` and ``overall_accuracy`` of a run's map, 0..1; None where nothing was judged."""
     accuracy = receipt.get("accuracy")
     if not isinstance(accuracy, Mapping):
         return {"miou": None, "overall_accuracy": None}
-    miou = known_number(accuracy.get("miou")) if "miou_of_shown_classes" in accuracy else _miou_of_before(accuracy)
-    return {"miou": miou, "overall_accuracy": known_number(accuracy.get("overall_accuracy"))}
-
-
-def _miou_of_before(accuracy: Mapping[str, Any]) -> float | None:
-    maps = [by_class for by_class in map(_by_class, judged_maps(accuracy).values()) if by_class]
-    if not maps:
-        return None
-    known: list[float] = []
-    for name, iou in maps[0].items():
-        each = [by_class.get(name) for by_class in maps]
-        if any(each):
-            known.append(iou or 0.0)
-        elif None not in each:
-            return None  # never right and never absent: the truth may have it or not
-    return sum(known) / len(known) if known else None
+    return {name: known_number(accuracy.get(name)) for name in ("miou", "overall_accuracy")}
 
 
 def judged_maps(accuracy: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
@@ -96,8 +73,3 @@ def false_class_words(accuracy: Mapping[str, Any]) -> str:
             pixels = ", ".join(f"{kind.replace('_', ' ')} {format_count(count)} px" for kind, count in false.items())
             told.append(f"{name} {pixels}")
     return f"Shown although the truth has none: {'; '.join(told)}." if told else ""
-
-
-def definitions_differ(rows: Sequence[Mapping[str, Any]]) -> bool:
-    """Whether the mean over the classes that a map shows, which was the score before, is another for any row."""
-    return any(row.get("miou_of_shown_classes", row.get("miou")) != row.get("miou") for row in rows)

@@ -285,14 +285,16 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
     if "familiar" in record:
         console.print(record["familiar"], markup=False, soft_wrap=True)
     figures = record["validation"]
+    if figures is None and request.preset != "two-scale":
+        console.print("no scene was kept for validation, so that this control network is not judged")
+        return
     if figures is None:
-        given = "--weights" if request.preset == "two-scale" else "--weights OTHERS --control"
         console.print(
             "no scene was kept for validation; to judge the weights on scenes that they were not trained on: "
-            f"spectralzoom evaluate {request.dataset} {given} {out}",
+            f"spectralzoom evaluate {request.dataset} --weights {out}",
             soft_wrap=True,
         )
-        if request.settings.darkest_ms < REFERENCE_MS and request.preset == "two-scale":
+        if request.settings.darkest_ms < REFERENCE_MS:
             console.print("nor has the file a record of plain scans, by which survey --seconds chooses", soft_wrap=True)
         return
     title = f"{figures['scenes']} scene{'s' if figures['scenes'] > 1 else ''} kept for validation"

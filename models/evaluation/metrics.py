@@ -5,13 +5,6 @@ A mean over classes is over those that the labels have among the pixels judged (
 classes, whatever they show. A class that a map shows and the labels lack is a false class: it has no IoU of its own,
 `false_pixels` counts it, and each of its pixels is one that the class below it has missed.
 
-Before, the mean was over the classes that labels or map show (`miou_of_shown_classes`): a single stray pixel of a
-false class was another IoU of 0 in the mean of the map that has it, and none in the mean of the map beside it.
-
-`boundary_counts` and `boundary_iou` look near borders alone (Cheng et al., arXiv 2103.16562): of each class only the
-pixels within ``d`` px (chessboard) of the border of its own region are kept, in the labels and in the map. The edge of
-the image is a border, and so is that of what has no label.
-
 How sure a difference of two rows is, draws of frames and seeds say, again and again: both rows are judged on the same
 draw, and the classes of its mean are those that the labels of its frames have.
 """
@@ -21,13 +14,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import UNLABELLED
 
-DIAGONAL_SHARE = 0.02  # the default of Cheng et al.
 DRAWS = 2000
 LEVEL = 0.95
 Counts = NDArray[np.int64]
@@ -83,28 +74,9 @@ def mean_iou_of_each(counts: NDArray[np.integer]) -> NDArray[np.float64]:
     return mean
 
 
-def miou_of_shown_classes(counts: NDArray[np.int64], known: int | None = None) -> float:
-    """Mean IoU over the classes that labels or map show, false ones as 0: the definition of before; NaN without any.
-
-    Of the first ``known`` classes, where those behind them say that a pixel is of none.
-
-    Of two maps the one whose every class is better may have the lower mean: not to be compared, kept for old figures.
-    """
-    held = labelled_classes(counts)
-    shown = (held | (counts.sum(axis=0) > 0))[:known]
-    return mean_iou(counts) * float(held.sum() / shown.sum()) if shown.any() else float("nan")
-
-
-def agreement(counts: NDArray[np.int64], known: int | None = None) -> dict[str, float]:
-    """Give the figures that stand side by side wherever a map is scored: mIoU, by both definitions, and the pixels'.
-
-    ``known``: as of `miou_of_shown_classes`.
-    """
-    return {
-        "miou": mean_iou(counts),
-        "miou_of_shown_classes": miou_of_shown_classes(counts, known),
-        "overall_accuracy": overall_accuracy(counts),
-    }
+def agreement(counts: NDArray[np.int64]) -> dict[str, float]:
+    """Give the figures that stand side by side wherever a map is scored: mIoU and the share of right pixels."""
+    return {"miou": mean_iou(counts), "overall_accuracy": overall_accuracy(counts)}
 
 
 def overall_accuracy(counts: NDArray[np.int64]) -> float:
@@ -135,79 +107,9 @@ def gap_closed(reached: float, none: float, all_seats: float) -> float | None:
     return (reached - none) / way if way >= 0.01 else None  # NaN is None too
 
 
-def frequency_weighted_iou(counts: NDArray[np.int64]) -> float:
-    """Mean of the classes' IoU by how many pixels carry their label; NaN when nothing is labelled."""
-    support = counts.sum(axis=1)
-    held = support > 0
-    return float(np.average(iou_per_class(counts)[held], weights=support[held])) if held.any() else float("nan")
-
-
-def miou_over_frames(frames: NDArray[np.int64]) -> float:
-    """`miou_i`: each frame's own mean IoU, then the mean over frames that have one, (frame, class, class) counts."""
-    return _mean_of_known(np.array([mean_iou(counts) for counts in frames]))
-
-
-def miou_over_frame_classes(frames: NDArray[np.int64]) -> float:
-    """`miou_c`: each class's mean IoU over the frames whose labels have it, then over classes; (frame, class, class).
-
-    A large object counts as much as a small one, which the counts of the whole data set do not allow for.
-    """
-    each = np.array([iou_per_class(counts) for counts in frames]).reshape(len(frames), -1)
-    return _mean_of_known(np.array([_mean_of_known(column) for column in each.T]))
-
-
 def _mean_of_known(values: NDArray[np.float64]) -> float:
     known = values[~np.isnan(values)]
     return float(known.mean()) if known.size else float("nan")
-
-
-def boundary_px(shape: tuple[int, int]) -> int:
-    """Width of the boundary [px]: a share of the diagonal, rounded, at least 1."""
-    return max(1, round(DIAGONAL_SHARE * float(np.hypot(*shape))))
-
-
-def boundary_counts(
-    labels: NDArray[np.integer], predicted: NDArray[np.integer], classes: int, width: int | None = None
-) -> NDArray[np.int64]:
-    """Count boundary pixels of each class, (class, 2) int64: in both, in either. Counts of images add up.
-
-    ``labels`` and ``predicted`` are (y, x) class indices; where the label is 255 neither counts. ``width`` is that of
-    the boundary [px], by default 2 % of the image's diagonal. Raises ShapeError where the two are not of one (y, x)
-    size.
-    """
-    if labels.shape != predicted.shape or labels.ndim != 2:
-        raise ShapeError(f"labels are {labels.shape}, the class map is {predicted.shape}; they must be equal, (y, x)")
-    d = boundary_px(labels.shape) if width is None else width
-    seen = labels != UNLABELLED
-    counts = np.zeros((classes, 2), np.int64)
-    for number in range(classes):
-        truth = near_border(labels == number, d)
-        drawn = near_border((predicted == number) & seen, d)
-        counts[number] = np.count_nonzero(truth & drawn), np.count_nonzero(truth | drawn)
-    return counts
-
-
-def near_border(region: NDArray[np.bool_], width: int) -> NDArray[np.bool_]:
-    """Pixels of a (y, x) region within ``width`` px of what is not the region; the image ends where the array does."""
-    if not region.any():
-        return region
-    inner = region.astype(np.uint8)
-    for axis in (0, 1):
-        inner = scipy.ndimage.minimum_filter1d(inner, 2 * width + 1, axis=axis, mode="constant", cval=0)
-    border: NDArray[np.bool_] = region & (inner == 0)
-    return border
-
-
-def boundary_iou(counts: NDArray[np.int64], labelled: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Boundary IoU of each class from `boundary_counts`; NaN for a class that the labels lack (`labelled_classes`)."""
-    both, either = counts[:, 0].astype(np.float64), counts[:, 1]
-    iou: NDArray[np.float64] = np.divide(both, either, out=np.full(len(both), np.nan), where=labelled)
-    return iou
-
-
-def mean_boundary_iou(counts: NDArray[np.int64], labelled: NDArray[np.bool_]) -> float:
-    """Mean over the classes that the labels have; NaN where there is none."""
-    return _mean_of_known(boundary_iou(counts, labelled))
 
 
 CONFIDENCE_BINS = 20

@@ -85,35 +85,6 @@ def captured_gain(bought: float, best: float) -> float | None:
     return bought / best if best > 0 else None
 
 
-def average_precision(score: Values, positive: NDArray[np.bool_]) -> float:
-    """Mean precision at each positive, from the best score down; equal scores by number, NaN last.
-
-    NaN where nothing is positive.
-    """
-    if not positive.any():
-        return float("nan")
-    worth = np.where(np.isnan(score), -np.inf, score)
-    hits = positive[np.argsort(-worth, kind="stable")]
-    precision = np.cumsum(hits) / np.arange(1, len(hits) + 1)
-    return float(precision[hits].mean())
-
-
-def top_seats(gain: Values, count: int) -> NDArray[np.bool_]:
-    """Which of the seats are the ``count`` with the most gain, equal ones by number, (seat,)."""
-    best = np.zeros(len(gain), bool)
-    best[np.argsort(-gain, kind="stable")[:count]] = True
-    return best
-
-
-def rank_correlation(score: Values, gain: Values) -> float:
-    """Spearman's correlation, equal values sharing their mean rank; NaN where either is flat."""
-    if len(score) < 2:
-        return float("nan")
-    first, second = (scipy.stats.rankdata(values) - (len(values) + 1) / 2 for values in (score, gain))
-    spread = float(np.sqrt((first**2).sum() * (second**2).sum()))
-    return float((first * second).sum() / spread) if spread > 0 else float("nan")
-
-
 @dataclass(frozen=True)
 class Controls:
     """Confusion counts of each placement at one share of the seats (mode ``frame``)."""

@@ -150,24 +150,9 @@ def content_key(path: Path) -> str:
         raise _unreadable(path, error) from error
 
 
-def seal_weights(path: Path) -> bool:
-    """Give a file of an earlier version the hashes that it lacks, in place; False where it has them and they fit.
-
-    Raises WeightsError as ``load_weights``, or where the disk refuses.
-    """
-    described = describe_weights(path)
-    weights = _read(path, described)
-    if not described.sealed:
-        save_weights(weights, path)
-    return not described.sealed
-
-
 def unsealed_note(path: Path) -> str:
     """What to say of weights without hashes."""
-    return (
-        f"{path.name} was made before weights had hashes: damage to its numbers cannot be told; to add them now:"
-        f" spectralzoom seal {path}"
-    )
+    return f"{path.name} was made before weights had hashes: damage to its numbers cannot be told; train them anew"
 
 
 def load_weights(path: Path) -> Weights:

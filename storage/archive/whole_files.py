@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from pipeline.errors import ArchiveError, visible
@@ -43,21 +42,6 @@ def make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError) as error:
         raise ArchiveError(f"{folder} is or lies below a file, expected a folder; choose another --out") from error
-
-
-def new_file(folder: Path, stem: str, suffix: str) -> Path:
-    """Take a name that nothing in ``folder`` has: ``stem``, or ``stem-2`` and so on; an empty file keeps it.
-
-    Raises ArchiveError: the folder is or lies below a file, or the disk refuses.
-    """
-    with refusals(folder, "export to"):
-        make_folder(folder)
-        for number in itertools.count(1):
-            path = folder / f"{stem}{f'-{number}' if number > 1 else ''}{suffix}"
-            with suppress(FileExistsError):
-                path.touch(exist_ok=False)
-                return path
-    raise AssertionError("numbers do not end")
 
 
 def write_whole(path: Path, content: str) -> None:

@@ -146,11 +146,6 @@ def class_flags(names: Sequence[str], colours: NDArray[np.uint8]) -> dict[str, A
     }
 
 
-def load_class_names(path: Path) -> ClassNames:
-    """Read what the classes of a map are called, and their colours. Raises IncompleteStoreError where there is none."""
-    return legend_of(open_group(path))
-
-
 def legend_of(group: zarr.Group) -> ClassNames:
     """The classes that a group's attributes name."""
     attributes: dict[str, Any] = dict(group.attrs)

@@ -198,7 +198,7 @@ def test_frames_of_one_class_are_told_when_weights_are_judged(made: Path, weight
     """An evaluation asks whether the value of that class stands for none."""
     candidates, choices = open_candidates((weights,)), {"labels": None, "bands": None, "wavelengths": None}
     data = open_frames(str(made / "soil"), (), None, LineCamera(), choices)
-    jobs = sort_frames(EvaluateRequest(str(made / "soil"), (weights,)), data, candidates, [], lambda *words: None)
+    jobs = sort_frames(EvaluateRequest(str(made / "soil"), (weights,)), data, candidates, lambda *words: None)
     assert alike_notes(jobs.alike)[0].startswith("all labels are class_0 in 001, 002; if its value")
 
 

@@ -12,8 +12,7 @@ import pytest
 import shapely
 from PIL import Image
 
-from flows.archive.field_figures import figure_lines
-from flows.archive.plan_command import plan_content
+from flows.archive.plan_command import figure_lines, plan_content
 from flows.cli.main import main
 from flows.settings.load import load_settings
 from tests.conftest import Survey

@@ -29,7 +29,7 @@ from flows.settings.load import load_settings
 from pipeline.errors import SettingsError, WavelengthError
 from pipeline.ground.map_grid import grid_of_map, ground_grid, image_at
 from pipeline.ground.view import GroundView, RigPose
-from pipeline.planning.orientation import CropRows
+from pipeline.products.crop_rows import CropRows
 from pipeline.products.indices import find_index
 from storage.archive.archive import Archive
 from storage.export.image_files import cog_problems

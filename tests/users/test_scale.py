@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from flows.publish.receipt_words import sentences
+from flows.publish.receipt_table import finding_rows
 from flows.settings.load import load_settings
 from flows.tasks.zones import place_of_field
 from pipeline.geometry.camera import LineCamera
@@ -50,7 +50,7 @@ def test_a_receipt_says_no_metres_where_nobody_knows(surveyed_png: Survey, tmp_p
     receipt = surveyed_png(tmp_path / "archive").receipt
     assert receipt["field"]["ground_pixel_m"] is None
     assert receipt["field"]["size_px"] == [128, 96]
-    assert "The field is 0.775 x 0.581 degrees of the view." in sentences(receipt)
+    assert dict(finding_rows(receipt))["field"] == "0.775 x 0.581 degrees of the view"
 
 
 def test_words_are_those_of_the_figures() -> None:
@@ -62,5 +62,5 @@ def test_words_are_those_of_the_figures() -> None:
         "hectares": 1.887,
         "hectares_per_hour": 1.887 / 24.5 * 3600,
     }
-    (said,) = sentences({"field": field})
+    ((_, said),) = finding_rows({"field": field})
     assert "860 m away in the middle: 1.89 ha at 12 cm a pixel, 277 ha an hour of the camera (13 s a hectare)" in said

@@ -7,7 +7,6 @@ reads it as one region however large it is.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from flows.tasks.run import SurveyRun
 from flows.tasks.stage import Product, Wanted, stage
 from flows.tasks.stages.effects import source_with
-from flows.tasks.stages.maps import glance_at, patch_columns
+from flows.tasks.stages.maps import glance_at
 from flows.tasks.stages.placement import load_registration
 from models.evaluation.metrics import (
     agreement,
@@ -30,15 +29,11 @@ from models.evaluation.metrics import (
     iou_per_class,
     kappa,
 )
-from models.evaluation.placement import CONTROL_SHARE, Controls, run_controls
-from models.policies.policies import score_seats
-from models.reading.inference import CoarseLook, Glance, glance_of_columns, segment
+from models.evaluation.placement import CONTROL_SHARE, run_controls
+from models.reading.inference import Glance, segment
 from models.weights.files import Weights
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
 from pipeline.geometry.scan import Sweep
-from pipeline.planning.fine_pass import price_of_seats
-from pipeline.planning.prices import count_lines
-from pipeline.planning.selection import frame_seats
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.region import read_seats
 from pipeline.simulator.effects.pointing import CommonOffset, PointingErrors
@@ -51,10 +46,10 @@ from storage.arrays.mosaics import open_patches
 from storage.rasters.raster_work import RasterPixels, patches_of
 
 RECORD = "accuracy.json"
-ACCURACY = Product("evaluate", version=9, files=(RECORD,), by_weights=True)
+ACCURACY = Product("evaluate", version=10, files=(RECORD,), by_weights=True)
 
 
-@stage("evaluate", "accuracy (not part of the survey)", ACCURACY, unit="operations of a glance", size="surveys")
+@stage("evaluate", "accuracy (not part of the survey)", ACCURACY)
 def evaluate(run: SurveyRun, mosaic: StageRef, patches: StageRef, class_map: StageRef, *captures: StageRef) -> Wanted:
     """Judge the map by the labels, and other placements, with the survey's effects; no part of the survey's cost.
 
@@ -151,8 +146,7 @@ def _controls(
         "all": figures,
         "gap_closed": gap_closed(result["miou"], result["none"]["miou"], figures["miou"]),
         "controls": controls.as_dict(),
-        "controls_mode": _controls_mode(run, seen, controls),
-        "segment_wall_s": _segment_seconds(run, seen, patches, columns),
+        "controls_share": controls.share,
     }
 
 
@@ -178,64 +172,14 @@ def _control_share(run: SurveyRun, patches: StageRef) -> float:
     return len(open_patches(patches.path / "patches.zarr").seats) / len(run.budget.seats)
 
 
-def _controls_mode(run: SurveyRun, seen: Glance, controls: Controls) -> dict[str, Any]:
-    """What the controls' seats are, and what those of most gain would cost the rig: seats are not lines."""
-    grid, share, shares = run.grid, run.grid.valid_share().ravel(), run.zones.shares
-    seats = frame_seats(score_seats("gain", seen), controls.share, (share if shares is None else shares) > 0).seats
-    fine = share[seats].sum() * grid.patch**2  # samples beside the scene do not count
-    mode = {
-        "mode": "frame",
-        "share_of_seats": controls.share,
-        "seats": controls.seats,
-        "share_of_samples": (fine + np.prod(grid.coarse_shape)) / (grid.height * grid.width),
-    }
-    if run.plan.plain:  # whose lines are those of every placement
-        return mode
-    price = price_of_seats(grid, run.camera, run.settings.cost, run.plan.along, seats)
-    coarse_lines, full_lines = count_lines(run.plan.coarse), count_lines(run.plan.full)
-    return mode | {
-        "share_of_lines": (coarse_lines + price.lines) / full_lines,
-        "share_of_seconds": (run.plan.coarse_s + price.seconds) / run.plan.full_s,
-    }
-
-
-def _segment_seconds(run: SurveyRun, seen: Glance, patches: StageRef, columns: NDArray[np.float32]) -> dict[str, float]:
-    """Wall time of the model from spectral columns to the map, the better of two each [s].
-
-    As captured: glance, scores where some are chosen, and map. With every seat there is nothing to choose: the map
-    alone.
-    """
-    (seats, own), settings = patch_columns(run, patches, seen), run.settings
-    valid = run.grid.valid_seats()
-    every, bare = columns[valid], CoarseLook(seen.grid, seen.columns, living=seen.living)  # to be read anew
-    network = None if run.vgg is None else run.vgg.saliency(run.weights)
-
-    def look_choose_draw() -> None:
-        looked = glance_of_columns(run.weights, seen.columns, run.grid)
-        if run.chooses:
-            score_seats(settings.policy, looked, seed=settings.seed, mask=run.mask, network=network)
-        segment(run.weights, looked, own, seats)
-
-    return {
-        "done": min(_seconds(look_choose_draw) for _ in range(2)),
-        "full": min(_seconds(lambda: segment(run.weights, bare, every, valid)) for _ in range(2)),
-    }
-
-
-def _seconds(work: Callable[[], object]) -> float:
-    start = time.perf_counter()
-    work()
-    return time.perf_counter() - start
-
-
 def _figures(run: SurveyRun, counts: NDArray[np.int64]) -> dict[str, Any]:
-    """What is said of a map; every map of a run is judged by the same labels, and so over the same classes."""
+    """Return what is said of a map; every map of a run is judged by the same labels, so over the same classes."""
     names = run.weights.class_names
     known = len(names)
     false = zip(names, false_pixels(counts)[:known].tolist(), strict=True)
     unknown = {} if len(counts) == known else {"unknown_px": int(counts[:, known].sum())}
     return {
-        **agreement(counts, known),
+        **agreement(counts),
         "average_accuracy": average_accuracy(counts),
         "kappa": kappa(counts),
         "pixels": int(counts.sum()),

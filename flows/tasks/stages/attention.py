@@ -1,4 +1,4 @@
-"""The stages of attention: a score for every seat, the sweeps that show most of it, and the other way to lay lines."""
+"""The stages of attention: a score for every seat, and the sweeps that show most of it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,16 +24,15 @@ from pipeline.geometry.scan import Sweep, exposing
 from pipeline.planning.area_cover import seats_shown
 from pipeline.planning.coverage import field_px
 from pipeline.planning.fine_pass import FinePlan, plan_fine
-from pipeline.planning.orientation import compare_orientations, find_rows
 from pipeline.planning.plain_scans import scan_words
 from storage.archive.keys import StageRef, array_digest
 from storage.archive.manifests import read_table, write_table
-from storage.arrays.mosaics import Attention, load_attention, mosaic_brightness, write_attention
+from storage.arrays.mosaics import Attention, write_attention
 
 ATTENTION = Product("attend", version=7, files=("attention.zarr", "plan.json"), by_weights=True)
 
 
-@stage("attend", "attention and plan", ATTENTION, unit="pixels")
+@stage("attend", "attention and plan", ATTENTION)
 def attend(run: SurveyRun, mosaic: StageRef) -> Wanted:
     """Score every seat by the coarse mosaic, and plan the sweeps that show the most score in the time left."""
     settings = run.settings
@@ -190,43 +188,3 @@ def load_plan(attention: StageRef) -> FinePlan:
     plan = read_table(attention.path / "plan.json")
     kept = {"sweeps": [Sweep(**sweep) for sweep in plan["sweeps"]], "seats": np.array(plan["seats"], np.intp)}
     return FinePlan(**(plan | kept))
-
-
-FILE = "orientation.json"
-TURNED = Product("turned", version=1, files=(FILE,))
-
-
-@stage("compare_turned", "the plan with lines along the other axis", TURNED, unit="pixels")
-def compare_turned(run: SurveyRun, mosaic: StageRef, attention: StageRef) -> Wanted:
-    """Plan the scores with lines along the other axis, and find which way crop rows run."""
-    settings = run.settings
-
-    def build(path: Path) -> None:
-        """Write what the plan would be with turned lines, and the sentence that tells of it."""
-        scores = load_attention(attention.path / "attention.zarr").score.ravel()
-        if run.plan.plain:  # whose seats are chosen free of lines
-            scores = np.zeros_like(scores)
-        rows = find_rows(mosaic_brightness(mosaic.path / "mosaic.zarr"))
-        turned = compare_orientations(
-            run.grid,
-            replace(run.camera, bits=8),  # seconds and seats alone, and no sample is summed
-            settings.cost,
-            run.plan.along,
-            scores,
-            budget_s=run.plan.fine_s,
-            plan=load_plan(attention),
-            rows=rows,
-            overlap_px=run.plan.overlap_px,
-            margin_px=run.plan.margin_px,
-            threshold=settings.threshold,
-            coarse_exposure_ms=settings.coarse_exposure_ms,
-            shown=None if settings.pointing_px else run.zones.shown,
-        )
-        write_table(path / FILE, asdict(turned) | {"sentence": turned.sentence})
-
-    return Wanted(build, {}, [mosaic, attention])  # all it depends on are parameters of attention
-
-
-def load_orientation(turned: StageRef) -> dict[str, Any]:
-    """Read what the other orientation of the line would have shown, and which way crop rows run."""
-    return read_table(turned.path / FILE)

@@ -7,16 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flows.settings.values import LOOK_WHOLE
 from flows.tasks.drawing import Drawing, UnknownRule, draw_field
 from flows.tasks.field_memory import FieldMemory, memory_lies, whole_pixels
-from flows.tasks.field_work import FieldWork, look_at, region_params, seat_columns
+from flows.tasks.field_work import FieldWork, look_at, region_params
 from flows.tasks.memory import MEMORY
 from flows.tasks.run import SurveyRun
 from flows.tasks.stage import Product, Wanted, stage
-from models.reading.inference import CoarseLook, Glance, read_glance
+from models.reading.inference import Glance, read_glance
 from models.reading.regions import whole_field
 from models.reading.remembered import MemoryAgreement, changed_shares
 from pipeline.geometry.grid import UNLABELLED
@@ -36,7 +35,6 @@ from storage.arrays.class_maps import (
     write_changes,
 )
 from storage.arrays.layout import NO_CLASS, blank_pixels
-from storage.arrays.mosaics import open_patches
 
 CLASS_MAP = Product("segment", version=9, files=("class_map.zarr", "belief.zarr"), by_weights=True)
 STRANGE = "strange.json"  # beside a map, where values were no readings
@@ -44,7 +42,7 @@ LEFT_OUT = "left_out.npy"  # beside a map while it is drawn: the pixels of which
 MOST_TURN_PX = 12.0  # that a field's corners may lie off by, as it is turned, so that its memory is of use
 
 
-@stage("draw_map", "class map", CLASS_MAP, unit="operations of the map", size="pixels")
+@stage("draw_map", "class map", CLASS_MAP)
 def draw_map(run: SurveyRun, mosaic: StageRef, patches: StageRef) -> Wanted:
     """Draw the class map from coarse and fine patches, region by region; no class where the scene has no value."""
 
@@ -172,9 +170,3 @@ def strange_pixels(class_map: StageRef) -> dict[str, int]:
 def glance_at(run: SurveyRun, mosaic: StageRef) -> Glance:
     """What the model says of a stored coarse mosaic alone, the whole field at once: for those that hold it anyway."""
     return read_glance(run.weights, look_at(run.weights, mosaic.path / "mosaic.zarr", whole_field(run.grid)))
-
-
-def patch_columns(run: SurveyRun, patches: StageRef, seen: CoarseLook) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Seats of the whole field and their normalised spectral columns, (seat, p, p, column); see ``seat_columns``."""
-    store = open_patches(patches.path / "patches.zarr")
-    return seat_columns(run.weights, store, run.scene.wavelength_nm, seen, whole_field(run.grid))

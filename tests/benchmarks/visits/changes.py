@@ -23,7 +23,7 @@ from visits.farm_visits import (
     shipped,
 )
 
-from flows.publish.change_pictures import CHANGED_SHARE
+from flows.archive.history import CHANGED_SHARE
 from models.reading.remembered import Remembered, changed_from, changed_shares, first_belief
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.scene import RasterScene, SceneRaster

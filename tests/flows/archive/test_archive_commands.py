@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from flows.archive import tables as archive_tables
+from flows.archive import commands as archive_tables
 from flows.archive.commands import command, contents, explain, gc, ls, run_verify
 from flows.settings.load import load_settings
 from flows.terminal.figures import DASH
@@ -58,7 +58,7 @@ def test_ls_shows_runs_and_stores(two_budgets: Path, capsys: pytest.CaptureFixtu
     out = capsys.readouterr().out
     assert first["id"] in out
     assert content["stages"]["rectify"][0]["key"] in out
-    assert "2 runs, 16 stores" in out
+    assert "2 runs, 14 stores" in out
     ls(two_budgets)
     out = capsys.readouterr().out
     assert max(map(len, out.splitlines())) <= 80
@@ -158,7 +158,7 @@ def test_captures_and_runs_are_explained(two_budgets: Path, capsys: pytest.Captu
     assert runs == [f"runs/{earlier['id']}"]
     (first, _) = (run["id"] for run in contents(Archive.open(two_budgets))["runs"])
     content = _json(capsys, lambda: explain(two_budgets, first, as_json=True))
-    assert [tree["stage"] for tree in content["lineage"]] == ["evaluate", "turned"]
+    assert [tree["stage"] for tree in content["lineage"]] == ["evaluate"]
     assert "--budget 0.8" in content["run"]["command"]
     explain(two_budgets, first)
     out = capsys.readouterr().out
@@ -194,7 +194,7 @@ def test_gc_keeps_what_surveys_name(archive: Path, capsys: pytest.CaptureFixture
     shutil.rmtree(Archive.open(archive).runs()[0])
     assert _json(capsys, lambda: gc(archive, as_json=True))["removals"] == []
     planned = _json(capsys, lambda: gc(archive, keep_days=0, dry_run=True, as_json=True))
-    assert len(planned["removals"]) == 6
+    assert len(planned["removals"]) == 5
     done = _json(capsys, lambda: gc(archive, keep_days=0, as_json=True))
     assert done["removals"] == planned["removals"]
     assert done["bytes"] == sum(one["size"] for one in done["removals"]) > 10_000
@@ -219,7 +219,7 @@ def test_verify_repairs_by_surveying_again(archive: Path, capsys: pytest.Capture
     (coarse,) = set(ages) - {uri.rpartition("/")[2] for uri in content["repair"]["remade"]}
     assert ages[coarse] == max(ages.values())
     assert run_verify(archive, QUIET) == DONE
-    assert "20 of 20 stores and runs are as published" in capsys.readouterr().out
+    assert "18 of 18 stores and runs are as published" in capsys.readouterr().out
 
 
 def test_verify_says_what_it_could_not_repair(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import shutil
 from pathlib import Path
@@ -12,8 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from flows.archive.compare_command import _classes, _confidence, _pair_of, compare, find_run
-from flows.publish.change_pictures import OTHER, SAME, MapPair, change_rgb, draw_difference, thin_changes
+from flows.archive.compare_command import _by_one_list, _comparison, compare, find_run
+from flows.publish.panels import draw_difference
 from pipeline.errors import ArchiveError, SceneError, SettingsError, ShapeError
 from pipeline.geometry.grid import UNLABELLED
 from storage.archive.archive import Archive
@@ -46,12 +45,9 @@ def _map(classes: np.ndarray[Any, Any], names: tuple[str, ...], seed: int = 0) -
 def test_a_run_is_the_same_as_itself(two_budgets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Every class agrees wholly; the picture lies beside the archive, which is left as it is."""
     content = _compared(capsys, two_budgets, "latest", "latest", tmp_path)
-    assert content["differing"] == {"pixels": 0, "share": 0.0, "pairs": 0}
-    assert (content["settings"], content["versions"], content["largest"]) == ([], [], [])
+    assert content["differing"] == {"pixels": 0, "share": 0.0}
+    assert (content["settings"], content["made"], content["largest"]) == ([], [], [])
     assert {row["iou"] for row in content["classes"]} == {1.0}
-    assert content["confidence"]["change"] == 0
-    assert compare(two_budgets, "latest", "latest", out=tmp_path) == 0
-    assert "settings and versions are the same" in capsys.readouterr().out
     old, new = (path.name for path in Archive.open(two_budgets).runs())
     before = sorted(two_budgets.rglob("*"))
     content = _compared(capsys, two_budgets, old, f"runs/{new}")
@@ -75,7 +71,7 @@ def test_two_budgets_are_told_apart_either_way(
         assert picture.width > 3 * 400
     compare(two_budgets, "previous", "latest", out=tmp_path)
     out = capsys.readouterr().out
-    for words in ("budget", "time of capture", "IoU of A and B", "confidence", "compare-"):
+    for words in ("budget", "time at the camera", "IoU of A and B", "stage.attend", "compare-"):
         assert words in out
     one, other = (
         _compared(capsys, two_budgets, *runs, tmp_path) for runs in (("previous", "latest"), ("latest", "previous"))
@@ -92,15 +88,17 @@ def test_two_budgets_are_told_apart_either_way(
 def test_new_weights_and_hectares_are_told(
     survey_png: Survey, make_weights: WeightsMaker, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Weights by their content, and hectares where both runs have a map on the ground."""
+    """Keys of the stages that read them, and hectares where both runs have a map on the ground."""
     small = {"pose": POSE, "map": {"resolution_m": 0.02}}
     for names in (("class_0", "class_1", "class_2"), ("class_1", "class_0", "class_2", "more")):
         survey_png(tmp_path / "archive", weights=str(make_weights(names=names)), **small)
     content = _compared(capsys, tmp_path / "archive", "previous", "latest", tmp_path)
-    assert "weights" in {row["name"] for row in content["versions"]}
+    made = {row["name"] for row in content["made"]}
+    assert "stage.draw_map" in made
+    assert "stage.rectify" not in made
     assert sum(row["ha"][1] for row in content["classes"]) > 0
     compare(tmp_path / "archive", "previous", "latest", out=tmp_path)
-    assert "ha in B" in capsys.readouterr().out
+    assert " m²" in capsys.readouterr().out
 
 
 def test_runs_of_different_fields_are_refused(survey_png: Survey, scene_files: Path, tmp_path: Path) -> None:
@@ -171,72 +169,34 @@ def test_classes_are_matched_by_name() -> None:
     classes[0, 0] = UNLABELLED
     order = np.full(256, UNLABELLED, np.uint8)
     order[:3] = (2, 0, 1)
-    pair = _pair_of([_map(classes, ("a", "b", "c")), _map(order[classes], ("b", "c", "a", "d"), seed=1)])
-    assert pair.maps.names == ("a", "b", "c", "d")
-    np.testing.assert_array_equal(pair.maps.colours[:3], _map(classes, ("a", "b", "c")).colours)
-    np.testing.assert_array_equal(pair.maps.old, pair.maps.new)
-    assert not pair.maps.pairs
-    assert np.trace(pair.joint) == classes.size
+    old, new = _by_one_list([_map(classes, ("a", "b", "c")), _map(order[classes], ("b", "c", "a", "d"), seed=1)])
+    assert old.names == new.names == ("a", "b", "c", "d")
+    np.testing.assert_array_equal(old.colours[:3], _map(classes, ("a", "b", "c")).colours)
+    np.testing.assert_array_equal(old.classes, new.classes)
     with pytest.raises(ShapeError, match=r"\(4, 4\) and \(4, 5\)"):
-        _pair_of([_map(np.zeros((4, width)), ("a",)) for width in (4, 5)])
+        _by_one_list([_map(np.zeros((4, width)), ("a",)) for width in (4, 5)])
 
 
 def test_hectares_are_told_where_both_runs_have_them() -> None:
-    """One map on the ground alone has nothing beside it."""
-    pair = _pair_of([_map(np.zeros((2, 2)), ("a",)) for _ in range(2)])
+    """One map on the ground alone has nothing beside it; pixels are counted class by class."""
+    alike = _by_one_list([_map(np.zeros((2, 2)), ("a",)) for _ in range(2)])
     posed, bare = (
         Run(Path("x"), {}, receipt, None, frozenset()) for receipt in ({"ground": {"areas_ha": {"a": 2.5}}}, {})
     )
-    assert ["ha" in row for runs in ((posed, bare), (bare, posed), (bare, bare)) for row in _classes(runs, pair)] == [
-        False
-    ] * 3
-    half = _pair_of([_map(np.zeros((2, 2)), ("a", "b")), _map(np.eye(2), ("a", "b"))])
-    assert [(row["name"], row["pixels"]) for row in _classes((bare, bare), half)] == [("a", [4, 2]), ("b", [0, 2])]
-    (row,) = _classes((posed, posed), pair)
+    for runs in ((posed, bare), (bare, posed), (bare, bare)):
+        assert not any("ha" in row for row in _comparison(runs, alike)["classes"])
+    half = _by_one_list([_map(np.zeros((2, 2)), ("a", "b")), _map(np.eye(2), ("a", "b"))])
+    found = _comparison((bare, bare), half)
+    assert [(row["name"], row["pixels"]) for row in found["classes"]] == [("a", [4, 2]), ("b", [0, 2])]
+    assert found["largest"] == [{"from": "a", "to": "b", "pixels": 2, "share": 0.5}]
+    (row,) = _comparison((posed, posed), alike)["classes"]
     assert (row["ha"], row["pixels"], row["iou"]) == ([2.5, 2.5], [4, 4], 1.0)
 
 
-def test_confidence_is_compared_where_both_have_a_class() -> None:
-    """Means, change from A to B, and the share that rose; none where there is nothing to compare."""
-    old, new = (np.array(values, np.float32) for values in ([0.5, 0.5, np.nan, 0.5, 0.9], [0.75, 0.5, 1, np.nan, 0.95]))
-    found = _confidence(old, new)
-    assert found["a"] == pytest.approx(1.9 / 3)
-    assert found["b"] == pytest.approx(2.2 / 3)
-    assert found["change"] == pytest.approx(0.1)
-    assert found["rose"] == pytest.approx(2 / 3)
-    assert set(_confidence(old[2:3], new[2:3]).values()) == {None}
-
-
-def test_changes_have_colours_of_their_own() -> None:
-    """The largest pairs each, the rest dark, what is the same light; maps of any shape and name are drawn."""
-    rng = np.random.default_rng(1)
-    names = tuple("abcdef")
-    old, new = (rng.integers(0, 6, (40, 50)).astype(np.uint8) for _ in range(2))
-    new[:2] = UNLABELLED
-    maps = _pair_of([_map(old, names), _map(new, names)]).maps
-    assert [count for *_, count in maps.pairs] == sorted((count for *_, count in maps.pairs), reverse=True)
-    picture = change_rgb(maps)
-    assert len(np.unique(picture.reshape(-1, 3), axis=0)) == 12
-    np.testing.assert_array_equal((picture == np.float32(SAME)).all(axis=-1), old == new)
-    assert (picture == np.float32(OTHER)).all(axis=-1).any()
-    assert (maps.name(0), maps.name(UNLABELLED)) == ("a", "no class")
-    for shape in ((1, 90), (300, 8)):
-        zero = np.zeros(shape, np.uint8)
-        drawn = draw_difference(MapPair(zero, zero, ("a $x$_b",), np.zeros((1, 3), np.uint8), []), ("A", "B", "none"))
-        with Image.open(io.BytesIO(drawn)) as picture:
-            assert picture.format == "PNG"
-
-
-@pytest.mark.parametrize(("step", "shape"), [(1, (6, 9)), (3, (2, 3)), (4, (2, 3)), (20, (1, 1))])
-def test_no_change_is_left_out_of_a_thinned_picture(step: int, shape: tuple[int, int]) -> None:
-    """A block shows a change where it holds any, with both of its classes, and else its first pixel."""
-    old = np.arange(54, dtype=np.uint8).reshape(6, 9) % 5
-    new = old.copy()
-    new[4, 8] = 7
-    maps = thin_changes(MapPair(old, new, tuple("abcdefgh"), np.zeros((8, 3), np.uint8), [(4, 7, 1)]), step)
-    assert maps.old.shape == maps.new.shape == shape
-    (place,) = np.argwhere(maps.old != maps.new)
-    assert tuple(place) == (4 // step, 8 // step)
-    assert (maps.old[tuple(place)], maps.new[tuple(place)]) == (old[4, 8], 7)
-    if step == 3:
-        np.testing.assert_array_equal(maps.old[0], old[0, ::3])
+@pytest.mark.parametrize("shape", [(1, 90), (300, 8), (20, 2600)])
+def test_maps_of_any_shape_and_name_are_drawn(shape: tuple[int, int], tmp_path: Path) -> None:
+    """Also those that are thinned, and class names that look like formulas."""
+    maps = [_map(np.zeros(shape), ("a $x$_b",)) for _ in range(2)]
+    draw_difference(tmp_path / "a.png", maps, ("A", "B $y$", "0 % differ"))
+    with Image.open(tmp_path / "a.png") as picture:
+        assert picture.format == "PNG"

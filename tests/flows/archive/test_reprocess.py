@@ -20,8 +20,7 @@ from flows.archive.commands import run_verify
 from flows.archive.reprocess_command import ReprocessRequest, _survey, run_reprocess
 from flows.settings.survey_settings import Settings
 from flows.terminal.processes import DONE, FAILED, PARTLY
-from models.weights.files import content_key
-from pipeline.errors import ArchiveError, SettingsError, WeightsError
+from pipeline.errors import SettingsError, WeightsError
 from pipeline.simulator.scenes.farm.farm_plan import CLASSES
 from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue
@@ -99,7 +98,6 @@ def test_nothing_has_changed_in_fields_however_they_are_chosen(surveyed: Path, r
     for wishes, words in (
         ({"field": "none"}, r"--field none.*turned, scene"),
         ({"since": "spring"}, "--since expects a date"),
-        ({"stage": "wish"}, "--stage wish.*segment"),
         ({"weights": Path("nowhere.safetensors")}, "there is no such file"),
     ):
         with pytest.raises(SettingsError, match=words):
@@ -125,8 +123,8 @@ def test_new_weights_make_a_generation_beside_the_old(archive: Path, other: Path
     assert run_verify(archive, QUIET) == DONE
 
 
-def test_an_interrupted_run_goes_on(archive: Path, other: Path, reprocess: Reprocess, tmp_path: Path) -> None:
-    """What was done is known from the summary, and is not done again."""
+def test_an_interrupted_run_goes_on(archive: Path, other: Path, reprocess: Reprocess) -> None:
+    """What was done is in the archive, and is not done again."""
     done: list[Path] = []
 
     def interrupted(settings: Settings, console: Console) -> Path:
@@ -135,33 +133,22 @@ def test_an_interrupted_run_goes_on(archive: Path, other: Path, reprocess: Repro
         done.append(_survey(settings, console))
         return done[0]
 
-    request = ReprocessRequest(archive, weights=other, out=tmp_path / "told")
+    request = ReprocessRequest(archive, weights=other)
     with pytest.raises(KeyboardInterrupt):
         run_reprocess(request, QUIET, survey=interrupted)
-    (file,) = (tmp_path / "told").iterdir()
-    assert [row["new"] for row in json.loads(file.read_text())["fields"]] == [done[0].name]
     assert reprocess.states(archive, weights=other) == [("scene", "ran"), ("turned", "skipped")]
 
 
 def test_a_newer_stage_is_run_for_those_that_rest_on_an_older(
-    archive: Path, reprocess: Reprocess, monkeypatch: pytest.MonkeyPatch, surveyed: Path
+    archive: Path, reprocess: Reprocess, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A raised version makes it and what follows anew, and `--stage` finds the fields; light is not captured again."""
-    assert reprocess(archive, stage="segment") == []
+    """A raised version makes it and what follows anew; light is not captured again."""
     light = _captures(archive)
     be_version(monkeypatch, "segment", 99)
-    assert reprocess(archive, stage="rectify") == []
-    assert reprocess.states(archive, stage="draw_map", dry_run=True) == [
-        ("turned", "would run"),
-        ("scene", "would run"),
-    ]
-    assert reprocess.states(archive, stage="segment", field="turned") == [("turned", "ran")]
-    assert _captures(archive) == light
+    assert reprocess.states(archive, dry_run=True) == [("turned", "would run"), ("scene", "would run")]
+    assert reprocess.states(archive, field="turned") == [("turned", "ran")]
     assert reprocess.states(archive) == [("scene", "ran"), ("turned", "skipped")]
     assert _captures(archive) == light
-    be_version(monkeypatch, "rectify", 99)
-    assert len(reprocess(surveyed, stage="segment", dry_run=True)) == 2
-    assert reprocess(surveyed, stage="capture_coarse", dry_run=True) == []
 
 
 def test_one_field_fails_and_the_others_are_done(archive: Path, other: Path, reprocess: Reprocess) -> None:
@@ -225,48 +212,7 @@ def test_a_dry_run_leaves_everything(surveyed: Path, other: Path, capsys: pytest
     out = capsys.readouterr().out
     assert "2 fields: 2 would run" in out
     assert "reprocess 1 of 2: turned" in told.getvalue()
-    assert list(surveyed.parent.glob("reprocess-*")) == []
     assert sorted(path for path in surveyed.rglob("*") if ".locks" not in path.parts) == before
-
-
-def test_the_summary_tells_what_was_asked_and_what_became_of_it(
-    archive: Path, other: Path, tmp_path: Path, reprocess: Reprocess
-) -> None:
-    """Beside the archive, there before the first field is begun, and never in another's place."""
-
-    def read(settings: Settings, console: Console) -> Path:
-        told = json.loads(next(tmp_path.glob("reprocess-*.json")).read_text())
-        seen.append((told["finished"], [row["state"] for row in told["fields"]]))
-        raise WeightsError("no")
-
-    seen: list[Any] = []
-    reprocess(archive, FAILED, survey=read, weights=other, field="*n*")
-    assert seen == [(None, []), (None, ["failed"])]
-    (file,) = tmp_path.glob("reprocess-*.json")
-    told = json.loads(file.read_text())
-    assert told["finished"] >= told["started"]
-    assert (told["archive"], told["dry_run"]) == (str(archive), False)
-    asked = told["asked"]
-    assert (asked["field"], asked["since"], asked["stage"], asked["failed"]) == ("*n*", None, None, False)
-    assert asked["weights"] == str(other)
-    assert asked["weights_key"] == content_key(other)
-    for _ in range(3):
-        assert len(reprocess(archive, out=tmp_path / "told")) == 2
-    assert len(list((tmp_path / "told").iterdir())) == 3
-    assert {row["state"] for row in reprocess(archive)} == {"skipped"}  # nothing to tell, and nobody asked for a file
-    assert list(tmp_path.glob("reprocess-*.json")) == [file]
-
-
-def test_a_place_that_cannot_hold_the_summary_is_refused_first(
-    archive: Path, other: Path, tmp_path: Path, reprocess: Reprocess
-) -> None:
-    """Before anything is surveyed."""
-    (tmp_path / "mine").write_text("mine")
-    with pytest.raises(SettingsError, match="lies in the archive, where nothing else belongs"):
-        run_reprocess(ReprocessRequest(archive, weights=other, out=archive / "runs"), QUIET)
-    request = ReprocessRequest(archive, weights=other, out=tmp_path / "mine")
-    with pytest.raises(ArchiveError, match="expected a folder; choose another --out"):
-        run_reprocess(request, QUIET, survey=lambda settings, console: pytest.fail("surveyed"))
 
 
 def test_a_run_is_current_only_where_all_of_it_is_there(archive: Path) -> None:

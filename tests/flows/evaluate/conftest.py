@@ -16,8 +16,8 @@ Judged = tuple[EvaluateRequest, dict[str, Any]]
 
 @pytest.fixture(scope="package")
 def judged(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Judged:
-    """What was asked for, and an evaluation of two seeds, one frame of which is timed."""
+    """What was asked for, and an evaluation of two seeds with plans of lines."""
     folder = tmp_path_factory.mktemp("out")
     weights = tuple(write_weights(folder / f"w{seed}.safetensors", seed) for seed in (0, 1))
-    request = EvaluateRequest(str(data), weights, folder / "out", **{**QUICK, "timed_frames": 1})
+    request = EvaluateRequest(str(data), weights, folder / "out", **{**QUICK, "rig": True})
     return request, evaluate_weights(request)

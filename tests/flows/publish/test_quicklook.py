@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from flows.publish import quicklook
-from flows.publish.panels import class_palette, class_rgb, draw_scale, grey_of, outline
+from flows.publish.panels import class_palette, class_rgb, grey_of, outline
 from flows.publish.quicklook import QuicklookData, _draw_attention, _draw_raw, draw_quicklook
 from storage.arrays.quicklooks import choose_bands, stretch
 
@@ -153,17 +153,6 @@ def test_palette_colours_are_all_different(count):
     assert palette.max() <= 1
     given = np.array([[0, 255, 0]], np.uint8)
     np.testing.assert_array_equal(class_palette(1, given), [[0, 1, 0]])
-
-
-@pytest.mark.parametrize(("width", "length"), [(1, 1), (7, 1), (39, 5), (640, 100), (1280, 200), (2400, 500)])
-def test_scale_bar_is_a_round_number_of_at_most_a_quarter(width, length):
-    """The largest of 1, 2, 5 times a power of ten, one pixel at least."""
-    axes = Figure().subplots()
-    draw_scale(axes, (100, width), 0.1)
-    assert axes.patches[0].get_width() == length
-    assert axes.texts[0].get_text().startswith(f"{length} px = ")
-    draw_scale(axes, (100, width), None)
-    assert axes.texts[1].get_text() == f"{length} px"  # a raster has no view angles
 
 
 def test_sweeps_stand_apart_and_shorter_ones_are_filled_up():

@@ -7,14 +7,14 @@ import copy
 import io
 import json
 import re
+from dataclasses import asdict
 
 import numpy as np
 import pytest
 from rich.console import Console
 
-from flows.publish.receipt import COSTS, Header, Receipt, build_receipt, check_receipt, comparable
-from flows.publish.receipt_table import print_table
-from flows.publish.receipt_words import headline
+from flows.publish.receipt import COSTS, Receipt, build_receipt, check_receipt, comparable
+from flows.publish.receipt_table import finding_rows, headline, print_table
 from flows.publish.report import Picture, render_report
 from flows.settings.survey_settings import Settings
 from flows.terminal.figures import area_words
@@ -30,31 +30,27 @@ def make_receipt(*, wall: float = 1.5, labels: bool = True) -> Receipt:
     savings: dict[str, object] = {name: dict(saving) for name in reversed(COSTS)}
     savings["multiply_adds"] = {**saving, "glance": 20, "score": 1, "encode": 19, "decode": 10}
     savings["capture_s"] = {"done": 104.0, "full": 209.0, "ratio": 104 / 209, "full_is": "predicted"}
-    savings["segment_wall_s"] = {"done": wall / 2, "full": wall}
     accuracy = {  # the map shows wheat, of which the truth has none
         "miou": np.float32(0.75),
-        "miou_of_shown_classes": 0.5,
         "overall_accuracy": 0.934,
         "per_class_iou": {"soil": 0.9, "bare_weed": 0.6, "wheat": float("nan")},
         "false_classes": {"wheat": 2},
         "none": {
             "miou": 0.5,
-            "miou_of_shown_classes": 0.5,
             "overall_accuracy": 0.812,
             "per_class_iou": {"soil": 0.8, "bare_weed": 0.2, "wheat": None},
             "false_classes": {},
         },
         "all": {
             "miou": 0.875,
-            "miou_of_shown_classes": 0.875,
             "overall_accuracy": 0.971,
             "per_class_iou": {"soil": 0.95, "bare_weed": 0.8, "wheat": None},
             "false_classes": {},
         },
         "gap_closed": 2 / 3,
         "controls": {
-            "random": {"miou": 0.5625, "miou_of_shown_classes": 0.375, "overall_accuracy": 0.9, "spread": 0.0125},
-            "sobel": {"miou": 0.6, "miou_of_shown_classes": 0.6, "overall_accuracy": 0.91, "spread": None},
+            "random": {"miou": 0.5625, "overall_accuracy": 0.9, "spread": 0.0125},
+            "sobel": {"miou": 0.6, "overall_accuracy": 0.91, "spread": None},
         },
     }
     row = {
@@ -86,16 +82,22 @@ def make_receipt(*, wall: float = 1.5, labels: bool = True) -> Receipt:
         StageRecord("capture", "ab12", "ran", wall, wall, 10**9, 0, 10**8, f"{wall:064}"),  # a manifest holds times
         StageRecord("rectify", "cd34", "cached"),
     ]
-    header = Header(
-        "farm", "sim", "farm@1", 7, f"start {wall}", f"end {wall}", {"torch": "2.13.0"}, Settings().to_dict()
-    )
     return build_receipt(
-        header,
-        stages,
-        savings,
-        {"quicklook": f"runs/{wall}/quicklook.png"},
+        survey="farm",
+        source="sim",
+        scene="farm@1",
+        seed=7,
+        started=f"start {wall}",
+        finished=f"end {wall}",
+        versions={"torch": "2.13.0"},
+        settings=Settings().to_dict(),
+        stages=[asdict(one) for one in stages],
+        savings=savings,
+        products={"quicklook": f"runs/{wall}/quicklook.png"},
         accuracy=accuracy if labels else None,
-        simulation={"effects": [row], "total": total},
+        effects=[row],
+        effects_total=total,
+        zones={},
     )
 
 
@@ -118,7 +120,7 @@ def test_receipt_has_the_fields_of_the_design_and_reads_back():
         "effects_total",
         "products",
     ]
-    assert list(receipt["savings"]) == [*COSTS, "segment_wall_s"]
+    assert set(receipt["savings"]) == {*COSTS}
     assert "accuracy" not in make_receipt(labels=False)
     receipt = make_receipt()
     assert check_receipt(json.loads(to_json(receipt))) == receipt
@@ -135,12 +137,9 @@ def test_receipt_has_the_fields_of_the_design_and_reads_back():
         ("savings", "tokens"),
         ("savings", "lines", "full_is"),
         ("savings", "multiply_adds", "score"),
-        ("savings", "segment_wall_s", "full"),
         ("accuracy", "gap_closed"),
         ("accuracy", "none", "miou"),
         ("accuracy", "controls", "random", "spread"),
-        ("effects", 0, "why"),
-        ("effects_total", "saved_s"),
     ],
 )
 def test_missing_field_is_named(path):
@@ -155,15 +154,17 @@ def test_missing_field_is_named(path):
 
 
 def test_words_outside_the_design_are_refused():
-    """A stage has one of four states, a full figure one of two origins."""
-    broken: dict = copy.deepcopy(dict(make_receipt()))
-    broken["stages"][1]["state"] = "done"
-    with pytest.raises(ShapeError, match=r"stages\[1\]\.state must be one of ran.*got 'done'"):
-        check_receipt(broken)
-    broken = copy.deepcopy(dict(make_receipt()))
-    broken["savings"]["lines"]["full_is"] = "guessed"
-    with pytest.raises(ShapeError, match="measured or predicted"):
-        check_receipt(broken)
+    """A stage has one of four states, a full figure one of two origins; a judged map has its accuracy."""
+    for path, wrong in ((("stages", 1, "state"), "done"), (("savings", "lines", "full_is"), "guessed")):
+        broken: dict = copy.deepcopy(make_receipt())
+        part = broken
+        for name in path[:-1]:
+            part = part[name]
+        part[path[-1]] = wrong
+        with pytest.raises(ShapeError, match=rf"{path[-1]} is not of the design"):
+            check_receipt(broken)
+    with pytest.raises(ShapeError, match="accuracy and judged belong to a map that is judged"):
+        check_receipt({**make_receipt(labels=False), "accuracy_is": "judged"})
 
 
 def test_comparable_leaves_times_out_and_nothing_else():
@@ -180,10 +181,10 @@ def test_comparable_leaves_times_out_and_nothing_else():
     assert comparable(one) != comparable({**one, "seed": 8})
 
 
-def test_table_shows_savings_accuracy_and_stages_in_80_columns():
-    """Figures with their units, 'predicted', the controls, every stage; small areas in square metres."""
+def test_the_table_fits_80_columns():
+    """Figures with their units, beside everything; small areas in square metres."""
     text = _printed(make_receipt())
-    for words in ("104 s", "209 s", "50 %", "predicted", "75.0", "93.4", "± 1.2", "67 %", "capture", "cached"):
+    for words in ("104 s", "209 s", "50 %"):
         assert words in text, words
     assert max(map(len, _printed(make_receipt(), 80).splitlines())) <= 80
     assert [area_words(hectares) for hectares in (2.5, 0.1, 0.0999, 0.0012)] == ["2.5 ha", "0.1 ha", "999 m²", "12 m²"]
@@ -193,21 +194,6 @@ def _printed(receipt: Receipt, width: int = 100) -> str:
     console = Console(file=io.StringIO(), width=width)
     print_table(receipt, console)
     return console.file.getvalue()
-
-
-def test_table_shows_both_definitions_where_they_differ():
-    """With false classes and their pixels; where no map shows one there is no second column."""
-    text = _printed(make_receipt(), 200)
-    assert "mean over the 2 classes of the truth" in text
-    assert "Shown although the truth has none: this survey wheat 2 px." in text
-    (row,) = [line.split() for line in text.splitlines() if "this survey " in line and "75.0" in line]
-    assert row[-3:] == ["75.0", "93.4", "50.0"]
-    receipt = make_receipt()
-    accuracy = receipt["accuracy"]
-    for one in (accuracy, *accuracy["controls"].values()):
-        one["miou_of_shown_classes"] = one["miou"]
-    accuracy["false_classes"] = {}
-    assert "shown" not in _printed(receipt).lower()
 
 
 def test_headline_is_one_paragraph_with_the_figures():
@@ -262,7 +248,7 @@ def test_words_are_escaped():
 
 def test_page_has_the_figures():
     """Savings, accuracy, settings and versions; without a truth nothing of accuracy; dollar signs survive."""
-    page = render_report(make_receipt(), PNG, looked_twice=0.23)
+    page = render_report(make_receipt(), PNG, captured_again=0.23)
     figures = ("104 s", "predicted", "50 %", "75.0", "93.4", "56.2 ± 1.2", "67 %", "budget", "torch", "Class by class")
     for words in (*figures, "this survey wheat 2 px", "2 of 3 classes are in the truth"):
         assert words in page, words
@@ -274,22 +260,22 @@ def test_page_has_the_figures():
     assert "field $title" in page
 
 
-def test_seconds_stand_beside_the_cheapest_good_scan_and_beside_every_line_as_before():
-    """With a record both are told, on a line of the table each; without one the old comparison alone."""
+def test_seconds_stand_beside_the_cheapest_good_scan():
+    """With a scan performance table it is named."""
     receipt = make_receipt()
-    assert "at full exposure" not in _printed(receipt, 200)
-    receipt["savings"]["capture_s"] |= {
-        "done": 30.0,
-        "full": 40.0,
-        "ratio": 0.75,
-        "full_scan": "every line, 17 ms",
-        "every_line_s": 200.0,
+    receipt["savings"]["capture_s"] |= {"done": 30.0, "full": 40.0, "ratio": 0.75, "full_scan": "every line, 17 ms"}
+    words = "Capture took 30 s instead of 40 s for the cheapest scan that is nearly as good as any (every line, 17 ms)"
+    assert words in headline(receipt)
+
+
+def test_findings_are_rows_and_what_is_not_there_is_none():
+    """A receipt without findings has no row; those that are there have a label each."""
+    assert finding_rows(make_receipt()) == []
+    found = {
+        "zones": {"kept_px": 50, "field_px": 100, "no_go_px": 0, "kept_m2": 5e4},
+        "expected": {"miou": 0.8, "error": 0.02},
     }
-    text = headline(receipt)
-    assert "Capture took 30 s, 75 % of the 40 s of the cheapest scan that is nearly as good as any" in text
-    assert "(every line, 17 ms); every line of 100 ms, which savings were told against before, takes 200 s." in text
-    now, before = (
-        line.split() for line in _printed(receipt, 200).splitlines() if "30 s" in line and "predicted" in line
-    )
-    assert now[-3:-1] == ["75", "%"]
-    assert before[-3:-1] == ["15", "%"]
+    assert finding_rows(found) == [
+        ("expected score", "about 80.0 ± 2.0, with no label asked"),
+        ("zones", "50 px, 50 % of the field, 5 ha; of the rest no map is drawn"),
+    ]

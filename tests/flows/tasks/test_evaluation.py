@@ -1,4 +1,4 @@
-"""What a map scores: labels and controls where the map looks, and figures read from receipts of any age."""
+"""What a map scores: labels and controls where the map looks, and figures read from receipts."""
 
 from __future__ import annotations
 
@@ -10,13 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from flows.tasks.scores import definitions_differ, false_class_words, score_of, worst_class
+from flows.tasks.scores import false_class_words, score_of, worst_class
 from flows.tasks.stages import accuracy as evaluation
 from flows.tasks.stages import placement
-from models.evaluation.metrics import agreement, confusion, iou_per_class, mean_iou, miou_of_shown_classes
+from models.evaluation.metrics import confusion
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.rectify.registration.illumination import LightRatio
@@ -51,7 +49,6 @@ def test_a_false_class_is_listed_with_its_pixels() -> None:
     assert found["false_classes"] == {"tree": 1}
     assert found["per_class_iou"] == pytest.approx({"soil": 2 / 3, "crop": 1.0, "tree": np.nan}, nan_ok=True)
     assert found["miou"] == pytest.approx(5 / 6)
-    assert found["miou_of_shown_classes"] == pytest.approx(5 / 9)
 
 
 def _registration(archive: Path, record: dict[str, Any]) -> StageRef:
@@ -97,37 +94,8 @@ def test_corrections_are_found_and_read(monkeypatch: pytest.MonkeyPatch, tmp_pat
     assert other.gain is None
 
 
-NAMES = ("soil", "crop", "weed", "track")
-MAP = st.lists(st.integers(0, 3), min_size=24, max_size=24)
-
-
-def _before(truth: list[int], *maps: list[int]) -> tuple[dict[str, Any], float]:
-    """The accuracy of a receipt of before, of this map, none and all; and what this map scores now."""
-    found = []
-    for drawn in maps:
-        counts = confusion(np.array(truth), np.array(drawn), 4)
-        shown = counts.sum(axis=0) + counts.sum(axis=1) > 0
-        iou = np.where(shown, np.nan_to_num(iou_per_class(counts)), np.nan)
-        per_class = {name: None if np.isnan(one) else float(one) for name, one in zip(NAMES, iou, strict=True)}
-        found.append({"miou": miou_of_shown_classes(counts), "per_class_iou": per_class, "overall_accuracy": 0.5})
-    now = mean_iou(confusion(np.array(truth), np.array(maps[0]), 4))
-    return {**found[0], "none": found[1], "all": found[2]}, now
-
-
-@given(st.lists(st.integers(0, 2), min_size=24, max_size=24), MAP, MAP, MAP)
-def test_an_older_receipt_scores_as_it_would_now_or_not_at_all(
-    truth: list[int], this: list[int], none: list[int], every: list[int]
-):
-    """Its mean is taken over the classes of the truth, as far as its three maps tell which these are."""
-    accuracy, now = _before(truth, this, none, every)
-    found = score_of({"accuracy": accuracy})["miou"]
-    maps = [accuracy["per_class_iou"], accuracy["none"]["per_class_iou"], accuracy["all"]["per_class_iou"]]
-    unclear = any(all(one[name] == 0 for one in maps) for name in NAMES)
-    assert (found is None) if unclear else found == pytest.approx(now)
-
-
-def test_a_receipt_of_now_gives_its_own_figures():
-    """Both means; the worst class of the truth; and each map that shows a false class, with its pixels."""
+def test_a_receipt_gives_its_own_figures():
+    """Its score; the worst class of the truth; and each map that shows a false class, with its pixels."""
     assert score_of(make_receipt()) == {"miou": 0.75, "overall_accuracy": 0.934}
     accuracy: Any = copy.deepcopy(make_receipt()["accuracy"])
     assert worst_class(accuracy) == ("bare_weed", 0.2, 0.6, 0.8)
@@ -146,13 +114,3 @@ def test_what_was_not_judged_has_no_score(accuracy: object):
     """No labels, or a receipt that somebody has damaged."""
     assert score_of({"accuracy": accuracy}) == {"miou": None, "overall_accuracy": None}
     assert score_of({}) == {"miou": None, "overall_accuracy": None}
-
-
-@given(MAP, MAP)
-def test_definitions_differ_where_a_map_shows_a_false_class(truth: list[int], drawn: list[int]):
-    """And nowhere else, to the last bit; a receipt of before, which has one definition, has no other."""
-    counts = confusion(np.array(truth), np.array(drawn), 4)
-    figures = agreement(counts)
-    expected = figures["miou"] > 0 and not set(drawn) <= set(truth)
-    assert definitions_differ([figures]) == expected
-    assert not definitions_differ([{"miou": figures["miou"]}])

@@ -96,9 +96,9 @@ def test_receipt_and_page_say_what_was_looked_at(visits: tuple[Path, Any, Any]) 
     assert part.receipt["settings"]["look"] == look["lines"]
     assert look["expected_gain"] >= 0
     page = (part.folder / "report.html").read_text(encoding="utf-8")
-    assert f"Lines {look['lines']} were looked at" in page
+    assert f"lines {look['lines']}, " in page
     assert "a part of the field was scanned once: every" in part.receipt["plan"]["reason"]
-    assert "such a scan scores about" not in page  # the record tells of scans of all, which remember nothing
+    assert "this one: " not in page  # the record tells of scans of all, which remember nothing
     assert any(
         "where most is to be mended" in note and "is expected to be wrong" in note
         for note in part.receipt["settings"]["notes"]
@@ -145,7 +145,7 @@ def test_what_is_due_is_looked_at_first(visited: Path, visits: Any, survey_png: 
     notes = " ".join(part.receipt["settings"]["notes"])
     assert f"{look['due'] - look['due_left']} of the {look['due']} seats that were due are among them" in notes
     page = " ".join((part.folder / "report.html").read_text(encoding="utf-8").split())
-    assert f"{look['due_left']} of {look['due']} seats that were due had to wait" in page
+    assert f"{look['due_left']} of {look['due']} places that were due had to wait" in page
 
 
 def test_of_what_is_sure_enough_nothing_is_looked_at(

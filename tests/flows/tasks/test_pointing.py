@@ -12,21 +12,21 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from flows.publish.receipt_words import sentences
+from flows.publish.receipt_table import finding_rows
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings, parse_settings
 from flows.tasks.capture_plan import plan_capture
-from flows.tasks.stages.maps import patch_columns
+from flows.tasks.field_work import seat_columns
 from models.network.spectral import SpectralBasis
 from models.reading.inference import Glance
+from models.reading.regions import whole_field
 from pipeline.errors import SettingsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
 from pipeline.planning.coverage import coarse_sweeps, full_sweeps, reach_px
 from pipeline.simulator.effects.pointing import PointingErrors
-from storage.archive.keys import StageRef
 from storage.arrays.layout import open_group, read_array
-from storage.arrays.mosaics import PatchWriter
+from storage.arrays.mosaics import PatchWriter, open_patches
 from tests.flows.conftest import FEW_BANDS
 from tests.remembered_work import without_effects
 
@@ -72,14 +72,13 @@ def test_sweeps_are_put_right_by_seams_and_on_the_mosaic(surveyed: tuple[dict[st
 
 
 def test_what_the_mirror_missed_is_told_and_detail_still_helps(surveyed: tuple[dict[str, Any], Path]) -> None:
-    """Seats seen in part are counted, either pass has its sentence, and with patches the map is better than without."""
+    """Seats seen in part are counted, either pass has its row, and with patches the map is better than without."""
     receipt, archive = surveyed
     values = read_array(open_group(archive / receipt["products"]["patches"]), "values")
     partly = np.isnan(values).all(axis=3).any(axis=(1, 2))
     assert receipt["pointing"]["fine"]["partly_seen"] == np.count_nonzero(partly)
-    words = " ".join(sentences(surveyed[0]))
-    assert "The coarse sweeps were put right by up to" in words
-    assert "The fine sweeps were put right by up to" in words
+    rows = dict(finding_rows(surveyed[0]))
+    assert all("put right by up to" in rows[f"pointing, {name}"] for name in ("coarse", "fine"))
     accuracy = surveyed[0]["accuracy"]
     assert accuracy["miou"] > accuracy["none"]["miou"]
 
@@ -96,9 +95,9 @@ def test_unseen_pixels_take_the_coarse_look(tmp_path: Path) -> None:
     coarse = np.random.default_rng(1).normal(size=(*np.array(grid.padded_shape) // 2, 2)).astype(np.float32)
     writer = PatchWriter(tmp_path / "patches.zarr", seats, grid.seat_origin(seats), 4, np.array([500.0, 700.0]))
     writer.write(values, np.asarray(np.isfinite(values).all(axis=-1), np.bool_))
-    run = SimpleNamespace(grid=grid, weights=weights, scene=SimpleNamespace(wavelength_nm=np.array([500.0, 700.0])))
     seen = Glance(grid, coarse, np.empty(0, np.float32))
-    told, columns = patch_columns(run, StageRef("patches", "k", tmp_path), seen)  # type: ignore[arg-type]
+    store, nm = open_patches(tmp_path / "patches.zarr"), np.array([500.0, 700.0])
+    told, columns = seat_columns(weights, store, nm, seen, whole_field(grid))  # type: ignore[arg-type]
     assert told.tolist() == [1, 7]
     np.testing.assert_allclose(columns[1], values[2], rtol=1e-3)
     np.testing.assert_allclose(columns[0][:, 0], values[0][:, 0], rtol=1e-3)
@@ -120,29 +119,29 @@ def found_of(**told: Any) -> dict[str, Any]:
 
 
 TOLD: dict[str, tuple[dict[str, Any], str]] = {
-    "one sweep": ({}, "The coarse pass is one sweep, which has no seam to be put right by."),
+    "one sweep": ({}, "one sweep, which has no seam to be put right by"),
     "put right": (
         {"sweeps": {"a": [0, 0], "b": [3, -4]}, "residual_rms_px": 0.123},
-        "The coarse sweeps were put right by up to 5.0 px; 0.12 px rms are left at the seams.",
+        "put right by up to 5.0 px; 0.12 px rms are left at the seams",
     ),
-    "nothing left": ({"sweeps": {"a": [0, 0], "b": [3, -4]}}, "The coarse sweeps were put right by up to 5.0 px."),
+    "nothing left": ({"sweeps": {"a": [0, 0], "b": [3, -4]}}, "put right by up to 5.0 px"),
     "none found": (
         {"held": "the mosaic", "sweeps": {"b": [0, 0]}, "not_found": ["b"]},
-        "Nothing could be told of b: left where the mirror reported.",
+        "b left where the mirror reported: nothing was found",
     ),
     "partly seen": (
         {"sweeps": {"a": [0, 0], "b": [3, -4]}, "too_narrow": [{}], "partly_seen": 7},
-        "The coarse sweeps were put right by up to 5.0 px. 1 overlaps were too narrow to compare. 7 chosen places were "
-        "not seen whole; what is missing of them is mapped by the coarse look.",
+        "put right by up to 5.0 px; 1 overlap too narrow to compare; 7 chosen places not seen whole, mapped there by "
+        "the coarse look",
     ),
 }
 
 
 @pytest.mark.parametrize("case", TOLD)
-def test_every_finding_has_its_sentence(case: str) -> None:
+def test_every_finding_has_its_words(case: str) -> None:
     """One sweep, corrections, residuals, what could not be told and what was missed are each said once."""
     told, words = TOLD[case]
-    assert sentences(found_of(**told)) == [words]
+    assert finding_rows(found_of(**told)) == [("pointing, coarse", words)]
 
 
 GRID = SceneGrid(300, 1500, 16, 4)
@@ -179,4 +178,4 @@ def test_a_mirror_that_is_believed_costs_nothing() -> None:
     assert plan.coarse == coarse_sweeps(GRID, settings.camera, plan.along)
     with pytest.raises(SettingsError, match=r"^--pointing-px 192: .* overlap by 640 px .* give less than 192$"):
         plan_capture(parse_settings({"pointing_px": 192.0}), GRID)
-    assert sentences(found_of(held="the mosaic", sweeps={})) == []
+    assert finding_rows(found_of(held="the mosaic", sweeps={})) == []

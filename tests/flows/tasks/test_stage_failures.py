@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import shutil
 import tempfile
 import time
@@ -165,7 +164,7 @@ def test_a_stage_that_fails_is_one_message(stage: str, walk: Walk) -> None:
 def test_the_survey_goes_on_as_if_nothing_had_been(walk: Walk) -> None:
     """Each store was begun three times, twice to fail; the run at last reads all but the last, and draws the map."""
     assert walk.builds == dict.fromkeys(walk.keys, 3)
-    assert {name for name, state in walk.last.items() if state == "ran"} == {"compare_turned", "evaluate"}
+    assert {name for name, state in walk.last.items() if state == "ran"} == {"draw_map", "evaluate"}
     np.testing.assert_array_equal(class_map(walk.out), class_map(walk.undisturbed))
     archive = Archive.open(walk.out)
     assert {ref.key for ref in archive.refs()} == set(walk.keys.values())
@@ -271,7 +270,7 @@ def test_a_served_field_of_which_a_stage_fails(
 def test_a_reprocessing_of_which_a_stage_fails(
     server: str, walk: Walk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It ends Failed and says where the reason stands; the next one makes what was missing, and completes."""
+    """It ends Failed and says why; the next one makes what was missing, and completes."""
     from flows.archive.reprocess_flow import reprocess
 
     out = Path(shutil.copytree(walk.undisturbed, tmp_path / "archive"))
@@ -283,9 +282,8 @@ def test_a_reprocessing_of_which_a_stage_fails(
         state = reprocess(archive=str(out), return_state=True)
     run, _ = newest_run("reprocess", 0)
     assert (state.is_failed(), run.name, run.state.message) == (True, f"reprocess-{out}", state.message)
-    assert "no field could be reprocessed; reprocess-TIME.json beside the archive says why" in state.message
-    (summary,) = tmp_path.glob("reprocess-*.json")
-    assert [row["message"] for row in json.loads(summary.read_text())["fields"]] == [FULL_DISK]
+    assert "no field could be reprocessed: scene: " in state.message
+    assert FULL_DISK in state.message
     assert archive.find("segment", missing.key) is None
     state = reprocess(archive=str(out), return_state=True)
     assert (state.is_completed(), problems(out)) == (True, [])

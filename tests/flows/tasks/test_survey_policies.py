@@ -13,7 +13,7 @@ import torch
 from rich.console import Console
 
 from flows.publish.receipt import check_receipt
-from flows.publish.receipt_words import sentences
+from flows.publish.receipt_table import finding_rows
 from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings, parse_settings
@@ -134,7 +134,7 @@ def test_a_threshold_leaves_seconds_and_says_so(
     assert plan["spared_s"] > 0
     assert plan["spared_share"] == pytest.approx(plan["spared_s"] / receipt["savings"]["capture_s"]["full"])
     assert plan["spared_score"] > 0
-    assert "unspent: no further run of lines pays" in " ".join(sentences(receipt))
+    assert "unspent: no further run of lines pays" in dict(finding_rows(receipt))["plan"]
     assert "threshold" not in without[0].receipt["plan"]
     receipt: Any = without[0].receipt
     key = next(stage["key"] for stage in receipt["stages"] if stage["name"] == "attend")
@@ -150,7 +150,7 @@ def test_a_threshold_above_all_gains_draws_the_coarse_map(survey_png: Survey, tm
     """Nothing pays: no fine line, and the map is that of the coarse look alone."""
     done = survey_png(tmp_path, threshold="1e6", **FLAGS)
     receipt: Any = done.receipt
-    assert done.looked_twice == 0
+    assert done.captured_again == 0
     assert receipt["plan"]["lines"] == 0
     assert receipt["accuracy"]["miou"] == receipt["accuracy"]["none"]["miou"]
 

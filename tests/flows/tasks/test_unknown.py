@@ -17,7 +17,7 @@ import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flows.publish.receipt_words import sentences
+from flows.publish.receipt_table import finding_rows
 from flows.settings.load import load_settings
 from flows.settings.values import parse_unknown
 from flows.tasks.beyond_training import beyond_training
@@ -133,7 +133,7 @@ def test_a_map_of_nothing_known_is_published_and_says_what_to_do(
     receipt: Any = published.receipt
     assert receipt["unknown"]["share"] == 1
     assert receipt["accuracy"]["miou"] == 0
-    words = " ".join(sentences(receipt))
+    words = dict(finding_rows(receipt))["unknown"]
     assert "100 % of the map is unknown" in words
     assert "These weights do not know this field: train" in words
     assert "--unknown off" in (published.folder / "report.html").read_text(encoding="utf-8")

@@ -1,37 +1,25 @@
-"""Confusion counts, what lies near borders, and what follows from both."""
+"""Confusion counts, and what follows from them."""
 
 from __future__ import annotations
-
-import random
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 
 from models.evaluation.metrics import (
     agreement,
     average_accuracy,
-    boundary_counts,
-    boundary_iou,
-    boundary_px,
     calibration_error,
     confidence_counts,
     confusion,
     false_pixels,
-    frequency_weighted_iou,
     gap_closed,
     iou_per_class,
     kappa,
     labelled_classes,
-    mean_boundary_iou,
     mean_iou,
     mean_iou_of_each,
-    miou_of_shown_classes,
-    miou_over_frame_classes,
-    miou_over_frames,
-    near_border,
     overall_accuracy,
 )
 from pipeline.errors import ShapeError
@@ -61,7 +49,7 @@ def test_names_of_classes_do_not_matter(pairs: list[tuple[int, int]], names: lis
     renamed = np.append(names, [255] * 252).astype(np.uint8)
     before, after = confusion(labels, drawn, 4), confusion(renamed[labels], renamed[drawn], 4)
     assert iou_per_class(after)[names] == pytest.approx(iou_per_class(before), nan_ok=True)
-    for mean in (mean_iou, miou_of_shown_classes, overall_accuracy, average_accuracy, kappa):
+    for mean in (mean_iou, overall_accuracy, average_accuracy, kappa):
         assert mean(after) == pytest.approx(mean(before), nan_ok=True)
 
 
@@ -95,13 +83,11 @@ def test_agreement_by_chance_has_no_kappa():
 
 
 def test_a_class_shown_where_the_labels_have_none_is_false():
-    """It has no IoU and its pixels are told; they lower the class they were taken from, and the old mean by a 0."""
+    """It has no IoU and its pixels are told; they lower the class they were taken from."""
     counts = confusion(np.array([0, 0, 0, 1]), np.array([0, 0, 2, 1]), 3)
     assert iou_per_class(counts) == pytest.approx([2 / 3, 1, np.nan], nan_ok=True)
     assert false_pixels(counts).tolist() == [0, 0, 1]
-    assert agreement(counts) == pytest.approx(
-        {"miou": (2 / 3 + 1) / 2, "miou_of_shown_classes": (2 / 3 + 1 + 0) / 3, "overall_accuracy": 3 / 4}
-    )
+    assert agreement(counts) == pytest.approx({"miou": (2 / 3 + 1) / 2, "overall_accuracy": 3 / 4})
 
 
 LABELLED = st.lists(st.tuples(st.integers(0, 2), st.integers(0, 4)), min_size=1, max_size=60)  # classes 3, 4: false
@@ -141,19 +127,6 @@ def test_one_false_class_is_as_bad_as_another(pairs: list[tuple[int, int]], old:
     wrong = (drawn == old) & (drawn != labels) & ~np.isin(drawn, labels)
     before, after = (confusion(labels, shown, 5) for shown in (drawn, np.where(wrong, new, drawn)))
     assert mean_iou(after) == mean_iou(before)
-
-
-@given(PAIRS)
-def test_both_definitions_agree_without_a_false_class(pairs: list[tuple[int, int]]):
-    """Bit for bit where every class shown is one of the labels; else the old one is below, or both are 0."""
-    counts = confusion(*_maps(pairs), 4)
-    new, old = mean_iou(counts), miou_of_shown_classes(counts)
-    if not counts.any():
-        assert np.isnan([new, old]).all()
-    elif false_pixels(counts).any():
-        assert old < new or old == new == 0
-    else:
-        assert old == new
 
 
 @given(st.lists(PAIRS, min_size=1, max_size=4))
@@ -196,113 +169,6 @@ def test_a_gap_of_less_than_a_point_is_not_closed():
     assert gap_closed(0.8, 0.5, 0.7) == pytest.approx(1.5)
     assert gap_closed(0.505, 0.5, 0.509) is None
     assert gap_closed(0.5, float("nan"), 0.7) is None
-
-
-def test_means_over_frames_by_hand():
-    """A class in one frame alone counts as much as the other in `miou_c`, by its pixels' IoU in `miou`."""
-    large, small = np.array([[8, 0], [0, 0]]), np.array([[2, 2], [1, 1]])
-    frames = np.stack([large, small, np.zeros((2, 2), np.int64)])
-    alone = (2 / 5 + 1 / 4) / 2
-    assert miou_over_frames(frames) == pytest.approx((1 + alone) / 2)
-    assert miou_over_frame_classes(frames) == pytest.approx(((1 + 2 / 5) / 2 + 1 / 4) / 2)
-    assert frequency_weighted_iou(large + small) == pytest.approx((12 * 10 / 13 + 2 * 1 / 4) / 14)
-
-
-@given(st.lists(PAIRS, min_size=1, max_size=4), st.randoms(use_true_random=False))
-def test_the_order_of_frames_does_not_matter(frames: list[list[tuple[int, int]]], order: random.Random):
-    """Means over frames are the same in any order, 1 for perfect maps, and NaN where nothing is labelled."""
-    counts = np.stack([confusion(*_maps(frame), 4) for frame in frames])
-    moved = np.stack(order.sample(list(counts), len(counts)))
-    for mean in (miou_over_frames, miou_over_frame_classes):
-        assert mean(moved) == pytest.approx(mean(counts), nan_ok=True)
-        perfect = mean(np.stack([np.diag(one.sum(axis=1)) for one in counts]))
-        assert perfect == 1 if counts.any() else np.isnan(perfect)
-
-
-MAPS = arrays(np.uint8, (7, 9), elements=st.sampled_from([0, 1, 2, 255]))
-
-
-@given(MAPS, st.integers(1, 4))
-def test_the_border_is_within_its_width(region: np.ndarray, width: int):
-    """A pixel is kept exactly when a pixel outside the region, or the edge, is within the width (chessboard)."""
-    inside = region == 1
-    framed = np.pad(inside, width)
-    slow = [
-        [inside[y, x] and not framed[y : y + 2 * width + 1, x : x + 2 * width + 1].all() for x in range(9)]
-        for y in range(7)
-    ]
-    assert near_border(inside, width).tolist() == slow
-
-
-@given(MAPS)
-def test_a_perfect_map_agrees_at_every_border(labels: np.ndarray):
-    """The IoU of a class with itself is 1; a class that is not there has none."""
-    present = np.array([(labels == number).any() for number in range(3)])
-    iou = boundary_iou(boundary_counts(labels, np.where(labels == 255, 0, labels), 3), present)
-    assert (iou[present] == 1).all()
-    assert np.isnan(iou[~present]).all()
-
-
-def test_boundaries_by_hand():
-    """A block of 4 x 4 moved by one column: rings of 12 px, 6 px in both, 18 in either."""
-    labels, drawn = np.zeros((10, 10), np.uint8), np.zeros((10, 10), np.uint8)
-    labels[3:7, 3:7], drawn[3:7, 4:8] = 1, 1
-    counts = boundary_counts(labels, drawn, 2, width=1)
-    assert counts[1].tolist() == [6, 18]
-    assert boundary_iou(counts, counts[:, 1] > 0)[1] == pytest.approx(1 / 3)
-
-
-def test_only_borders_count():
-    """A hole deep inside is missed with a narrow boundary where the plain IoU sees it."""
-    labels = np.ones((21, 21), np.uint8)
-    drawn = labels.copy()
-    drawn[10, 10] = 0
-    counts = boundary_counts(labels, drawn, 2, width=2)
-    ring = 21**2 - 17**2
-    assert counts[1].tolist() == [ring, ring + 24]  # the hole has a border of its own, 5 x 5 less itself
-
-
-def test_unlabelled_pixels_do_not_count():
-    """What the map says where no label is has no part in it."""
-    labels = np.full((6, 6), 255, np.uint8)
-    labels[:3] = 1
-    drawn = np.where(labels == 255, 2, 1).astype(np.uint8)
-    counts = boundary_counts(labels, drawn, 3, width=1)
-    assert counts[0].tolist() == counts[2].tolist() == [0, 0]
-    assert boundary_iou(counts, counts[:, 1] > 0)[1] == 1
-
-
-def test_no_class_has_no_mean():
-    """Nothing labelled: NaN, neither 0 nor 1."""
-    empty = np.full((4, 4), 255, np.uint8)
-    assert np.isnan(mean_boundary_iou(boundary_counts(empty, np.zeros((4, 4), np.uint8), 2), np.zeros(2, bool)))
-
-
-@given(MAPS, MAPS, st.integers(1, 3))
-def test_a_false_class_adds_nothing_to_the_mean(labels: np.ndarray, drawn: np.ndarray, width: int):
-    """The mean is over the classes that the labels have: showing class 3, which they never have, is only a miss."""
-    known = np.minimum(drawn, 2)
-    labelled = labelled_classes(confusion(labels, known, 4))
-    means = [
-        mean_boundary_iou(boundary_counts(labels, np.where(known == 2, number, known), 4, width), labelled)
-        for number in (2, 3)
-    ]
-    if (labels == 2).any():
-        assert means[1] <= means[0] + 1e-12
-    else:
-        assert means[1] == pytest.approx(means[0], nan_ok=True)
-
-
-@pytest.mark.parametrize(("shape", "width"), [((3, 4), 1), ((300, 400), 10), ((966, 1296), 32)])
-def test_the_width_follows_the_diagonal(shape: tuple[int, int], width: int):
-    """Two percent of the diagonal, a pixel at least."""
-    assert boundary_px(shape) == width
-
-
-def test_maps_of_other_sizes_are_refused():
-    """The message names both sizes."""
-    with pytest.raises(ShapeError, match=r"labels are \(2, 3\), the class map is \(3, 2\)"):
-        boundary_counts(np.zeros((2, 3), int), np.zeros((3, 2), int), 2)
 
 
 def test_calibration_error_is_how_far_confidence_lies_beside_what_is_right():

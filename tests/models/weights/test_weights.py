@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import struct
 from dataclasses import replace
@@ -20,12 +19,10 @@ from models.weights.files import (
     UNSEALED,
     Weights,
     check_two_scale,
-    content_key,
     describe_weights,
     load_any_weights,
     load_weights,
     save_weights,
-    seal_weights,
     with_record,
 )
 from models.weights.sealed_files import SEAL, TENSORS
@@ -263,32 +260,6 @@ def test_a_header_of_petabytes_is_refused_unread(saved: Path):
     saved.write_bytes(len(text).to_bytes(8, "little") + text + bytes(64))
     with pytest.raises(WeightsError, match="not a readable safetensors file"):
         load_weights(saved)
-
-
-def test_weights_of_an_earlier_version_are_sealed_in_place(saved: Path):
-    """They load, say that they have no hashes, and have them after sealing, under the same key; then damage is told."""
-    written = saved.read_bytes()
-    _rewritten(saved, _about(saved))
-    key = content_key(saved)
-    assert key == hashlib.sha256(saved.read_bytes()).hexdigest()[:20]  # as before there were hashes
-    assert not describe_weights(saved).sealed
-    load_weights(saved)
-    assert seal_weights(saved)
-    assert saved.read_bytes() == written
-    assert content_key(saved) == key
-    assert describe_weights(saved).sealed
-    assert not seal_weights(saved)
-
-
-def test_what_is_damaged_is_not_sealed(saved: Path):
-    """A file of an earlier version with a NaN stays as it is."""
-    tensors = load_file(saved)
-    tensors["fine_classes.bias"][0] = float("nan")
-    _rewritten(saved, _about(saved), tensors)
-    before = saved.read_bytes()
-    with pytest.raises(WeightsError, match="not finite"):
-        seal_weights(saved)
-    assert saved.read_bytes() == before
 
 
 @pytest.mark.parametrize("preset", [preset for preset in PRESETS if preset != "two-scale"])

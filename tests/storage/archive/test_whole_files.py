@@ -11,7 +11,7 @@ import pytest
 
 from pipeline.errors import ArchiveError
 from storage.archive import whole_files
-from storage.archive.whole_files import new_file, remove_leftovers, write_whole, written_aside
+from storage.archive.whole_files import remove_leftovers, write_whole, written_aside
 
 
 def _files(folder: Path) -> dict[str, str]:
@@ -95,16 +95,9 @@ def test_a_file_where_the_folder_should_be_is_refused(tmp_path: Path) -> None:
     (tmp_path / "mine").write_text("mine")
     here = Path(os.path.relpath(tmp_path / "mine"))
     for folder in (tmp_path / "mine", tmp_path / "mine" / "below", here):
-        for write in (lambda: write_whole(folder / "x", ""), lambda: new_file(folder, "x", "")):  # noqa: B023
-            with pytest.raises(ArchiveError, match="is or lies below a file, expected a folder; choose another --out"):
-                write()
+        with pytest.raises(ArchiveError, match="is or lies below a file, expected a folder; choose another --out"):
+            write_whole(folder / "x", "")
     assert (tmp_path / "mine").read_text() == "mine"
-
-
-def test_names_are_taken_once(tmp_path: Path) -> None:
-    """The second asker gets the next number."""
-    made = [new_file(tmp_path / "out", "told", ".json").name for _ in range(3)]
-    assert made == ["told.json", "told-2.json", "told-3.json"]
 
 
 def test_leftovers_of_killed_writers_go_and_nothing_else(tmp_path: Path) -> None:

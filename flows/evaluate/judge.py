@@ -1,0 +1,338 @@
+"""One frame judged by one set of weights, and the figures of many: means over seeds, intervals over frames and seeds.
+
+A record holds plain lists and numbers: counts of labels and map by every policy at each share of the patches and by
+plans of lines, which add up over frames, and what each map costs. Weights of frames left out in turn have no frame in
+common: together they are one seed of the training, judged on all of their frames. Weights that share a frame are
+different seeds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.evaluate.frames import COST, Look
+from models.evaluation.metrics import (
+    average_accuracy,
+    confusion,
+    false_pixels,
+    gap_closed,
+    iou_per_class,
+    kappa,
+    mean_iou,
+    overall_accuracy,
+    paired_interval,
+)
+from models.evaluation.placement import RANDOM_DRAWS, captured_gain, gain_sums, oracle_gain
+from models.network.sizes import multiply_adds
+from models.policies.policies import score_multiply_adds, score_seats
+from models.reading.inference import segment
+from models.weights.files import Weights
+from pipeline.errors import BudgetError, PoseError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.scan import Axis
+from pipeline.planning.coverage import cheapest_full, coarse_sweeps
+from pipeline.planning.fine_pass import plan_fine, price_of_seats
+from pipeline.planning.line_blocks import WIDTHS, line_blocks, most_shown
+from pipeline.planning.prices import BYTES_PER_SAMPLE, check_budget, count_lines
+from pipeline.planning.selection import frame_seats
+
+ORACLE = "oracle"
+ENDS = ("none", "all")  # no patch, every patch
+BUDGETS = (0.35, 0.4, 0.5, 0.65, 0.8)  # of the full scan's seconds, coarse pass included
+PLANNED = ("gain", "entropy")
+UNIFORM, RANDOM = "uniform lines", "random lines"
+Record = dict[str, Any]
+Seats = NDArray[np.intp]
+Spend = Callable[[float], tuple[Seats, float, int]]  # seconds of the fine pass -> patches, seconds, lines
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Shares of the patches and policies to try on every frame; no patch, every patch and the oracle are always there.
+
+    The oracle chooses by the labels.
+    """
+
+    shares: tuple[float, ...]  # of the valid patches, above 0 and below 1
+    policies: tuple[str, ...]
+    seed: int = 0
+    rig: bool = True  # also plans of lines at equal seconds
+
+
+def judge_frame(trial: Trial, look: Look, weights: Weights, camera: LineCamera) -> Record:
+    """Judge the map of every row, with its costs."""
+    grid = look.seen.grid
+    gain = oracle_gain(weights, look.seen, look.fine, look.labels)
+    seconds = _seconds_of_patches(look, camera)
+    rows = []
+    for policy, draw, share, seats in _placed(trial, look, gain):
+        samples = float(np.prod(grid.coarse_shape)) + float(grid.valid_share().ravel()[seats].sum() * grid.patch**2)
+        scored = 0 if policy in (*ENDS, ORACLE) else score_multiply_adds(policy, weights.config, grid)
+        bought, best = gain_sums(gain, seats, grid.valid_seats())
+        row = {
+            **{"policy": policy, "draw": draw, "share": share, "seats": len(seats), "gain": bought, "best_gain": best},
+            **{"counts": _counts(look, weights, seats), "samples": samples},
+            "bytes": samples * look.bands * BYTES_PER_SAMPLE,
+            "multiply_adds": multiply_adds(weights.config, grid, len(seats), look.bands, score=scored).total,
+        }
+        rows.append(row | seconds(policy, seats))
+    plans = _judged_plans(trial, look, weights, camera) if trial.rig else []
+    return {"frame": look.name, "shape": [grid.height, grid.width], "rows": rows, "plans": plans}
+
+
+def _placed(trial: Trial, look: Look, gain: NDArray[np.float64]) -> Iterator[tuple[str, int, float, Seats]]:
+    """Give (policy, draw, share, patches) of each row; chance is drawn several times."""
+    allowed = look.seen.grid.valid_share().ravel() > 0
+    yield "none", 0, 0.0, np.empty(0, np.intp)
+    yield "all", 0, 1.0, np.flatnonzero(allowed)
+    for policy in (*trial.policies, ORACLE):
+        for draw in range(RANDOM_DRAWS if policy == "random" else 1):
+            seed = trial.seed + 1000 * (draw + 1)
+            scores = gain if policy == ORACLE else score_seats(policy, look.seen, seed=seed)
+            for share in trial.shares:
+                yield policy, draw, share, frame_seats(scores, share, allowed).seats
+
+
+def _counts(look: Look, weights: Weights, seats: Seats) -> list[list[int]]:
+    drawn = segment(weights, look.seen, look.fine[seats], seats).classes
+    counts: list[list[int]] = confusion(look.labels, drawn, weights.config.classes).tolist()
+    return counts
+
+
+def _seconds_of_patches(look: Look, camera: LineCamera) -> Callable[[str, Seats], Record]:
+    """Price patches by the cost model: coarse pass and runs of lines, or the full scan where that is cheaper.
+
+    All patches are the full scan alone. None of each figure where the field is beyond the mirror's range.
+    """
+    grid = look.seen.grid
+    try:
+        along, _, full_s = cheapest_full(grid, camera, COST)
+        coarse_s = COST.seconds(coarse_sweeps(grid, camera, along), camera)
+    except PoseError:
+        return lambda policy, seats: {"capture_s": None, "full_s": None}
+
+    def priced(policy: str, seats: Seats) -> Record:
+        seconds = full_s if policy == "all" else coarse_s
+        if policy != "all" and len(seats):
+            seconds += price_of_seats(grid, camera, COST, along, seats).least[1]
+        return {"capture_s": seconds, "full_s": full_s}
+
+    return priced
+
+
+def _judged_plans(trial: Trial, look: Look, weights: Weights, camera: LineCamera) -> list[Record]:
+    """Judge plans of lines at each budget that pays; none where the field is beyond the mirror's range."""
+    grid, rows = look.seen.grid, []
+    try:
+        along, full, full_s = cheapest_full(grid, camera, COST)
+        coarse = coarse_sweeps(grid, camera, along)
+    except PoseError:
+        return []
+    coarse_s = COST.seconds(coarse, camera)
+    spends = _plans(look, camera, along, trial.seed)
+    for budget in BUDGETS:
+        try:
+            fine_s = check_budget(budget, coarse_s, full_s)
+        except BudgetError:
+            continue
+        for plan, draw, spend in spends:
+            seats, seconds, lines = spend(fine_s)
+            row = {"policy": plan, "draw": draw, "share": budget, "seats": len(seats)}
+            row |= {"capture_s": coarse_s + seconds, "full_s": full_s}
+            row |= {"lines": count_lines(coarse) + lines, "full_lines": count_lines(full)}
+            rows.append(row | {"counts": _counts(look, weights, seats)})
+    return rows
+
+
+def _plans(look: Look, camera: LineCamera, along: Axis, seed: int) -> list[tuple[str, int, Spend]]:
+    """Give our plans and two without a model: lines that lie evenly, and lines by chance, several times."""
+    grid = look.seen.grid
+    options = [line_blocks(grid, camera, COST, along, rows) for rows in WIDTHS]
+
+    def ours(policy: str) -> Spend:
+        scores = score_seats(policy, look.seen, seed=seed)
+
+        def spend(seconds: float) -> tuple[Seats, float, int]:
+            plan = plan_fine(grid, camera, COST, along, scores, budget_s=seconds)
+            return plan.seats, plan.seconds, plan.lines
+
+        return spend
+
+    def without_a_model(draw: int | None) -> Spend:
+        """Give what shows the most of lines that lie evenly, or by chance where a draw is numbered."""
+
+        def spend(seconds: float) -> tuple[Seats, float, int]:
+            if draw is None:
+                lines = most_shown(options, lambda blocks: blocks.evenly(seconds))
+            else:
+                seeds = [seed, 0xB10C, draw]
+                lines = most_shown(options, lambda blocks: blocks.at_random(seconds, np.random.default_rng(seeds)))
+            return lines.seats, COST.seconds(lines.sweeps, camera), count_lines(lines.sweeps)
+
+        return spend
+
+    found = [(policy, 0, ours(policy)) for policy in PLANNED]
+    found.append((UNIFORM, 0, without_a_model(None)))
+    return [*found, *((RANDOM, draw, without_a_model(draw)) for draw in range(RANDOM_DRAWS))]
+
+
+Runs = Sequence[Sequence[Record]]  # of each weights, or of each seed, the records of its frames
+COSTS = ("seats", "samples", "bytes", "multiply_adds", "capture_s", "full_s", "lines", "full_lines")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One policy at one share over all frames; a run is one seed with one draw. Zeros where a run has no frame."""
+
+    policy: str
+    share: float
+    counts: NDArray[np.int64]  # (run, frame, class, class)
+    of_seed: NDArray[np.intp]  # (run,)
+    parts: list[Record]  # rows of the records
+
+    def over_runs(self, figure: Callable[[Any], Any]) -> NDArray[np.float64]:
+        """A figure of each run's frames together, (run,) or (run, class)."""
+        return np.array([figure(run.sum(axis=0)) for run in self.counts])
+
+    @property
+    def judged(self) -> NDArray[np.bool_]:
+        """Frames that any run has, (frame,)."""
+        found: NDArray[np.bool_] = self.counts.sum(axis=(0, 2, 3)) > 0
+        return found
+
+
+def seeds_of(runs: Runs) -> list[list[int]]:
+    """Numbers of the weights of each seed: those with no frame in common, in the order given; without a frame none."""
+    seeds: list[tuple[set[str], list[int]]] = []
+    for number, records in enumerate(runs):
+        names = {record["frame"] for record in records}
+        if not names:
+            continue
+        for covered, members in seeds:
+            if not covered & names:
+                covered |= names
+                members.append(number)
+                break
+        else:
+            seeds.append((set(names), [number]))
+    return [members for _, members in seeds]
+
+
+def collect_row(seeds: Runs, policy: str, share: float, kind: str = "rows") -> Row | None:
+    """Gather the counts of one row, or of one of the ``plans``, from the records of all seeds; None without any."""
+    order = sorted({record["frame"] for records in seeds for record in records})
+    found = [
+        (number, order.index(record["frame"]), row)
+        for number, records in enumerate(seeds)
+        for record in records
+        for row in record[kind]
+        if (row["policy"], row["share"]) == (policy, share)
+    ]
+    if not found:
+        return None
+    draws = 1 + max(row["draw"] for _, _, row in found)
+    classes = len(found[0][2]["counts"])
+    counts = np.zeros((len(seeds) * draws, len(order), classes, classes), np.int64)
+    for number, at, row in found:
+        counts[number * draws + row["draw"], at] = row["counts"]
+    return Row(policy, share, counts, np.repeat(np.arange(len(seeds)), draws), [row for _, _, row in found])
+
+
+def difference(row: Row, other: Row | None, trial: Trial, draws: int) -> Record | None:
+    """Paired interval of one row less another, over the frames that both have; None without another."""
+    if other is None or other is row:
+        return None
+    both = row.judged & other.judged
+    if not both.any():
+        return {"difference": None, "low": None, "high": None, "frames": 0}
+    counts, seeds = (row.counts[:, both], other.counts[:, both]), (row.of_seed, other.of_seed)
+    found = paired_interval(*counts, seeds=seeds, draws=draws, seed=trial.seed)
+    return {**found.as_dict(), "frames": int(both.sum())}
+
+
+def summarise(runs: Runs, class_names: Sequence[str], trial: Trial, draws: int) -> Record:
+    """Give the figures of every row against every patch and against chance, and of every plan of lines.
+
+    ``runs`` are of each weights the records of `judge_frame`, ``draws`` those of the bootstrap.
+    """
+    seeds = [[record for number in members for record in runs[number]] for members in seeds_of(runs)]
+    shared = [(policy, share) for policy in (*trial.policies, ORACLE) for share in trial.shares]
+    keys = [("none", 0.0), *shared, ("all", 1.0)]
+    rows = {key: row for key in keys if (row := collect_row(seeds, *key)) is not None}
+    whole, none = rows["all", 1.0], rows["none", 0.0]
+    ends = [_mean(row.over_runs(mean_iou)) for row in (none, whole)]
+    support = whole.counts.sum(axis=3).max(axis=0).sum(axis=0)  # labelled pixels of each class, each frame once
+    table = []
+    for (policy, share), row in rows.items():
+        figures = {"policy": policy, "share": share, "uses_labels": policy == ORACLE, **_accuracy(row, class_names)}
+        figures["gap_closed"] = None if policy in ENDS else gap_closed(figures["miou"], *ends)
+        figures["captured_gain"] = captured_gain(*(sum(p[name] for p in row.parts) for name in ("gain", "best_gain")))
+        figures["against_all"] = difference(row, whole, trial, draws)
+        figures["against_random"] = difference(row, rows.get(("random", share)), trial, draws)
+        table.append(figures | {"cost": _cost(row, whole)})
+    named = dict(zip(class_names, support.tolist(), strict=True))
+    return {"rows": table, "support": named, "rig": _plan_figures(seeds, class_names, trial, draws)}
+
+
+def _plan_figures(seeds: Runs, class_names: Sequence[str], trial: Trial, draws: int) -> list[Record]:
+    """Give mIoU, seconds and lines of every plan at every budget, and ours against the two without a model.
+
+    A budget at which a frame has no plan is judged on the other frames, in every row alike; their number is said.
+    """
+    every = [(plan, budget) for plan in (*PLANNED, UNIFORM, RANDOM) for budget in BUDGETS]
+    rows = {key: row for key in every if (row := collect_row(seeds, *key, "plans")) is not None}
+    table = []
+    for (plan, budget), row in rows.items():
+        figures = {"policy": plan, "budget": budget, **_accuracy(row, class_names), "cost": _cost(row, row)}
+        for other, name in ((UNIFORM, "against_uniform"), (RANDOM, "against_random")):
+            figures[name] = difference(row, rows[other, budget], trial, draws) if plan in PLANNED else None
+        table.append(figures)
+    return table
+
+
+def _accuracy(row: Row, class_names: Sequence[str]) -> Record:
+    each = row.over_runs(mean_iou)
+    drawn = [each[row.of_seed == number] for number in np.unique(row.of_seed)]
+    seeds = np.array([_mean(some) for some in drawn])
+    classes = row.over_runs(iou_per_class)
+    false = row.over_runs(false_pixels).mean(axis=0).tolist()  # of a run
+    return {
+        "frames": int(row.judged.sum()),
+        "miou": _mean(each),
+        "spread": float(seeds.std(ddof=1)) if len(seeds) > 1 else None,
+        "draws_spread": _mean([some.std(ddof=1) for some in drawn]) if len(drawn[0]) > 1 else None,
+        "by_seed": seeds.tolist(),
+        "classes_averaged": int((~np.isnan(classes)).any(axis=0).sum()),
+        "pixel_accuracy": _mean(row.over_runs(overall_accuracy)),
+        "average_accuracy": _mean(row.over_runs(average_accuracy)),
+        "kappa": _mean(row.over_runs(kappa)),
+        "per_class_iou": dict(zip(class_names, [_mean(column) for column in classes.T], strict=True)),
+        "false_classes": {name: pixels for name, pixels in zip(class_names, false, strict=True) if pixels},
+    }
+
+
+def _cost(row: Row, whole: Row) -> Record:
+    """Give what a frame takes in the mean, of each cost, and its share of that of every patch."""
+    found = {}
+    for name in COSTS:
+        done, full = (_mean_or_none([one.get(name) for one in some.parts]) for some in (row, whole))
+        if done is not None:
+            found[name] = {"done": done, "ratio": done / full if full else None}
+    return found
+
+
+def _mean(values: Sequence[float] | NDArray[np.float64]) -> float:
+    """Mean of what is known; NaN where nothing is."""
+    known = np.asarray(values, np.float64)
+    known = known[~np.isnan(known)]
+    return float(known.mean()) if known.size else float("nan")
+
+
+def _mean_or_none(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None

@@ -1,0 +1,108 @@
+"""The effects of a simulated rig as a table: what each changes at most, what leaving it out saves, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from flows.terminal.figures import DASH, format_seconds
+from pipeline.simulator.selection.choice import UNIT_WORDS
+
+WIDE = 100  # characters, from which words fit into the table
+COLOURS = {"on": "green", "off": "dim"}
+_KEY = (
+    "left out: what any stored number would change by at most without the effect [{unit}]; error: by what is done"
+    " instead of the exact; measured: the same on the worst lines of the scene."
+)
+Row = Mapping[str, Any]
+
+
+def print_effects(effects: Iterable[Row], total: Row, console: Console) -> None:
+    """Print a row for every effect of the rig and what all come to; words stand below a narrow terminal's table."""
+    rows = list(effects)
+    there = [row for row in rows if row["reason"] != "absent"]
+    wide = console.width >= WIDE
+    table = Table(header_style="dim", box=SIMPLE_HEAD, collapse_padding=True, pad_edge=wide)
+    for name in ("effect", "computed", "left out", "error", "measured", "CPU", *(["why"] if wide else [])):
+        figure = name in ("left out", "error", "measured", "CPU")
+        table.add_column(name, justify="right" if figure else "left", no_wrap=name != "why", overflow="fold")
+    for row in there:
+        table.add_row(*_figures(row, total), *([escape(_words(row))] if wide else []))
+    console.print(table)
+    console.print(escape(_KEY.format(unit=UNIT_WORDS[total["unit"]])), style="dim")
+    if not wide and not total.get("unweighed"):
+        for row in there:
+            console.print(f"[bold]{escape(row['name'])}[/]: {escape(_words(row))}")
+    absent = [f"{row['name']} ({row['magnitude']})" for row in rows if row["reason"] == "absent"]
+    if absent:
+        console.print(f"[bold]Not there[/]: {escape(', '.join(absent))}.")
+    for sentence in total_words(total):
+        console.print(escape(sentence))
+
+
+def _figures(row: Row, total: Row) -> list[str]:
+    """Name, variant or off, what leaving it out would change, what is changed, measured, seconds."""
+    most, bound = total["tolerance"], row["bound"]
+    beyond = row["state"] == "off" and most is not None and (bound is None or bound > most)
+    colour = "yellow" if beyond else COLOURS[row["state"]]
+    return [
+        escape(row["name"]),
+        f"[{colour}]{escape(row['variant'] or 'off')}[/]",
+        DASH if total.get("unweighed") else format_change(row["left_out"], endless=True),
+        format_change(row["bound"], endless=True),
+        "" if row["measured"] is None else format_change(row["measured"]),
+        "" if not row["cost_s"] else "< 0.01 s" if row["cost_s"] < 0.01 else format_seconds(row["cost_s"]),
+    ]
+
+
+def _words(row: Row) -> str:
+    """How large an effect is, and why it is nevertheless there or left out where its figures do not tell."""
+    said = {
+        "exact": "",
+        "needed": "",
+        "small": "",
+        "unseen": "the scene shows nothing of it: ",
+        "spent": "the tolerance is spent where it saves more: ",
+        "asked": "asked for: ",
+        "unasked": "not asked for: ",
+        "unweighed": "",
+        "always": "always there: ",
+    }[row["reason"]]
+    magnitude: str = row["magnitude"]
+    return said + magnitude.removeprefix(f"{row['name']}: ")
+
+
+def format_change(value: float | None, *, endless: bool = False) -> str:
+    """A change in units of the tolerance; what is not there is a dash, or where ``endless`` has no bound at all."""
+    if value is None:
+        return "none" if endless else DASH
+    return f"{value:.2g}"
+
+
+def total_words(total: Mapping[str, Any]) -> Sequence[str]:
+    """What was asked for and what is left out, against the tolerance, and the seconds that this saves."""
+    unit, count = UNIT_WORDS[total["unit"]], total["on"] + total["off"]
+    tolerance = "any number of" if total["tolerance"] is None else f"{total['tolerance']:g}"
+    words = [f"{total['on']} of {count} effects are computed (asked: {total['asked']}, tolerance {tolerance} {unit})."]
+    if total["bound"] is None:
+        words.append("What is left out has no bound.")
+    else:
+        measured = "" if total["measured"] is None else f", measured on the worst lines {total['measured']:.2g}"
+        if total["measured"] is not None and total["measured"] > total["bound"]:
+            measured += ", more by what arithmetic makes of light with such contrasts"
+        words.append(
+            f"What is left out or cheapened changes a stored number by at most {total['bound']:.2g} {unit}{measured}."
+        )
+    if total.get("unweighed"):
+        return [*words[:1], "On a scene so small choosing takes longer than it can save: nothing was looked at."]
+    exact, cheap = (format_seconds(max(total[name], 0.0)) for name in ("saved_s", "saved_cheap_s"))
+    words.append(
+        f"That saves about {exact} of CPU in all sweeps decided on against all effects in full, "
+        f"{cheap} against all as cheap as a tenth of the tolerance lets them be."
+    )
+    return words
