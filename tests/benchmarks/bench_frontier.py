@@ -26,7 +26,7 @@ from rich.console import Console
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from flows.tasks.survey_model import PLAIN_STEPS, shipped_weights
-from flows.tradeoff.plans import plain_look
+from flows.tradeoff.stages import plain_look
 from flows.training.look import chosen_effects
 from models.evaluation.expected_scores import MapScores, expected_counts
 from models.evaluation.metrics import confusion, mean_iou

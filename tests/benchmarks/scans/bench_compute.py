@@ -19,7 +19,7 @@ from flows.settings.load import CHEAP_POLICY
 from flows.tasks.reading_costs import ReadingCosts
 from flows.tasks.seat_budget import SeatBudget
 from flows.tasks.survey_model import shipped_weights
-from flows.tradeoff.plans import plain_look
+from flows.tradeoff.stages import plain_look
 from flows.training.look import chosen_effects
 from models.evaluation.metrics import confusion, mean_iou
 from models.evaluation.placement import oracle_gain
