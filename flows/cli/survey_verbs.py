@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from flows.cli.app import AsJson, OutFolder, Switch, removed, split_list, stderr
+from flows.cli.app import AsJson, OutFolder, Switch, removed, stderr
 from flows.settings.documents import flag_help
 from flows.settings.load import SURVEY, TABLES, load_settings
 from flows.settings.survey_settings import REPLACED
@@ -170,7 +170,6 @@ def emulate(
     size: str | None = None,
     flags: RenderingFlags = NO_RENDERING_FLAGS,
     settings: Path | None = None,
-    faults: str | None = None,
     baud: int = SurveyRig.baud,
     speed: float = 1.0,
     out: OutFolder = None,
@@ -189,8 +188,6 @@ def emulate(
     settings
         A survey's TOML file, for what camera, optics and light are like, and how the mirror is mounted. Flags win over
         it.
-    faults
-        What goes wrong, with commas, each as name or name:seed; `list` shows all.
     baud
         Speed of the serial port's bytes; 0 lets them through as they come, as USB does.
     speed
@@ -198,10 +195,7 @@ def emulate(
     out
         A survey's TOML file to write, ready for `survey` and `rig check`.
     """
-    words = split_list(faults)
-    if words == (rig_check_command.LIST,):
-        return rig_check_command.show_faults(as_json=as_json)
     given = {"scene": scene, "size": size, **by_setting(flags)}
     asked = rig_emulation.emulated_settings(settings, given)
-    request = rig_emulation.EmulateRequest(asked, words, baud, speed, out)
+    request = rig_emulation.EmulateRequest(asked, baud, speed, out)
     return rig_emulation.run_emulate(request, stderr, as_json=as_json)

@@ -1,4 +1,4 @@
-"""What `rig check` does and shows, and the list of faults of emulated rigs."""
+"""The verb `rig check`: what it asks and shows."""
 
 from __future__ import annotations
 
@@ -20,25 +20,10 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import CostModel
 from pipeline.rig.device_settings import CameraLimits, SurveyRig
 from pipeline.rig.devices import SYSTEM_CLOCK
-from pipeline.rig.emulator.fault_names import fault_table
 from pipeline.rig.opening import open_camera_driver, open_devices, open_mirror_driver
 from pipeline.rig.rig_check import TRIGGERS, CheckRow, Device, check_camera, check_mirror, check_triggers, works
 
-LIST = "list"
 _COLOURS = {"ok": "green", "warn": "yellow", "fail": "bold red"}
-
-
-def show_faults(*, as_json: bool = False) -> int:
-    """List the faults that can be asked for, on stdout."""
-    if as_json:
-        rows = [{"name": name, "strikes": where, "what": what} for name, where, what in fault_table()]
-        print_json({"faults": rows})
-        return DONE
-    table = Table("fault", "strikes", "what happens", box=SIMPLE_HEAD)
-    for row in fault_table():
-        table.add_row(*map(escape, row))
-    on_stdout().print(table)
-    return DONE
 
 
 @dataclass(frozen=True)

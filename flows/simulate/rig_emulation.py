@@ -25,7 +25,6 @@ from pipeline.errors import SettingsError
 from pipeline.geometry.mirror import STRAIGHT
 from pipeline.rig.device_settings import SurveyRig
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock, ServedRig
-from pipeline.rig.emulator.fault_names import read_faults
 from pipeline.simulator.simulated import SimulatedSource
 
 EVERY_S = 0.2
@@ -39,14 +38,12 @@ class EmulateRequest:
     """What to emulate, and how."""
 
     settings: Settings
-    faults: tuple[str, ...] = ()
     baud: int = SurveyRig.baud
     speed: float = 1.0
     out: Path | None = None  # a survey's TOML to write
 
     def check(self) -> None:
-        """Refuse a fault, a speed or a file that cannot be (SettingsError), before minutes are spent on the scene."""
-        read_faults(self.faults)
+        """Refuse a speed or a file that cannot be (SettingsError), before minutes are spent on the scene."""
         FastClock(self.speed)
         if self.baud < 0:
             raise SettingsError(f"--baud expects bits a second, or 0 for no pace, got {self.baud}")
@@ -66,19 +63,12 @@ def run_emulate(
 ) -> int:
     """Emulate a rig until Ctrl-C, SIGTERM or ``ended``; how to connect goes to stdout, its state to ``console``."""
     request.check()
-    mirror_faults, camera_faults = read_faults(request.faults)
     with console.status("drawing the scene"):
         source, notes = emulated_source(request.settings)
     for note in notes:
         console.print(f"[dim]note: {escape(note)}[/]")
-    rig = EmulatedRig(
-        source,
-        FastClock(request.speed),
-        mirror_faults=mirror_faults,
-        camera_faults=camera_faults,
-        kept=KEPT_CAPTURES,
-        mounting=request.settings.rig.mounting,
-    )
+    clock = FastClock(request.speed)
+    rig = EmulatedRig(source, clock, kept=KEPT_CAPTURES, mounting=request.settings.rig.mounting)
     with _ending(ended or threading.Event()) as end, rig.serve(baud=request.baud) as served:
         _tell(request, served, console, as_json=as_json)
         with console.status(_state(rig)) as line:
@@ -105,8 +95,7 @@ def _tell(request: EmulateRequest, served: ServedRig, console: Console, *, as_js
             raise SettingsError(f"cannot write {request.out}: {error.strerror}; choose another --out") from error
         console.print(f"survey it with: spectralzoom survey {escape(str(request.out))}")
     if as_json:
-        faults = list(request.faults)
-        print_json({"rig": table, "speed": request.speed, "faults": faults, "toml": request.out and str(request.out)})
+        print_json({"rig": table, "speed": request.speed, "toml": request.out and str(request.out)})
     else:
         sys.stdout.write(f"{_toml_table('rig', table)}\n")
     sys.stdout.flush()

@@ -19,8 +19,8 @@ from pipeline.rig.devices import Clock
 from pipeline.rig.emulator.mirror_motion import AxisMotion, Stiffness, VectorPlayer
 from pipeline.rig.mirror.registers import (
     CHANNELS,
-    FEEDBACK_A,
     FEEDBACK_X,
+    LOG_SLOTS,
     ChannelRegisters,
     Status,
     Unit,
@@ -154,16 +154,12 @@ class MirrorState:
         return flags | was
 
 
-# what the logger's slots take down after power came: two outputs of the drive, then both forms of the optical feedback
-FIRST_SLOTS = (0xE802, 0xE902, 0x2300, 0x2301, 0x2302, 0x2303)
-
-
 class PositionLogger:
     """Slots, rate and rows of the logger. It stops by itself when its rows are full."""
 
     def __init__(self, state: MirrorState) -> None:
         self._state = state
-        self.slots = list(FIRST_SLOTS)
+        self.slots = [0] * LOG_SLOTS
         self.rate_hz = 10_000.0
         self._began_s: float | None = None
         self._stopped_s: float | None = None
@@ -194,7 +190,7 @@ class PositionLogger:
         register, state = self.slots[slot], self._state
         for channel in range(CHANNELS):
             registers, player = ChannelRegisters(channel), state.players[channel]
-            if register in (FEEDBACK_X + channel, FEEDBACK_A + channel):
+            if register == FEEDBACK_X + channel:
                 return state.positions(times)[:, channel].astype(">f4").tobytes()
             if register == registers.vector(VectorRegister.INDEX):
                 state.advance()

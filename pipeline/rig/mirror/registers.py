@@ -11,7 +11,6 @@ from enum import IntEnum, IntFlag
 
 CHANNELS = 2  # 0 is X, 1 is Y
 
-FEEDBACK_A = 0x2300  # of the first axis; the second's is the next one
 FEEDBACK_X, FEEDBACK_Y = 0x2302, 0x2303
 LOG_SLOTS = 6
 LOG_RUN, LOG_RATE = 0x2410, 0x2411

@@ -21,10 +21,11 @@ from rich.console import Console
 
 from flows.settings.load import load_settings
 from flows.simulate.rig_emulation import EmulateRequest, emulated_settings, run_emulate
-from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock, ServedRig
-from pipeline.rig.emulator.fault_names import make_fault
+from pipeline.rig.emulator.emulated_rig import FastClock, ServedRig
 from pipeline.rig.mirror.pro_mode import Command
 from tests.flows.conftest import CommandLine
+from tests.pipeline.rig.camera_faults import FaultyRig
+from tests.pipeline.rig.mirror_faults import make_fault
 from tests.pipeline.rig.small_rig import small_source
 
 SETS = {Command.SET_VALUE, Command.SET_VALUES, Command.SET_VECTOR}
@@ -35,7 +36,7 @@ NOWHERE = "127.0.0.1:1:1"
 def served(*faults: str) -> Iterator[ServedRig]:
     """An emulated rig behind ports, whose faults strike at the first occasion."""
     struck = [make_fault(name, at=0) for name in faults]
-    with EmulatedRig(small_source(), FastClock(20.0), mirror_faults=struck).serve() as rig:
+    with FaultyRig(small_source(), FastClock(20.0), mirror_faults=struck).serve() as rig:
         yield rig
 
 
@@ -144,7 +145,6 @@ def test_one_of_two_devices_is_partly(command_line: CommandLine) -> None:
         ("check", "--port", "nonsense://x"),
         ("check", "--prot", "x"),
         ("nonsense",),
-        ("emulate", "--faults", "nonsense"),
         ("emulate", "--speed", "0"),
         ("emulate", "--baud", "-1"),
         ("emulate", "--size", "12"),
@@ -158,13 +158,7 @@ def test_usage_errors(command_line: CommandLine, words: tuple[str, ...]) -> None
 
 
 def test_rig_in_order(command_line: CommandLine, tmp_path: Path) -> None:
-    """A table of what was asked and came, and nothing moved, also where surveys park; faults are listed."""
-    ended = command_line("rig", "emulate", "--faults", "list", "--json")
-    names = [row["name"] for row in json.loads(ended.out)["faults"]]
-    assert {"reset-in-upload", "camera-full", "never-stable"} <= set(names)
-    table = command_line("rig", "emulate", "--faults", "list")
-    assert table.code == 0
-    assert "camera-cut-cube" in table.out
+    """A table of what was asked and came, and nothing moved, also where surveys park."""
     with served() as rig:
         ended = command_line("rig", "check", "--port", rig.port, "--camera", camera_of(rig))
         assert ended.code == 0
@@ -206,7 +200,7 @@ def test_emulated_rig_is_checked_by_the_file_that_it_writes(command_line: Comman
     wanted: dict[str, object] = {"size": "64x48", "bands": "40,90", "effects": "all", "seed": "3"}
     wanted |= {"rig.mirror_axes": "y,-x", "camera.samples": "320", "detector.noiseless": True, "optics.focus_m": 40.0}
     settings = emulated_settings(None, wanted)
-    request = EmulateRequest(settings, ("split-replies:1",), 0, 20.0, file)
+    request = EmulateRequest(settings, 0, 20.0, file)
     ended, codes = threading.Event(), []
     console = Console(quiet=True)
     thread = threading.Thread(target=lambda: codes.append(run_emulate(request, console, as_json=True, ended=ended)))

@@ -11,12 +11,11 @@ import pytest
 from pipeline.errors import RigError
 from pipeline.rig.device_settings import MirrorSettings
 from pipeline.rig.devices import StateUnknown
-from pipeline.rig.emulator.fault_names import KINDS, make_fault
-from pipeline.rig.emulator.mirror_device import MirrorDevice
 from pipeline.rig.mirror.mirror_controller import MirrorController
 from pipeline.rig.mirror.pro_mode import Command, Frame, FrameReader, cell_int, read_registers
 from pipeline.rig.mirror.registers import VectorRegister, X, Y
 from tests.pipeline.rig.in_process import InProcessTransport, ManualClock
+from tests.pipeline.rig.mirror_faults import HARMLESS, KINDS, FaultyMirror, make_fault
 
 SEEDS = range(8)
 SETTINGS = MirrorSettings(expected_id="MR-E", read_back="all")
@@ -55,7 +54,7 @@ class Session:
     def __post_init__(self) -> None:
         self.clock = ManualClock()
         self.fault = make_fault(self.name, self.seed, self.at)
-        self.device = MirrorDevice(self.clock, [self.fault])
+        self.device = FaultyMirror(self.clock, [self.fault])
         self.transport = InProcessTransport(self.device, self.clock, self.baud)
         settings = replace(SETTINGS, with_crc=self.seed % 2 == 1)  # every other session sends CRCs
         self.driver = MirrorController(self.transport, settings, self.clock)
@@ -159,7 +158,7 @@ def test_no_fault_hangs_moves_twice_or_loses_what_was_acknowledged(name: str) ->
             assert "Traceback" not in words
             assert "\n" not in words
             assert 20 < len(words) < 600, words
-        if KINDS[name].harmless:
+        if name in HARMLESS:
             assert not session.errors, (seed, session.errors)
         if session.fault.chance.struck and name in ALWAYS_FATAL:
             assert session.errors, seed
