@@ -21,13 +21,11 @@ from pipeline.rig.device_settings import SurveyRig
 if TYPE_CHECKING:
     import flows.publish.survey_command as survey_command
     import flows.simulate.command as simulate_command
-    import flows.simulate.rig_check_command as rig_check_command
-    import flows.simulate.rig_emulation as rig_emulation
+    import flows.simulate.rig_commands as rig_commands
 else:
     survey_command = deferred("flows.publish.survey_command")
     simulate_command = deferred("flows.simulate.command")
-    rig_check_command = deferred("flows.simulate.rig_check_command")
-    rig_emulation = deferred("flows.simulate.rig_emulation")
+    rig_commands = deferred("flows.simulate.rig_commands")
 
 removed.update(REPLACED)
 OF_ZONES = ("area", "no_go", "plots", "plots_name")
@@ -159,8 +157,8 @@ def check(
         Also send the mirror round a small square, within 0.05 of the middle of its range, and read back where it went.
         It ends at 0; 0.
     """
-    return rig_check_command.run_check(
-        rig_check_command.check_request(settings, port, camera, move=move), stderr, as_json=as_json
+    return rig_commands.run_check(
+        rig_commands.check_request(settings, port, camera, move=move), stderr, as_json=as_json
     )
 
 
@@ -196,6 +194,6 @@ def emulate(
         A survey's TOML file to write, ready for `survey` and `rig check`.
     """
     given = {"scene": scene, "size": size, **by_setting(flags)}
-    asked = rig_emulation.emulated_settings(settings, given)
-    request = rig_emulation.EmulateRequest(asked, baud, speed, out)
-    return rig_emulation.run_emulate(request, stderr, as_json=as_json)
+    asked = rig_commands.emulated_settings(settings, given)
+    request = rig_commands.EmulateRequest(asked, baud, speed, out)
+    return rig_commands.run_emulate(request, stderr, as_json=as_json)

@@ -27,7 +27,7 @@ Setting = str | float
 
 
 @dataclass(frozen=True)
-class Clock:
+class Timing:
     """Seconds of one call over the rounds: processor and wall."""
 
     cpu_s: tuple[float, ...]
@@ -44,7 +44,7 @@ class Clock:
         return min(self.wall_s)
 
 
-def time_in_turn(calls: Mapping[Any, Callable[[], object]], rounds: int = 5) -> dict[Any, Clock]:
+def time_in_turn(calls: Mapping[Any, Callable[[], object]], rounds: int = 5) -> dict[Any, Timing]:
     """Time calls round by round, every round beginning with another one. Nothing runs before the first round."""
     names = list(calls)
     spent: dict[Any, list[tuple[float, float]]] = {name: [] for name in names}
@@ -55,10 +55,10 @@ def time_in_turn(calls: Mapping[Any, Callable[[], object]], rounds: int = 5) -> 
             wall, cpu = time.perf_counter(), time.process_time()
             calls[name]()
             spent[name].append((time.process_time() - cpu, time.perf_counter() - wall))
-    return {name: Clock(*map(tuple, zip(*pairs, strict=True))) for name, pairs in spent.items()}
+    return {name: Timing(*map(tuple, zip(*pairs, strict=True))) for name, pairs in spent.items()}
 
 
-def ratio(clocks: Mapping[Any, Clock], of: Any, to: Any) -> float:
+def ratio(clocks: Mapping[Any, Timing], of: Any, to: Any) -> float:
     """Return the median over the rounds of one call's processor time over another's, which load leaves unchanged."""
     pairs = zip(clocks[of].cpu_s, clocks[to].cpu_s, strict=True)
     return statistics.median([own / other for own, other in pairs if other > 0] or [math.nan])

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 
-from flows.tradeoff.entries import Clock, ratio
+from flows.tradeoff.entries import Timing, ratio
 from flows.tradeoff.entries import time_in_turn as in_turn
 
-__all__ = ["Clock", "ratio"]
+__all__ = ["Timing", "ratio"]
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -37,7 +37,7 @@ def not_run(what: str, folder: Path) -> Row:
     return Row(what, f"not run: no {folder}, set SPECTRALZOOM_DATA")
 
 
-def time_in_turn(calls: Mapping[str, Callable[[], object]], rounds: int = 5) -> dict[str, Clock]:
+def time_in_turn(calls: Mapping[str, Callable[[], object]], rounds: int = 5) -> dict[str, Timing]:
     """Time calls round by round, after one untimed run of each, every round beginning with another one."""
     for call in calls.values():
         call()

@@ -31,15 +31,16 @@ from pipeline.rig.mirror.mirror_requests import END, MOST_LINE, Reply
 from pipeline.rig.mirror.pro_mode import (
     BOUNDARY,
     ERROR_FLAG,
+    ChannelRegisters,
     Command,
     Damaged,
     ErrorCode,
     Frame,
     FrameReader,
+    Unit,
     encode,
     refuse,
 )
-from pipeline.rig.mirror.registers import ChannelRegisters, Unit
 
 KEPT_ACTS = 5_000
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:E[-+]?\d+)?"

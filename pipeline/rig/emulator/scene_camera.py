@@ -30,7 +30,7 @@ from pipeline.rig.device_settings import Pulses
 from pipeline.rig.devices import Clock
 from pipeline.rig.emulator.camera_device import CameraDevice, CameraUnit, EmulatedCapture, Floats, Ints, Raw
 from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.mirror.path_player import wire_positions
+from pipeline.rig.mirror.mirror_controller import wire_positions
 from pipeline.simulator.effects.effect import Aim, Bound, SweepBlock
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.render import Choice

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.simulator.effects.effect import Blur, Bound, Merged
 from pipeline.simulator.effects.probe import UNITS, Probe
-from pipeline.simulator.optics.defocus_disc import disc_points
-from pipeline.simulator.optics.kernel_fit import Moments
+from pipeline.simulator.optics.kernel_fit import Moments, disc_points
 from pipeline.simulator.optics.rays import normals_met, pupil_contrast, spread_of_rays, spread_of_waves
 from pipeline.simulator.rig_model import Rig
 

@@ -18,9 +18,9 @@ from pipeline.simulator.effects.probe import Probe, difference_rates, rising_gap
 from pipeline.simulator.rig_model import Rig
 
 if TYPE_CHECKING:
-    from pipeline.simulator.effects import neighbour_bands
+    from pipeline.simulator import compiled_loops
 else:
-    neighbour_bands = deferred("pipeline.simulator.effects.neighbour_bands")
+    compiled_loops = deferred("pipeline.simulator.compiled_loops")
 
 Floats = NDArray[np.float64]
 Light = NDArray[np.float32]
@@ -182,7 +182,7 @@ class Smile(LightChange):
         bands = tuple(map(float, block.wavelength_nm))
         first, weights = _tap_weights(bands, float(smile), camera.samples)
         out = np.empty(light.shape, np.float32)
-        neighbour_bands.mix_neighbours(np.ascontiguousarray(light, np.float32), weights, first, out)
+        compiled_loops.mix_neighbours(np.ascontiguousarray(light, np.float32), weights, first, out)
         return out
 
 

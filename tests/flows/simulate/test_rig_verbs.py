@@ -20,7 +20,7 @@ import serial
 from rich.console import Console
 
 from flows.settings.load import load_settings
-from flows.simulate.rig_emulation import EmulateRequest, emulated_settings, run_emulate
+from flows.simulate.rig_commands import EmulateRequest, emulated_settings, run_emulate
 from pipeline.rig.emulator.emulated_rig import FastClock, ServedRig
 from pipeline.rig.mirror.pro_mode import Command
 from tests.flows.conftest import CommandLine

@@ -15,8 +15,18 @@ import numpy as np
 from pipeline.rig.emulator import Chunk
 from pipeline.rig.emulator.mirror_device import MirrorDevice, Mode, Request
 from pipeline.rig.mirror.mirror_requests import END, ID, VERSION, Reply
-from pipeline.rig.mirror.pro_mode import CELL, Command, ErrorCode, Frame, encode, int_cell, read_vector, refuse
-from pipeline.rig.mirror.registers import VECTOR_MEMORY, Status
+from pipeline.rig.mirror.pro_mode import (
+    CELL,
+    VECTOR_MEMORY,
+    Command,
+    ErrorCode,
+    Frame,
+    Status,
+    encode,
+    int_cell,
+    read_vector,
+    refuse,
+)
 
 LATE_S = 20.0  # beyond any deadline
 SLOW_S = 0.02  # from byte to byte

@@ -20,10 +20,8 @@ from pipeline.rig.devices import Clock, DeviceGone, DeviceRefused
 from pipeline.rig.emulator.camera_device import CameraUnit
 from pipeline.rig.emulator.mirror_device import Mode
 from pipeline.rig.emulator.mirror_state import MirrorUnit
-from pipeline.rig.mirror.mirror_controller import MirrorController
-from pipeline.rig.mirror.path_player import MotionLog
-from pipeline.rig.mirror.pro_mode import Command
-from pipeline.rig.mirror.registers import Status
+from pipeline.rig.mirror.mirror_controller import MirrorController, MotionLog
+from pipeline.rig.mirror.pro_mode import Command, Status
 from pipeline.rig.rig_check import SQUARE, CheckRow, check_camera, check_mirror, check_triggers, failed, works
 from tests.pipeline.rig.camera_faults import CameraFault, CameraFaults, FaultyRig
 from tests.pipeline.rig.in_process import InProcessRig, ManualClock

@@ -20,7 +20,7 @@ from pipeline.geometry.scan import Sweep
 from pipeline.rig.camera.camera_files import KeptInMemory
 from pipeline.rig.capture.capture_runner import RigDevices
 from pipeline.rig.device_settings import ControlPatience
-from pipeline.rig.mirror.registers import Status
+from pipeline.rig.mirror.pro_mode import Status
 from pipeline.source import Line
 from tests.pipeline.rig.camera_faults import CameraFault, CameraFaults
 from tests.pipeline.rig.mirror.test_fault_suite import moves

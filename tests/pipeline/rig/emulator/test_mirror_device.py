@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from pipeline.rig.emulator.mirror_device import MirrorDevice, Mode
 from pipeline.rig.emulator.mirror_state import MirrorUnit
-from pipeline.rig.mirror.registers import Status
+from pipeline.rig.mirror.pro_mode import Status
 from tests.pipeline.rig.in_process import ManualClock
 
 GO_PRO_CRC = b"GOPROCRC\r\n"

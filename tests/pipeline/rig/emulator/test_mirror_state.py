@@ -9,36 +9,33 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.geometry.scan import Ends
-from pipeline.rig.emulator import mirror_motion
+from pipeline.rig.emulator import mirror_state as mirror_motion
 from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.emulator.mirror_motion import MOST_STEPS, AxisMotion, Stiffness, VectorPlayer
-from pipeline.rig.emulator.mirror_state import MirrorUnit
+from pipeline.rig.emulator.mirror_state import MOST_STEPS, AxisMotion, MirrorUnit, Stiffness, VectorPlayer
 from pipeline.rig.mirror.pro_mode import (
-    ErrorCode,
-    Frame,
-    FrameReader,
-    Value,
-    cell_float,
-    cell_int,
-    encode,
-    get_value,
-    get_vector,
-    refuse,
-    set_values,
-    set_vector,
-)
-from pipeline.rig.mirror.registers import (
     FEEDBACK_X,
     FEEDBACK_Y,
     LOG_RATE,
     LOG_RUN,
     VECTOR_MEMORY,
+    ErrorCode,
+    Frame,
+    FrameReader,
     Trigger,
     Unit,
+    Value,
     VectorRegister,
     X,
     Y,
+    cell_float,
+    cell_int,
+    encode,
+    get_value,
+    get_vector,
     log_slot,
+    refuse,
+    set_values,
+    set_vector,
 )
 from tests.pipeline.rig.in_process import ManualClock
 from tests.pipeline.rig.mirror.mirror_bytes import set_value

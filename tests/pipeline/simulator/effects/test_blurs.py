@@ -15,7 +15,7 @@ from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.blurs import ABERRATION, DEFOCUS, DIFFRACTION, KEYSTONE, defocus_px, keystone_shift
 from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.line import SLIT
-from pipeline.simulator.optics.defocus_disc import disc_contrast
+from pipeline.simulator.optics.kernel_fit import disc_contrast
 from pipeline.simulator.optics.rays import pupil_contrast
 from pipeline.simulator.render import expected_light
 from pipeline.simulator.rig_model import Air, Optics, Rig
