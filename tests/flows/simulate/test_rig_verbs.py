@@ -69,28 +69,6 @@ def test_settings_file_says_where_both_are(command_line: CommandLine, tmp_path: 
         assert not still(rig)
 
 
-@pytest.mark.parametrize(
-    ("fault", "came", "mend"),
-    [
-        ("modem", "/dev/", ""),
-        ("echo", "/dev/", ""),
-        ("wrong-firmware", "LENS-DRIVER-4, version 0.0.1", "rig.expected_id"),
-        ("mirror-warm", "the mirror is too warm", "motions are refused"),
-    ],
-)
-def test_other_devices_and_states_fail_and_nothing_moves(
-    command_line: CommandLine, fault: str, came: str, mend: str
-) -> None:
-    """One row that failed says which; the exit code is 1, and the square that was asked for is not begun."""
-    with served(fault) as rig:
-        ended = command_line("rig", "check", "--port", rig.port, "--move", "--json")
-        (row,) = [row for row in json.loads(ended.out)["rows"] if row["verdict"] == "fail"]
-        assert ended.code == 1
-        assert came in row["came"]
-        assert mend in row["mend"]
-        assert still(rig)
-
-
 def refused(number: int) -> Any:
     """An opening of ports that the system refuses."""
 

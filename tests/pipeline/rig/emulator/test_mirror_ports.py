@@ -13,7 +13,7 @@ import serial
 
 from pipeline.errors import RigError, SettingsError
 from pipeline.rig.device_settings import MirrorSettings
-from pipeline.rig.devices import SYSTEM_CLOCK, DeadlinePassed, DeviceGone
+from pipeline.rig.devices import SYSTEM_CLOCK, DeviceGone
 from pipeline.rig.emulator.emulated_rig import EmulatedPort, FastClock
 from pipeline.rig.emulator.mirror_device import MirrorDevice
 from pipeline.rig.mirror.mirror_controller import open_mirror
@@ -25,60 +25,6 @@ def line(*faults: str, baud: int = 0) -> InProcessTransport:
     """A line to a controller with faults that strike at once."""
     clock = ManualClock()
     return InProcessTransport(FaultyMirror(clock, [make_fault(name, at=0) for name in faults]), clock, baud=baud)
-
-
-def test_bytes_come_in_order_and_no_more_than_asked_for() -> None:
-    """Reads give what is there, in parts if fewer are asked for."""
-    transport = line()
-    transport.write(b"START\r\nGETID\r\n", 1.0)
-    assert transport.drain() == b""
-    assert [transport.read(5, 1.0), transport.read(3, 1.0), transport.read(99, 1.0)] == [b"OK\r\nM", b"R-E", b"-2\r\n"]
-    assert transport.clock.now() < 0.01
-    assert transport.sent == [b"START\r\nGETID\r\n"]
-
-
-def test_bytes_take_their_time_on_the_line() -> None:
-    """At 9600 baud 7 bytes there and 4 back take 11 times 10 bits, besides the controller's own time."""
-    transport = line(baud=9600)
-    transport.write(b"START\r\n", 1.0)
-    assert transport.read(10, 1.0) == b"OK\r\n"
-    assert transport.clock.now() == pytest.approx(110 / 9600 + 2e-4)
-
-
-@pytest.mark.parametrize(("name", "acts"), [("gone-before", 0), ("gone-within", 0), ("gone-after", 1)])
-def test_a_device_that_goes_is_gone(name: str, acts: int) -> None:
-    """Whether it is gone at once or when it is read from, and for good; only after a request it was carried out."""
-    transport = line(name)
-
-    def ask() -> None:
-        transport.write(b"START\r\n", 1.0)
-        transport.read(10, 1.0)
-
-    for _ in range(2):
-        with pytest.raises(DeviceGone, match="went away; look at the cable"):
-            ask()
-    assert len(transport.device.acts) == acts
-
-
-def test_a_port_that_hangs_takes_nothing_until_the_deadline() -> None:
-    """The first bytes go nowhere, then writing blocks until its deadline."""
-    transport = line("hangs")
-    transport.write(b"START\r\n", 1.0)
-    assert transport.read(10, 1.0) == b""
-    with pytest.raises(DeadlinePassed, match="did not take 7 bytes"):
-        transport.write(b"START\r\n", 3.0)
-    assert transport.clock.now() == 3.0
-
-
-def test_a_line_waits_until_its_deadline_and_is_closed_for_good() -> None:
-    """Where nothing comes, the clock stands at the deadline; once it is closed nothing can be sent or read."""
-    transport = line()
-    assert transport.read(10, 2.5) == b""
-    assert transport.clock.now() == 2.5
-    transport.close()
-    for use in (lambda: transport.write(b"START\r\n", 1.0), lambda: transport.read(1, 1.0)):
-        with pytest.raises(DeviceGone, match="is closed"):
-            use()
 
 
 ASKED = bytes.fromhex("7e 00 11 02 50 01 59 3c 7e")

@@ -164,7 +164,7 @@ def test_no_fault_hangs_moves_twice_or_loses_what_was_acknowledged(name: str) ->
     assert struck >= len(SEEDS) // 2, f"{name} struck in {struck} of {len(SEEDS)} sessions"
 
 
-@pytest.mark.parametrize("name", ["no-reply", "just-late-reply", "reply-byte-lost", "silent-reset", "gone-after"])
+@pytest.mark.parametrize("name", ["no-reply", "silent-reset", "gone-after"])
 def test_no_reply_of_a_session_can_be_spared(name: str) -> None:
     """The fault strikes each request in turn, motions among them: nothing moves twice or is lost unseen."""
     kinds = set()
@@ -176,4 +176,4 @@ def test_no_reply_of_a_session_can_be_spared(name: str) -> None:
         kinds |= {type(error) for error in session.errors}
         assert max(session.waits_s) <= SETTINGS.deadline_s + EPSILON_S
     assert at > 30
-    assert StateUnknown in kinds or name == "just-late-reply"  # which mostly still comes in time
+    assert StateUnknown in kinds

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.sensor import STRAY_LIGHT
@@ -104,17 +102,6 @@ def test_detectors_do_not_mix():
     np.testing.assert_allclose(made[..., 30:], widen_bands(other, second, np.ones(20), 6.0), rtol=1e-6)
 
 
-@given(st.integers(0, 10**6), st.floats(0.5, 7), st.sampled_from(["sigma", "dn"]))
-@settings(max_examples=30, deadline=None)
-def test_bound_holds(seed, fwhm_nm, unit):
-    """Leaving the response out changes no number by more than the bound, factor 1.2; widths may differ by band."""
-    wavelength, light = random_light(seed)
-    fwhm = np.random.default_rng(seed).uniform(0.7, 1.3, 90) * fwhm_nm
-    probe = probe_of(light, wavelength, unit, fwhm)
-    made = RESPONSE.change(light, block_of(rig_with(), wavelength, fwhm_nm=fwhm), "exact")
-    assert worst(made, light, unit) <= 1.2 * RESPONSE.bound(probe, rig_with()).value + 1e-4
-
-
 def test_bound_is_within_6_times_at_the_median():
     """Over 30 random spectra and widths the bound is at most 6 times what happens."""
     ratios = []
@@ -139,9 +126,6 @@ def test_steep_step_is_bounded_by_its_slope():
     steepest = 4900 / units(light, "sigma").min()
     np.testing.assert_allclose(bound, steepest * np.sqrt(VARIANCE_OF_6), rtol=1e-6)
     assert RESPONSE.bound(probe, rig_with(), "exact").value == 0
-
-
-ROUNDED = 1e-3  # DN: two of the last places of 16,384 electrons in float32
 
 
 def bent(light, wavelength, smile_nm, variant="cubic", **more):
@@ -197,16 +181,6 @@ def test_smile_detectors_do_not_mix():
     np.testing.assert_allclose(both[..., :30], bent(light, first, 1.0), rtol=1e-6)
     np.testing.assert_allclose(both[..., 30:50], bent(other, second, 1.0), rtol=1e-6)
     np.testing.assert_array_equal(both[..., 50], other[..., 0])
-
-
-@given(st.integers(0, 10**6), st.floats(-3, 3), st.sampled_from(["sigma", "dn"]))
-@settings(max_examples=40, deadline=None)
-def test_bounds_hold(seed, smile_nm, unit):
-    """Leaving smile out changes no more than the bound, factor 1.2, and what floats round."""
-    wavelength, light = random_light(seed)
-    rig, probe = rig_with(smile_nm=smile_nm), probe_of(light, wavelength, unit)
-    made = bent(light, wavelength, smile_nm)
-    assert worst(made, light, unit) <= 1.2 * SMILE.bound(probe, rig).value + ROUNDED
 
 
 def test_bounds_are_within_6_times_at_the_median():
