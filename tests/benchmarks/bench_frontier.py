@@ -12,7 +12,8 @@ with a file of weights behind it by these.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -20,7 +21,10 @@ from pathlib import Path
 import numpy as np
 from measure import Row
 from numpy.typing import NDArray
+from rich.console import Console
 
+from flows.publish.survey_command import run_survey
+from flows.settings.load import load_settings
 from flows.tasks.survey_model import PLAIN_STEPS, shipped_weights
 from flows.tradeoff.stages import plain_look
 from flows.training.look import chosen_effects
@@ -33,7 +37,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel
 from pipeline.planning.coverage import cheapest_full, plain_sweeps
-from pipeline.planning.plain_scans import MIOU, PlainScan, ScanLimits, ScanRecord, choose_scan, plain_scans
+from pipeline.planning.plain_scans import MIOU, PlainScan, ScanLimits, ScanRecord, choose_scan, plain_scans, scan_words
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene
 from pipeline.simulator.scenes.scene import RasterScene
@@ -41,8 +45,14 @@ from pipeline.simulator.simulated import SimulatedSource, sweep_starts
 
 SHAPE, SEEDS = (512, 640), (1, 2, 3)
 CAMERA, COST = LineCamera(), CostModel()
+STEPS = (1, 2, 4)
+EXPOSURES_MS = (100.0, 70.0, 50.0, 35.0, 25.0, 17.0, 14.0, 12.0, 10.0, 8.0, 6.0, 5.0, 4.0, 3.0)
+BUDGETS, COARSE_MS = (0.35, 0.5, 0.65), (100.0, 25.0)
+SECONDS = (3.5, 5.0, 8.0, 15.0, 28.0)  # of surveys that choose their scan
+SLACK = 0.3  # points of mIoU that such a survey may lie below the best plain scan tried
 LARGE = {107.0: 95.2, 56.0: 95.0, 29.0: 94.3, 20.5: 93.3, 14.0: 91.5, 10.0: 89.0, 8.0: 85.0}  # of 1280 x 1024: goals
 BANDS = 270
+RMS, WITHIN, HELD = 1.5, 1.645, 0.9  # goals of what maps say of themselves; 90 % lie within so many of their errors
 
 
 @dataclass(frozen=True)
@@ -56,6 +66,44 @@ class PlanMap:
 
 
 Judged = list[PlanMap]  # of each farm
+
+
+def rows() -> list[Row]:
+    """Every plan by its seconds; a survey's goal is the best plain scan that takes no longer."""
+    plain = {
+        scan_words(step, exposure_ms): [_plain(seed, step, exposure_ms) for seed in SEEDS]
+        for step in STEPS
+        for exposure_ms in EXPOSURES_MS
+    }
+    found = [(_seconds(one), Row(name, _figure(one))) for name, one in plain.items()]
+
+    for seconds in SECONDS:
+        scan = chosen_scan(SHAPE, seconds)
+        judged = [_plain(seed, scan.step, scan.exposure_ms) for seed in SEEDS]
+        found.append(_beside(plain, f"survey --seconds {seconds:g}: {_promise(scan)}", judged, SLACK))
+    for budget in BUDGETS:
+        for exposure_ms in COARSE_MS:
+            judged = [_survey(seed, budget, exposure_ms) for seed in SEEDS]
+            found.append(_beside(plain, f"survey, budget {budget:g}, coarse lines {exposure_ms:g} ms", judged, 0.0))
+    return [row for _, row in sorted(found, key=lambda pair: pair[0])] + list(_told_rows(plain))
+
+
+def _beside(plain: Mapping[str, Judged], what: str, one: Judged, slack: float) -> tuple[float, Row]:
+    """Seconds and the row of a plan whose goal is the best plain scan that takes no longer, less some slack."""
+    best, by = max((_mean(other), said) for said, other in plain.items() if _seconds(other) <= _seconds(one) + 1e-9)
+    goal = f">= {best - slack:.1f}, {by}" + (f", less {slack:g}" if slack else "")
+    return _seconds(one), Row(what, _figure(one), goal, _mean(one) >= best - slack)
+
+
+def _told_rows(plain: Mapping[str, Judged]) -> Iterator[Row]:
+    """How far what maps say of themselves, and what the record says of such scans, lie from what they score."""
+    maps = [one for judged in plain.values() for one in judged]
+    off = np.array([one.expected - one.miou for one in maps])
+    held = np.abs(off) <= WITHIN * np.array([one.error for one in maps])
+    rms = float(np.sqrt(np.mean(off**2)))
+    figure = f"{rms:.2f} points rms, {off.mean():+.2f} in the mean, {100 * held.mean():.0f} % within their error"
+    met = rms <= RMS and bool(held.mean() >= HELD)
+    yield Row(f"what {len(maps)} maps say of themselves", figure, f"<= {RMS:g} rms, {HELD:.0%} within", met)
 
 
 def large_rows(shape: tuple[int, int], goals: dict[float, float], weights: Weights) -> Iterator[Row]:
@@ -115,6 +163,12 @@ def scores(step: int) -> MapScores:
     return MapScores.read(load_familiar(_path(step), described).record[MAP_SCORES])
 
 
+@cache
+def _plain(seed: int, step: int, exposure_ms: float) -> PlanMap:
+    """The map of a farm's plain scan."""
+    return map_of(farm_scene(seed, SHAPE, camera=CAMERA), seed, step, exposure_ms)
+
+
 def map_of(scene: RasterScene, seed: int, step: int, exposure_ms: float, weights: Weights | None = None) -> PlanMap:
     """The map of a scene's plain scan; what it says of itself by the house's own weights alone."""
     others, weights, rig = weights is not None, weights or shipped(step), Rig(CAMERA)
@@ -137,6 +191,23 @@ def map_of(scene: RasterScene, seed: int, step: int, exposure_ms: float, weights
 def _judged(scene: RasterScene, classes: NDArray[np.uint8], weights: Weights) -> float:
     assert scene.labels is not None
     return 100 * mean_iou(confusion(scene.labels, classes, weights.config.classes))
+
+
+def _survey(seed: int, budget: float, coarse_ms: float) -> PlanMap:
+    """The map of the command's survey."""
+    with tempfile.TemporaryDirectory() as out:
+        given = {
+            "scene": "farm",
+            "size": f"{SHAPE[0]}x{SHAPE[1]}",
+            "seed": str(seed),
+            "budget": str(budget),
+            "coarse_exposure_ms": str(coarse_ms),
+            "engine": "plain",
+            "controls": False,
+            "out": out,
+        }
+        receipt = run_survey(load_settings(None, given), Console(quiet=True)).receipt
+    return PlanMap(receipt["savings"]["capture_s"]["done"], 100 * receipt["accuracy"]["miou"])
 
 
 def main(arguments: Sequence[str]) -> int:
