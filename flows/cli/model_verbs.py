@@ -39,7 +39,7 @@ def tradeoff(
     Parameters
     ----------
     stage
-        rectify, plan, simulate, segment or store; all without one.
+        rectify, segment, simulate, store or survey; all without one.
     out
         Folder for tradeoff.json and tradeoff.png.
     repeats

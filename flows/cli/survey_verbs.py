@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from flows.cli.app import AsJson, OutFolder, Switch, removed, split_list, stderr
+from flows.cli.app import AsJson, OutFolder, Switch, removed, stderr
 from flows.settings.documents import flag_help
 from flows.settings.load import SURVEY, TABLES, load_settings
 from flows.settings.survey_settings import REPLACED
@@ -21,13 +21,11 @@ from pipeline.rig.device_settings import SurveyRig
 if TYPE_CHECKING:
     import flows.publish.survey_command as survey_command
     import flows.simulate.command as simulate_command
-    import flows.simulate.rig_check_command as rig_check_command
-    import flows.simulate.rig_emulation as rig_emulation
+    import flows.simulate.rig_commands as rig_commands
 else:
     survey_command = deferred("flows.publish.survey_command")
     simulate_command = deferred("flows.simulate.command")
-    rig_check_command = deferred("flows.simulate.rig_check_command")
-    rig_emulation = deferred("flows.simulate.rig_emulation")
+    rig_commands = deferred("flows.simulate.rig_commands")
 
 removed.update(REPLACED)
 OF_ZONES = ("area", "no_go", "plots", "plots_name")
@@ -159,8 +157,8 @@ def check(
         Also send the mirror round a small square, within 0.05 of the middle of its range, and read back where it went.
         It ends at 0; 0.
     """
-    return rig_check_command.run_check(
-        rig_check_command.check_request(settings, port, camera, move=move), stderr, as_json=as_json
+    return rig_commands.run_check(
+        rig_commands.check_request(settings, port, camera, move=move), stderr, as_json=as_json
     )
 
 
@@ -170,7 +168,6 @@ def emulate(
     size: str | None = None,
     flags: RenderingFlags = NO_RENDERING_FLAGS,
     settings: Path | None = None,
-    faults: str | None = None,
     baud: int = SurveyRig.baud,
     speed: float = 1.0,
     out: OutFolder = None,
@@ -189,8 +186,6 @@ def emulate(
     settings
         A survey's TOML file, for what camera, optics and light are like, and how the mirror is mounted. Flags win over
         it.
-    faults
-        What goes wrong, with commas, each as name or name:seed; `list` shows all.
     baud
         Speed of the serial port's bytes; 0 lets them through as they come, as USB does.
     speed
@@ -198,10 +193,7 @@ def emulate(
     out
         A survey's TOML file to write, ready for `survey` and `rig check`.
     """
-    words = split_list(faults)
-    if words == (rig_check_command.LIST,):
-        return rig_check_command.show_faults(as_json=as_json)
     given = {"scene": scene, "size": size, **by_setting(flags)}
-    asked = rig_emulation.emulated_settings(settings, given)
-    request = rig_emulation.EmulateRequest(asked, words, baud, speed, out)
-    return rig_emulation.run_emulate(request, stderr, as_json=as_json)
+    asked = rig_commands.emulated_settings(settings, given)
+    request = rig_commands.EmulateRequest(asked, baud, speed, out)
+    return rig_commands.run_emulate(request, stderr, as_json=as_json)

@@ -1,1 +1,1 @@
-"""What accuracy costs in time: one module a choice, each with knob, reference and error measure."""
+"""What accuracy costs in time: one measure a stage, with knob, reference and error."""

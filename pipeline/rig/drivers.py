@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike
 from pipeline.rig.camera.camera_cubes import CapturedLines, MeanFrame
 from pipeline.rig.camera.camera_files import Kept
 from pipeline.rig.camera.camera_files import Progress as FetchProgress
-from pipeline.rig.mirror.path_player import MotionLog
-from pipeline.rig.mirror.path_player import Progress as LoadProgress
-from pipeline.rig.mirror.registers import Trigger
+from pipeline.rig.mirror.mirror_controller import MotionLog
+from pipeline.rig.mirror.mirror_controller import Progress as LoadProgress
+from pipeline.rig.mirror.pro_mode import Trigger
 
 
 class MirrorDriver(Protocol):

@@ -27,7 +27,7 @@ from pipeline.rig.device_settings import Pulses
 from pipeline.rig.devices import Clock
 from pipeline.rig.drivers import CameraDriver, MirrorDriver
 from pipeline.rig.mirror.mirror_controller import MirrorController, check_model
-from pipeline.rig.mirror.registers import Status, Trigger
+from pipeline.rig.mirror.pro_mode import Status, Trigger
 
 Verdict = Literal["ok", "warn", "fail"]
 Device = Literal["mirror", "camera"]

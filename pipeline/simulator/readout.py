@@ -36,9 +36,9 @@ from pipeline.simulator.effects.noise import (
 from pipeline.simulator.render import Choice
 
 if TYPE_CHECKING:
-    from pipeline.simulator.effects import noise_loops
+    from pipeline.simulator import compiled_loops
 else:
-    noise_loops = deferred("pipeline.simulator.effects.noise_loops")
+    compiled_loops = deferred("pipeline.simulator.compiled_loops")
 
 Light = NDArray[np.float32]
 
@@ -90,7 +90,7 @@ class Readout:
             np.empty(light.shape, np.uint16),
         )
         added = np.ravel(np.asarray(self.added, np.float32))
-        finite = noise_loops.read_merged(
+        finite = compiled_loops.read_merged(
             *(seen.reshape(-1), added, deviate.reshape(-1), self.read_noise_e),
             *(camera.electrons_per_dn, camera.dark_dn, camera.full_scale_dn, raw.reshape(-1)),
         )

@@ -26,7 +26,7 @@ from rich.console import Console
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from flows.tasks.survey_model import PLAIN_STEPS, shipped_weights
-from flows.tradeoff.plans import plain_look
+from flows.tradeoff.stages import plain_look
 from flows.training.look import chosen_effects
 from models.evaluation.expected_scores import MapScores, expected_counts
 from models.evaluation.metrics import confusion, mean_iou
@@ -161,13 +161,6 @@ def scores(step: int) -> MapScores:
     weights = shipped(step)
     described = Description(weights.config, weights.basis, weights.class_names, weights.record)
     return MapScores.read(load_familiar(_path(step), described).record[MAP_SCORES])
-
-
-def seconds_of(step: int, exposure_ms: float) -> float:
-    """Seconds of the camera of a plain scan of a small farm."""
-    grid = SceneGrid(*SHAPE, shipped().config.patch, shipped().config.factor)
-    along, _, _ = cheapest_full(grid, CAMERA, COST)
-    return COST.seconds(plain_sweeps(grid, CAMERA, along, step=step, exposure_ms=exposure_ms), CAMERA)
 
 
 @cache

@@ -18,7 +18,7 @@ from pipeline.geometry.mirror import (
     position_to_normal,
     reflect,
 )
-from pipeline.geometry.paper_equations import straight_slope_rotation
+from tests.pipeline.geometry.paper_equations import straight_slope_rotation
 from tests.pipeline.geometry.test_paper import paper_position, slope_rotation
 
 COUNT = 200_000

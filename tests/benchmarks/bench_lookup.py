@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from measure import Clock, Row, ratio, time_in_turn
+from measure import Row, Timing, ratio, time_in_turn
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -131,7 +131,7 @@ def _worst(found: Floats, truth: Floats) -> float:
     return float(np.nanmax(np.abs(found - truth))) if apart.mean() < 1e-4 else np.inf
 
 
-def _ns(clock: Clock) -> float:
+def _ns(clock: Timing) -> float:
     return 1e9 * clock.cpu_min_s / PIXELS
 
 
@@ -144,7 +144,7 @@ def _error(table: TieTable, truth: Floats) -> Row:
     return Row(what, f"{off:.2g} px (bound {table.bound_px:.2g})", "< 2e-3 px", off < 2e-3 and off <= table.bound_px)
 
 
-def _against_tree(track: Track, table: TieTable, truth: Floats, clocks: dict[str, Clock]) -> list[Row]:
+def _against_tree(track: Track, table: TieTable, truth: Floats, clocks: dict[str, Timing]) -> list[Row]:
     _, nearest = cKDTree(_samples()).query(_pixels(), workers=1)
     tree_off = _worst(np.stack(np.divmod(nearest, CAMERA.samples), axis=-1).astype(np.float64), truth)
     faster, closer = ratio(clocks, "tree", "ties 16"), tree_off / _worst(_whole(table), truth)
@@ -163,12 +163,12 @@ def _against_tree(track: Track, table: TieTable, truth: Floats, clocks: dict[str
     ]
 
 
-def _closed_form(track: Track, truth: Floats, clocks: dict[str, Clock]) -> Row:
+def _closed_form(track: Track, truth: Floats, clocks: dict[str, Timing]) -> Row:
     off = _worst(track_lookup(track, CAMERA, _pixels(), along="x"), truth)
     return Row("lookup in closed form, every pixel", f"{_ns(clocks['closed form']):.3g} ns/px, {off:.1g} px")
 
 
-def _spacing(track: Track, truth: Floats, tie: int, clocks: dict[str, Clock]) -> Row:
+def _spacing(track: Track, truth: Floats, tie: int, clocks: dict[str, Timing]) -> Row:
     table = _ties(track, tie)
     found = f"{_ns(clocks[f'ties {tie}']):.2g} ns/px, {_worst(_whole(table), truth):.2g} px"
     return Row(f"ties every {tie} px, whatever the tolerance", found, peers=f"bound {table.bound_px:.2g} px")
@@ -198,7 +198,7 @@ def _field() -> Row:
     )
 
 
-def _uneven(clocks: dict[str, Clock]) -> Row:
+def _uneven(clocks: dict[str, Timing]) -> Row:
     track = _jittered()
     at = track_lookup(track, CAMERA, _pixels(), along="x")
     on = np.isfinite(at[..., 0])

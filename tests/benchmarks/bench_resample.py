@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from beside.resample_peers import BANDS, ENGINES, Peer, Turned, cv2_parts, peers, spline, turned_waves
-from measure import Clock, Row, ratio, time_in_turn
+from measure import Row, Timing, ratio, time_in_turn
 from numpy.typing import NDArray
 
 from pipeline.rectify.kernels import Kernel, windows
@@ -59,7 +59,7 @@ def _take(scene: Turned, out: NDArray[np.float32]) -> Callable[[], None]:
     return call
 
 
-def _ns(clock: Clock, values: int) -> float:
+def _ns(clock: Timing, values: int) -> float:
     return clock.cpu_min_s / values * 1e9
 
 

@@ -11,7 +11,7 @@ from functools import partial
 
 import numpy as np
 import torch
-from measure import Clock, Row, ratio, time_in_turn
+from measure import Row, Timing, ratio, time_in_turn
 from numpy.typing import NDArray
 
 from models.network.layers import Encoder, Memory, cut
@@ -128,7 +128,7 @@ def _batches() -> list[Row]:
     ]
 
 
-def _rate(clock: Clock) -> float:
+def _rate(clock: Timing) -> float:
     return FRAMES / clock.cpu_min_s
 
 

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import gc
 import os
-import statistics
 import textwrap
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 
+from flows.tradeoff.entries import Timing, ratio
+from flows.tradeoff.entries import time_in_turn as in_turn
+
+__all__ = ["Timing", "ratio"]
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -26,24 +27,6 @@ class Row:
     peers: str = ""
 
 
-@dataclass(frozen=True)
-class Clock:
-    """Seconds of one call over the rounds: processor and wall."""
-
-    cpu_s: tuple[float, ...]
-    wall_s: tuple[float, ...]
-
-    @property
-    def cpu_min_s(self) -> float:
-        """Least processor time [s]."""
-        return min(self.cpu_s)
-
-    @property
-    def wall_min_s(self) -> float:
-        """Least wall time [s]."""
-        return min(self.wall_s)
-
-
 def data_folder(name: str) -> Path:
     """Give where a real data set lies, there or not: in $SPECTRALZOOM_DATA, or in shared/data beside the checkout."""
     return Path(os.environ.get("SPECTRALZOOM_DATA", ROOT.parent / "shared" / "data")) / name
@@ -54,24 +37,11 @@ def not_run(what: str, folder: Path) -> Row:
     return Row(what, f"not run: no {folder}, set SPECTRALZOOM_DATA")
 
 
-def time_in_turn(calls: Mapping[str, Callable[[], object]], rounds: int = 5) -> dict[str, Clock]:
+def time_in_turn(calls: Mapping[str, Callable[[], object]], rounds: int = 5) -> dict[str, Timing]:
     """Time calls round by round, after one untimed run of each, every round beginning with another one."""
-    names = list(calls)
-    for name in names:
-        calls[name]()
-    spent: dict[str, list[tuple[float, float]]] = {name: [] for name in names}
-    for turn in range(rounds):
-        for name in names[turn % len(names) :] + names[: turn % len(names)]:
-            gc.collect()
-            wall, cpu = time.perf_counter(), time.process_time()
-            calls[name]()
-            spent[name].append((time.process_time() - cpu, time.perf_counter() - wall))
-    return {name: Clock(*map(tuple, zip(*pairs, strict=True))) for name, pairs in spent.items()}
-
-
-def ratio(clocks: Mapping[str, Clock], of: str, to: str) -> float:
-    """Median over the rounds of one call's processor time over another's: what a loaded machine leaves unchanged."""
-    return statistics.median(a / b for a, b in zip(clocks[of].cpu_s, clocks[to].cpu_s, strict=True) if b > 0)
+    for call in calls.values():
+        call()
+    return in_turn(calls, rounds)
 
 
 def peak_bytes() -> int:

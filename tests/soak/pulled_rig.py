@@ -18,7 +18,7 @@ from types import TracebackType
 from typing import Any, Literal
 
 from flows.settings.load import load_settings
-from flows.simulate.rig_emulation import emulated_source
+from flows.simulate.rig_commands import emulated_source
 from pipeline.rig.emulator.camera_server import CameraServer
 from pipeline.rig.emulator.emulated_rig import EmulatedPort, EmulatedRig, FastClock
 from pipeline.rig.emulator.scene_camera import SceneView

@@ -20,9 +20,8 @@ from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.effects.probe import Probe, unit_at
 from pipeline.simulator.effects.registry import BY_NAME, EFFECTS
 from pipeline.simulator.render import expected_light
-from pipeline.simulator.selection.choice import TOTAL, Decision, decide, list_effects, sum_up
+from pipeline.simulator.selection.choice import TOTAL, Decision, decide, everything, list_effects, pays, sum_up
 from pipeline.simulator.selection.survey_probe import probe_survey
-from pipeline.simulator.selection.unweighed import everything, pays
 from pipeline.simulator.selection.verification import candidate_blocks, verify, worst_blocks
 from pipeline.simulator.simulated import SimulatedSource, sweep_block, sweep_starts
 from storage.archive.keys import StageRef

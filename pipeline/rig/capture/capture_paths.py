@@ -20,9 +20,9 @@ from pipeline.errors import RigError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Axis, Sweep, exposing, line_positions, memory_loads, sweep_positions
 from pipeline.rig.camera.camera_cubes import CapturedLines
-from pipeline.rig.capture.clock_fit import FrameTimes
 from pipeline.rig.capture.line_positions import (
     CommandTimes,
+    FrameTimes,
     LinePositions,
     MirrorTrack,
     PlayedPath,
@@ -31,7 +31,7 @@ from pipeline.rig.capture.line_positions import (
     lines_by_trigger,
 )
 from pipeline.rig.device_settings import Pulses, check_capture
-from pipeline.rig.mirror.path_player import wire_positions
+from pipeline.rig.mirror.mirror_controller import wire_positions
 
 LEAD = 1  # cells before the first line's: a unit that waits for edges takes its first cell at the run command, assumed
 REFERENCES = "references"  # prefix of a capture that is made for the dark and white frames in its folder

@@ -31,8 +31,8 @@ from pipeline.rig.capture.line_positions import LinePositions, MirrorTrack, line
 from pipeline.rig.device_settings import SurveyRig
 from pipeline.rig.devices import Clock
 from pipeline.rig.drivers import CameraDriver, MirrorDriver
-from pipeline.rig.mirror.path_player import MotionLog
-from pipeline.rig.mirror.registers import Trigger
+from pipeline.rig.mirror.mirror_controller import MotionLog
+from pipeline.rig.mirror.pro_mode import Trigger
 from pipeline.source import AT_REST
 
 LOG = logging.getLogger(__name__)

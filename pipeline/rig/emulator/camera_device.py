@@ -10,7 +10,6 @@ import json
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,6 @@ from numpy.typing import NDArray
 from pipeline.errors import RigError
 from pipeline.rig.devices import Clock
 from pipeline.rig.emulator import Chunk
-from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults
 
 Floats = NDArray[Any]  # float64
 Ints = NDArray[np.int64]
@@ -69,7 +67,6 @@ class EmulatedCapture:
     layout: IndexLayout
     wavelength_nm: Sequence[float]
     references: dict[str, Raw] = field(default_factory=dict)  # name -> (frame, sample, band)
-    cut_bytes: int = 0  # missing at the end of the last cube
     _lines: list[Raw] = field(default_factory=list)
     _taken: int = 0
     _whole: dict[str, bytes] | None = None  # all files, once no frame is to come
@@ -125,10 +122,7 @@ class EmulatedCapture:
         for first in range(0, self._taken, self.frames_per_cube):
             every = self._lines[0]
             cube = every[first : first + self.frames_per_cube]
-            data = _bil(cube)
-            if first + len(cube) == len(every) and self.cut_bytes:
-                data = data[: -self.cut_bytes]
-            found |= {f"raw_{first}": data, f"raw_{first}.hdr": self._header(cube)}
+            found |= {f"raw_{first}": _bil(cube), f"raw_{first}.hdr": self._header(cube)}
             found[f"frameIndex_{first}.txt"] = self._index(first, len(cube))
         if self._taken == self.most_frames:
             self._whole = found
@@ -183,10 +177,8 @@ class CameraDevice:
         *,
         positions: Positions = lambda times_s: np.zeros((len(times_s), 2)),
         unit: CameraUnit | None = None,
-        faults: CameraFaults | None = None,
     ) -> None:
         self.unit = CameraUnit() if unit is None else unit
-        self.faults = CameraFaults() if faults is None else faults
         self.clock = clock
         self.exposure_ms, self.period_ms = 10.0, 10.0
         self.captures: list[EmulatedCapture] = []
@@ -196,10 +188,10 @@ class CameraDevice:
 
     def greet(self) -> list[Chunk]:
         """What a new connection is sent."""
-        return self._cut(b"Hyperspec control" + PROMPT)
+        return [Chunk(0.0, b"Hyperspec control" + PROMPT)]
 
     def command(self, line: str) -> list[Chunk] | None:
-        """Do one command; give its reply, in pieces and in time, or None where the connection ends."""
+        """Do one command and return its reply, or None where the connection ends."""
         with self._lock:
             self.commands.append(line)
             if line == "exit":
@@ -208,9 +200,7 @@ class CameraDevice:
                 said = {"success": True, "response": self._do(line), "errorMessage": ""}
             except RigError as error:
                 said = {"success": False, "response": None, "errorMessage": str(error)}
-            if self.faults.strikes(CameraFault.HANGS_UP):
-                return None
-            return self._spoken(line, json.dumps(said))
+            return [Chunk(0.0, f"{line}\r\n{json.dumps(said)}".encode() + PROMPT)]
 
     def is_capturing(self) -> bool:
         """Whether a capture runs."""
@@ -241,32 +231,6 @@ class CameraDevice:
             while len(numbers := capture.pending(self.clock.now())):
                 middle_s = capture.middle_s(numbers)
                 capture.put(self._lines(self._positions(middle_s), middle_s))
-
-    def _spoken(self, line: str, reply: str) -> list[Chunk]:
-        if self.faults.strikes(CameraFault.SILENT):
-            return []
-        if self.faults.strikes(CameraFault.NOT_JSON):
-            reply = "Segmentation fault"
-        data = f"{line}\r\n{reply}".encode() + PROMPT
-        foreign = b'%b\r\n{"success": true, "response": [], "errorMessage": ""}' + PROMPT  # its echo tells it apart
-        if self.faults.strikes(CameraFault.STALE):
-            other = b"isCapturing" if line.startswith("listFiles") else b"listFiles"
-            return [Chunk(0.0, foreign % other), Chunk(0.1, data)]
-        if self.faults.strikes(CameraFault.MERGED):
-            return [Chunk(0.0, foreign % b"stopCapture" + data)]
-        if self.faults.strikes(CameraFault.LATE):
-            return [Chunk(self.faults.late_s, data)]
-        if self.faults.strikes(CameraFault.SLOW):
-            return [Chunk(self.faults.slow_s, data)]
-        return self._cut(data)
-
-    def _cut(self, data: bytes) -> list[Chunk]:
-        if not self.faults.strikes(CameraFault.SPLIT):
-            return [Chunk(0.0, data)]
-        rng, most = self.faults.rng, max(len(data) - 1, 0)
-        count = min(int(rng.integers(1, 7)), most)
-        ends = sorted(int(end) + 1 for end in rng.permutation(most)[:count])
-        return [Chunk(0.002, data[start:stop]) for start, stop in pairwise([0, *ends, len(data)])]
 
     def _do(self, line: str) -> Any:
         name, _, rest = line.partition("(")
@@ -305,10 +269,10 @@ class CameraDevice:
     def _capture(self, argument: Any) -> Any:
         if not isinstance(argument, dict) or not {"prefix", "maxCubes", "maxFramesPerCube"} >= set(argument):
             raise RigError("capture takes prefix, maxCubes and maxFramesPerCube")
-        if self.is_capturing() or self.faults.strikes(CameraFault.BUSY):
+        if self.is_capturing():
             raise RigError("busy capturing")
         held = sum(map(len, self.files().values()))
-        if held >= self.unit.disk_bytes or self.faults.strikes(CameraFault.FULL):
+        if held >= self.unit.disk_bytes:
             raise RigError("disk full")
         frames = argument.get("maxFramesPerCube", 0) or self.unit.usual_frames
         cubes = argument.get("maxCubes", 0)
@@ -318,10 +282,6 @@ class CameraDevice:
         return {"folder": folder}
 
     def _begun(self, folder: str, frames: int, cubes: int) -> EmulatedCapture:
-        cut = 0
-        if self.faults.strikes(CameraFault.CUT_CUBE):
-            probe = self._lines(self._positions(np.array([self.clock.now()])), np.array([self.clock.now()]))
-            cut = probe[0].size * 3  # a line and a half of two bytes a number
         return EmulatedCapture(
             folder,
             began_s=self.clock.now() + self.unit.clock.delay_s,
@@ -333,7 +293,6 @@ class CameraDevice:
             layout=self.unit.layout,
             wavelength_nm=self.unit.wavelength_nm,
             references=self.unit.references,
-            cut_bytes=cut,
         )
 
     def _list(self, argument: Any) -> list[dict[str, Any]]:

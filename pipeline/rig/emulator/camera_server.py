@@ -20,14 +20,13 @@ from pipeline.rig.device_settings import FileServer
 from pipeline.rig.devices import Closing
 from pipeline.rig.emulator import Chunk
 from pipeline.rig.emulator.camera_device import MOST_LINE, PROMPT, CameraDevice
-from pipeline.rig.emulator.fault_names import CameraFault
 
 try:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # asyncore, which Python 3.11 still has
         from pyftpdlib.authorizers import DummyAuthorizer
         from pyftpdlib.filesystems import AbstractedFS
-        from pyftpdlib.handlers import DTPHandler, FTPHandler
+        from pyftpdlib.handlers import FTPHandler
         from pyftpdlib.ioloop import IOLoop
         from pyftpdlib.servers import FTPServer
 except ImportError as error:
@@ -67,6 +66,8 @@ class CameraServer(Closing):
     RigError where a port is taken.
     """
 
+    handler: type[FileHandler] | None = None  # of the file server's sessions
+
     def __init__(self, device: CameraDevice, *, host: str = "127.0.0.1", port: int = 0, file_port: int = 0) -> None:
         self.device = device
         self.host = host
@@ -79,7 +80,7 @@ class CameraServer(Closing):
                 f"{host}:{port} cannot be listened on ({error}); take another port, or 0 for a free one"
             ) from error
         try:
-            self._files = _file_server(device, (host, file_port))
+            self._files = _file_server(device, (host, file_port), self.handler or FileHandler)
         except BaseException:
             self._listener.close()
             raise
@@ -138,43 +139,18 @@ class CameraServer(Closing):
         self._files.close_all()
 
 
-def _file_server(device: CameraDevice, address: tuple[str, int]) -> FTPServer:
+def _file_server(device: CameraDevice, address: tuple[str, int], kind: type[FileHandler]) -> FTPServer:
     chatter = logging.getLogger("pyftpdlib")
     chatter.setLevel(logging.ERROR)
     if not chatter.handlers:
         chatter.addHandler(logging.NullHandler())  # else it turns itself up to everything, on stderr
     authorizer = DummyAuthorizer()
     authorizer.add_user(FileServer.user, FileServer.password, homedir=".", perm="elr")
-    handler = type("CameraFileHandler", (_FileHandler,), {"device": device, "authorizer": authorizer})
+    handler = type("CameraFileHandler", (kind,), {"device": device, "authorizer": authorizer})
     try:
         return FTPServer(address, handler, ioloop=IOLoop())
     except OSError as error:
         raise RigError(f"{address[0]}:{address[1]} cannot be listened on ({error}); take another port") from error
-
-
-class _HalfOf:
-    """What a producer gives of a file up to half of what is left of it."""
-
-    def __init__(self, producer: Any, transfer: Any) -> None:
-        self._transfer = transfer
-        rest = producer.file.read()
-        self._data = rest[: len(rest) // 2]
-
-    def more(self) -> bytes:
-        data: bytes = self._data[:65536]
-        self._data = self._data[65536:]
-        if not data:
-            self._transfer.cmd_channel.close()
-        return data
-
-
-class _BreakingTransfer(DTPHandler):  # type: ignore[misc]
-    """Closes a transfer half way while that fault strikes, and the session with it."""
-
-    def push_with_producer(self, producer: Any) -> None:
-        if self.cmd_channel.device.faults.strikes(CameraFault.BREAKS_OFF):
-            producer = _HalfOf(producer, self)
-        super().push_with_producer(producer)
 
 
 class _FilesInMemory(AbstractedFS):  # type: ignore[misc]
@@ -236,18 +212,11 @@ class _FilesInMemory(AbstractedFS):  # type: ignore[misc]
             raise FileNotFoundError(2, "No such file", path) from None
 
 
-class _FileHandler(FTPHandler):  # type: ignore[misc]
-    """A session of the file server; it is closed at once while that fault strikes."""
+class FileHandler(FTPHandler):  # type: ignore[misc]
+    """A session of the file server."""
 
     device: CameraDevice
-    dtp_handler = _BreakingTransfer
     abstracted_fs = _FilesInMemory
     use_sendfile = False
     auth_failed_timeout = 0
     banner = "emulated camera"
-
-    def handle(self) -> None:
-        if self.device.faults.strikes(CameraFault.REFUSES_FILES):
-            self.close()
-            return
-        super().handle()

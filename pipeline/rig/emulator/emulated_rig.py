@@ -17,7 +17,6 @@ import os
 import select
 import threading
 import tty
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import count
 
@@ -28,8 +27,7 @@ from pipeline.rig.devices import SYSTEM_CLOCK, Clock, Closing
 from pipeline.rig.emulator import Chunk
 from pipeline.rig.emulator.camera_device import CameraUnit
 from pipeline.rig.emulator.camera_server import CameraServer
-from pipeline.rig.emulator.fault_names import CameraFaults
-from pipeline.rig.emulator.mirror_device import Fault, MirrorDevice, VanishedError
+from pipeline.rig.emulator.mirror_device import MirrorDevice
 from pipeline.rig.emulator.mirror_state import MirrorUnit
 from pipeline.rig.emulator.scene_camera import SceneCamera, SceneView
 from pipeline.rig.transports import BITS_PER_BYTE
@@ -85,8 +83,8 @@ class EmulatedPort(Closing):
     def _serve(self, read_end: int) -> None:
         try:
             _Line(self.device, self._master, self.baud).serve(read_end)
-        except VanishedError as error:
-            LOG.info("%s: %s", self.path, error)
+        except OSError as error:
+            LOG.info("%s: the device went away (%s)", self.path, error)
         except Exception:
             LOG.exception("the emulated controller on %s failed", self.path)
         finally:
@@ -106,13 +104,11 @@ class _Line:
         self._in: list[tuple[float, int, bytes]] = []  # when it reached the device
         self._out: list[tuple[float, int, bytes]] = []
         self._in_free_s = self._out_free_s = 0.0
-        self._greeted = False
 
     def serve(self, stop: int) -> None:
-        """Carry bytes until ``stop`` is closed at its other end; VanishedError once device and bytes are gone."""
+        """Carry bytes until ``stop`` is closed at its other end; OSError where the device goes away."""
         while True:
-            heard = [stop] if self._device.hung else [stop, self._master]
-            ready, _, _ = select.select(heard, [], [], self._patience())
+            ready, _, _ = select.select([stop, self._master], [], [], self._patience())
             if stop in ready:
                 return
             if self._master in ready:
@@ -121,13 +117,8 @@ class _Line:
                 due, _, data = heapq.heappop(self._in)
                 self._schedule(self._device.receive(data), due)  # not from now: waking late is not the device's doing
             self._deliver()
-            if self._device.gone and not self._out:
-                raise VanishedError("the device went away")
 
     def _take(self, data: bytes) -> None:
-        if not self._greeted:  # what lies in the port: earlier it would be flushed as the port is opened
-            self._greeted = True
-            self._schedule(self._device.opened(), self._device.clock.now())
         self._in_free_s = max(self._device.clock.now(), self._in_free_s) + len(data) * self._byte_s
         heapq.heappush(self._in, (self._in_free_s, next(self._order), data))
 
@@ -180,7 +171,7 @@ class RigState:
     """What both devices do at a moment."""
 
     position: tuple[float, float]  # device X and Y
-    mode: str  # simple, pro, pro with requests checked; or gone, or hung, by a fault
+    mode: str  # simple, pro, or pro with requests checked
     last: str  # that the mirror was asked to do
     capturing: bool
     captures: int
@@ -199,15 +190,19 @@ class EmulatedRig:
         So many finished captures keep their files; 0 is all.
     mounting
         How the mirror is mounted, whatever drivers believe.
+
+    A subclass may have devices and servers of other kinds, such as ones that fail.
     """
+
+    mirror_kind = MirrorDevice
+    camera_kind = SceneCamera
+    server_kind = CameraServer
 
     def __init__(
         self,
         source: SimulatedSource,
         clock: Clock,
         *,
-        mirror_faults: Sequence[Fault] = (),
-        camera_faults: CameraFaults | None = None,
         wired: Pulses = "position",
         kept: int = 0,
         mirror: MirrorUnit | None = None,
@@ -215,24 +210,18 @@ class EmulatedRig:
         mounting: Mounting = STRAIGHT,
     ) -> None:
         self.clock = clock
-        self.mirror = MirrorDevice(self.clock, mirror_faults, unit=mirror)
-        self.camera = SceneCamera(
-            SceneView(source, mounting),
-            self.mirror,
-            self.clock,
-            wired=wired,
-            kept=kept,
-            unit=camera,
-            faults=camera_faults,
-        )
+        self.mirror = self.mirror_kind(self.clock, unit=mirror)
+        view = SceneView(source, mounting)
+        self.camera = self.camera_kind(view, self.mirror, self.clock, wired=wired, kept=kept, unit=camera)
         self.mirror.pulses = self.camera.pulses
 
     def seen(self) -> RigState:
         """Say what both devices do now."""
         x, y = self.mirror.positions(self.clock.now())
         last = self.mirror.acts[-1].request.words if self.mirror.acts else ""
-        mode = "gone" if self.mirror.gone else "hung" if self.mirror.hung else self.mirror.mode.value
-        return RigState((float(x), float(y)), mode, last, self.camera.is_capturing(), len(self.camera.captures))
+        return RigState(
+            (float(x), float(y)), self.mirror.mode.value, last, self.camera.is_capturing(), len(self.camera.captures)
+        )
 
     def serve(self, *, baud: int = 0) -> ServedRig:
         """Open a pty for the mirror, and the camera's sockets (else RigError); use it as a context, or close it."""
@@ -251,7 +240,7 @@ class ServedRig(Closing):
         self._port = EmulatedPort(rig.mirror, baud=baud)
         self.port = self._port.open()
         try:
-            self._server = CameraServer(rig.camera)
+            self._server = rig.server_kind(rig.camera)
         except BaseException:
             self._port.close()
             raise

@@ -11,15 +11,13 @@ requests after GOPRO as well (``crc="required"``), and one that knows no GOPROCR
 
 from __future__ import annotations
 
-import errno
 import math
 import re
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
-from random import Random
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -33,15 +31,16 @@ from pipeline.rig.mirror.mirror_requests import END, MOST_LINE, Reply
 from pipeline.rig.mirror.pro_mode import (
     BOUNDARY,
     ERROR_FLAG,
+    ChannelRegisters,
     Command,
     Damaged,
     ErrorCode,
     Frame,
     FrameReader,
+    Unit,
     encode,
     refuse,
 )
-from pipeline.rig.mirror.registers import ChannelRegisters, Unit
 
 KEPT_ACTS = 5_000
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:E[-+]?\d+)?"
@@ -82,71 +81,6 @@ class Request:
         return known.get(self.frame.command, f"command {self.frame.command:02X}").lower().replace("_", " ")
 
 
-class VanishedError(OSError):
-    """The device went away: no port knows it any more."""
-
-    def __init__(self, why: str) -> None:
-        super().__init__(errno.EIO, why)
-
-
-@dataclass
-class Chance:
-    """When a fault strikes: at one of the opportunities that come, early ones as likely as later twice as many."""
-
-    random: Random
-    at: int
-    seen: int = 0
-    struck: int = 0
-
-    @classmethod
-    def drawn(cls, name: str, seed: int, span: int, at: int | None = None) -> Chance:
-        """Draw the opportunity, from 0 to ``span``, exclusive; ``at`` says it instead."""
-        random = Random(f"{name} {seed}")
-        drawn = int(2 ** random.uniform(0, math.log2(span + 1))) - 1
-        return cls(random, min(drawn, span - 1) if at is None else at)
-
-    def comes(self) -> bool:
-        """Take note of an opportunity and say whether it is the one."""
-        self.seen += 1
-        now = self.seen == self.at + 1
-        self.struck += now
-        return now
-
-    def lasts(self) -> bool:
-        """Take note of an opportunity and say whether it is the one, or comes after it."""
-        return self.comes() or self.seen > self.at
-
-
-@dataclass
-class Fault:
-    """A fault that never strikes. Hooks are called in the order in which they stand here."""
-
-    chance: Chance
-
-    def begin(self, device: MirrorDevice) -> None:
-        """Take a hand as the controller is switched on."""
-
-    def opened(self, device: MirrorDevice) -> list[Chunk]:
-        """Give what is found in the port as it is opened."""
-        return []
-
-    def instead(self, device: MirrorDevice, data: bytes) -> list[Chunk] | None:
-        """Answer bytes in the controller's place; None leaves them to it."""
-        return None
-
-    def incoming(self, device: MirrorDevice, data: bytes) -> bytes:
-        """Give the bytes that reach the controller."""
-        return data
-
-    def verdict(self, device: MirrorDevice, request: Request) -> bytes | None:
-        """Give a reply to a request that then is not carried out; None lets the controller do it."""
-        return None
-
-    def outgoing(self, device: MirrorDevice, request: Request, chunks: list[Chunk]) -> list[Chunk]:
-        """Give the bytes that leave the controller, and when."""
-        return chunks
-
-
 @dataclass(frozen=True)
 class Act:
     """A request that was carried out, for whoever checks what happened, and when. [s]"""
@@ -158,42 +92,26 @@ class Act:
 class MirrorDevice:
     """One emulated controller with its mirror.
 
-    ``acts`` are the requests carried out so far, the newest ``KEPT_ACTS``; ``gone`` and ``hung`` say that the
-    port knows no device any more, or takes no bytes. ``pulses`` is what is wired to the trigger input, which is looked
-    at before anything else is done. Methods may be called from several threads: the port's, and that of an emulated
-    camera, which gives triggers and asks for positions.
+    ``acts`` are the requests carried out so far, the newest ``KEPT_ACTS``. ``pulses`` is what is wired to the trigger
+    input, which is looked at before anything else is done. Methods may be called from several threads: the port's, and
+    that of an emulated camera, which gives triggers and asks for positions.
     """
 
-    def __init__(self, clock: Clock, faults: Sequence[Fault] = (), *, unit: MirrorUnit | None = None) -> None:
-        self.clock, self.faults, self.unit = clock, tuple(faults), MirrorUnit() if unit is None else unit
+    def __init__(self, clock: Clock, *, unit: MirrorUnit | None = None) -> None:
+        self.clock, self.unit = clock, MirrorUnit() if unit is None else unit
         self.acts: deque[Act] = deque(maxlen=KEPT_ACTS)
-        self.gone = self.hung = False
         self.pulses: Pulses | None = None
         self._pulses_taken_s = clock.now()
         self._lock, self._wire = threading.RLock(), threading.Lock()
         self.state = MirrorState(clock, self.unit)
         self.restart(boot_s=0.0)
-        for fault in self.faults:
-            fault.begin(self)
-
-    def opened(self) -> list[Chunk]:
-        """Give what a user finds in the port when it is opened: nothing, but for faults."""
-        with self._lock:
-            return [chunk for fault in self.faults for chunk in fault.opened(self)]
 
     def receive(self, data: bytes) -> list[Chunk]:
-        """Take bytes and give what comes back; VanishedError where a fault took the device away."""
+        """Take bytes and return what comes back."""
         self.take_pulses()
         with self._lock:
-            if self.gone:
-                raise VanishedError("the device is gone")
-            for fault in self.faults:
-                instead = fault.instead(self, data)
-                if instead is not None:
-                    return instead
-                data = fault.incoming(self, data)
             out: list[Chunk] = []
-            while data and not self.gone and self.clock.now() >= self._boots_until:
+            while data and self.clock.now() >= self._boots_until:
                 data = self._take_line(data, out) if self.mode is Mode.SIMPLE else self._take_frame(data, out)
             return out
 
@@ -256,19 +174,12 @@ class MirrorDevice:
         return rest
 
     def _answer(self, request: Request, out: list[Chunk]) -> None:
-        """Carry a request out, unless a fault has its own way with it, and add the reply."""
-        reply: bytes | None = None
-        for fault in self.faults:
-            reply = fault.verdict(self, request) if reply is None else reply
-        if reply is None:
-            reply = self.carry_out(request)
-        chunks = [Chunk(self.unit.turnaround_s, reply)] if reply else []
-        for fault in self.faults:
-            chunks = fault.outgoing(self, request, chunks)
-        out += chunks
+        """Carry a request out and add the reply."""
+        if reply := self.carry_out(request):
+            out.append(Chunk(self.unit.turnaround_s, reply))
 
     def carry_out(self, request: Request) -> bytes:
-        """Do what a request asks for and give the bytes of the reply, whatever faults there are."""
+        """Do what a request asks for and give the bytes of the reply."""
         self.acts.append(Act(self.clock.now(), request))
         if request.damaged is not None:  # answered to the command that the bytes seem to hold, if any
             command = request.damaged.data[1] if len(request.damaged.data) > 1 else 0

@@ -16,37 +16,32 @@ from pipeline.rig.emulator.mirror_state import MirrorState, PositionLogger
 from pipeline.rig.mirror.pro_mode import (
     CELL,
     ERROR_FLAG,
+    FEEDBACK_X,
+    LOG_RATE,
+    LOG_RUN,
+    LOG_SLOTS,
     MOST_PAYLOAD,
+    VECTOR_MEMORY,
+    ChannelRegisters,
     Command,
     ErrorCode,
     Frame,
+    Trigger,
+    Unit,
+    VectorRegister,
     cell_float,
     cell_int,
     float_cell,
     int_cell,
+    log_slot,
     read_register,
     read_registers,
     read_vector,
     refuse,
     values_reply,
 )
-from pipeline.rig.mirror.registers import (
-    FEEDBACK_A,
-    FEEDBACK_X,
-    LOG_RATE,
-    LOG_RUN,
-    LOG_SLOTS,
-    VECTOR_MEMORY,
-    ChannelRegisters,
-    Trigger,
-    Unit,
-    VectorRegister,
-    log_slot,
-)
 
 LOWEST_HZ, HIGHEST_HZ = 0.0, 10_000.0
-_TEMPERATURES = 0x2200  # mirror, electronics, and the limits of both, in whole degrees
-_ANALOG, _GENERATOR = 0x58, 0x60
 _CURRENT_A = 0.7
 _LOGGED = range(log_slot(0), log_slot(LOG_SLOTS))  # vectors of the logger
 
@@ -88,7 +83,7 @@ class RegisterFile:
     def __init__(self, state: MirrorState) -> None:
         self._state = state
         self.logger = PositionLogger(state)
-        self._registers = {**_board(state), **_logger(self.logger), **_channel(state, 0), **_channel(state, 1)}
+        self._registers = {**_feedback(state), **_logger(self.logger), **_channel(state, 0), **_channel(state, 1)}
 
     def answer(self, frame: Frame) -> Frame:
         """Carry out a frame of pro mode and give the reply, which may say why not."""
@@ -204,18 +199,13 @@ def _within(stop: int, size: int) -> None:
         raise RefusedError(ErrorCode.VECTOR_INDEX)
 
 
-def _board(state: MirrorState) -> dict[int, Register]:
-    """Temperatures and optical feedback."""
+def _feedback(state: MirrorState) -> dict[int, Register]:
+    """Return the registers of the optical feedback, and of the vector memory."""
 
     def place(channel: int) -> float:
         return state.axes[channel].place(state.moment)
 
-    table = {
-        first + channel: Register(partial(place, channel)) for first in (FEEDBACK_A, FEEDBACK_X) for channel in (0, 1)
-    }
-    degrees = (state.unit.temperature_c, state.unit.temperature_c, 65.0, 65.0)
-    for number, value in enumerate(degrees, _TEMPERATURES):
-        table[number] = Register(partial(round, value), whole=True)
+    table = {FEEDBACK_X + channel: Register(partial(place, channel)) for channel in (0, 1)}
     table[VECTOR_MEMORY] = Register(lambda: 0, whole=True)  # whether the head's own copy is valid
     return table
 
@@ -228,9 +218,9 @@ def _logger(logger: PositionLogger) -> dict[int, Register]:
 
 
 def _channel(state: MirrorState, channel: int) -> dict[int, Register]:
-    """Inputs of a channel and which of them it follows; analog input and generator only keep what they are given."""
+    """Return the inputs of a channel, and which of them it follows."""
     registers = ChannelRegisters(channel)
-    inputs = {registers.static_system, registers.vector_system, _ANALOG + channel, _GENERATOR + channel}
+    inputs = {registers.static_system, registers.vector_system}
 
     def choose(system: int) -> None:
         if system not in inputs:
@@ -244,14 +234,6 @@ def _channel(state: MirrorState, channel: int) -> dict[int, Register]:
     for unit in Unit:
         most = _CURRENT_A if unit is Unit.CURRENT else 1.0
         table[registers.static_system << 8 | unit] = Register(*_item(state.static[channel], unit), -most, most)
-    kept: dict[int, float] = {}
-    for number in (
-        *range((_ANALOG + channel) << 8 | 1, ((_ANALOG + channel) << 8) + 6),
-        *range((_GENERATOR + channel) << 8, ((_GENERATOR + channel) << 8) + 9),
-        *range(registers.xy_system << 8, (registers.xy_system << 8) + 3),
-    ):
-        kept[number] = 0.0
-        table[number] = Register(*_item(kept, number))
     return {**table, **_vector_unit(state, channel)}
 
 

@@ -1,13 +1,19 @@
-"""What the emulated mirror controller is in: targets, vector memory, motion, status, log. No protocol; time by a clock.
+"""The emulated mirror controller: its motion in closed form, vector units, targets, status and log. No protocol.
 
-Nothing runs by itself: everything is worked out up to the clock's moment when somebody asks.
+Nothing runs by itself: everything is worked out up to the clock's moment when it is asked for, so time may run at any
+speed. Assumed of a vector unit, as no document says it: the first cell is taken at the run command, with an external
+trigger too, whose edges then take one cell each; a unit that is done keeps its last cell and reports that it no longer
+runs.
 """
 
 from __future__ import annotations
 
 import heapq
 import math
+from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import lru_cache
 from itertools import groupby
 from typing import Literal
 
@@ -16,16 +22,201 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.geometry.scan import Ends
 from pipeline.rig.devices import Clock
-from pipeline.rig.emulator.mirror_motion import AxisMotion, Stiffness, VectorPlayer
-from pipeline.rig.mirror.registers import (
+from pipeline.rig.mirror.pro_mode import (
     CHANNELS,
-    FEEDBACK_A,
     FEEDBACK_X,
+    LOG_SLOTS,
     ChannelRegisters,
     Status,
+    Trigger,
     Unit,
     VectorRegister,
 )
+from pipeline.simulator.effects.mirror_path import responses
+
+Floats = NDArray[np.float64]
+KEPT_STEPS = 20_000  # commands that an axis remembers; older times are given as the oldest state that is known
+MOST_STEPS = 20_000  # steps that are played one by one; of a longer silence only the last ones are
+
+
+@dataclass(frozen=True)
+class Stiffness:
+    """What an axis is like. The defaults are those of the simulated mirror: data sheet and assumed."""
+
+    natural_hz: float = 20.0
+    damping: float = 0.7
+
+    @property
+    def pace(self) -> float:
+        """Natural frequency. [rad/s]"""
+        return 2 * math.pi * self.natural_hz
+
+
+@dataclass
+class AxisMotion:
+    """One axis: starts at rest at 0 and follows steps of its command.
+
+    The history is three columns, when a command came, the place and the rate then, and the command itself.
+    """
+
+    stiffness: Stiffness = field(default_factory=Stiffness)
+    _time: list[float] = field(default_factory=lambda: [-math.inf])
+    _place: list[float] = field(default_factory=lambda: [0.0])
+    _rate: list[float] = field(default_factory=lambda: [0.0])  # over the natural frequency
+    _command: list[float] = field(default_factory=lambda: [0.0])
+
+    @property
+    def commanded(self) -> float:
+        """What the axis goes to."""
+        return self._command[-1]
+
+    def command(self, time_s: float, place: float) -> None:
+        """Take a new command at a time that is not before the last one's (an earlier one counts as then)."""
+        now = max(time_s, self._time[-1])
+        if place == self._command[-1]:
+            return
+        here, rate = self._moved(now - self._time[-1])
+        self._time.append(now)
+        self._place.append(here)
+        self._rate.append(rate)
+        self._command.append(place)
+        if len(self._time) > 2 * KEPT_STEPS:
+            for column in (self._time, self._place, self._rate, self._command):
+                del column[:-KEPT_STEPS]
+
+    def rest(self, time_s: float) -> None:
+        """Be at rest at 0 at once, as after a loss of power; the past is forgotten."""
+        self._time, self._place, self._rate, self._command = [time_s], [0.0], [0.0], [0.0]
+
+    def places(self, times_s: ArrayLike) -> Floats:
+        """Give where the axis was at times (...), in the unit of its commands.
+
+        Times before the oldest command that is remembered are given the place then.
+        """
+        times = np.asarray(times_s, np.float64)
+        known = np.asarray(self._time)
+        at = np.clip(np.searchsorted(known, times, side="right") - 1, 0, None)
+        gone = np.maximum(times - known[at], 0.0)
+        still = ~np.isfinite(gone)
+        impulse, rise = responses(np.where(still, 0.0, gone) * self.stiffness.pace, self.stiffness.damping)
+        off = np.asarray(self._place)[at] - np.asarray(self._command)[at]
+        places: Floats = np.asarray(self._command)[at] + off * (1 - rise) + np.asarray(self._rate)[at] * impulse
+        return np.where(still, np.asarray(self._command)[at], places)
+
+    def commands(self, times_s: ArrayLike) -> Floats:
+        """Give where the axis was sent to at times (...); times before the oldest that is remembered get the oldest."""
+        at = np.searchsorted(np.asarray(self._time), np.asarray(times_s, np.float64), side="right") - 1
+        return np.asarray(self._command)[np.clip(at, 0, None)]
+
+    def place(self, time_s: float) -> float:
+        """Give where the axis was at one time, which is faster for the time after the last command."""
+        if time_s < self._time[-1]:
+            return float(self.places(time_s))
+        return self._moved(time_s - self._time[-1])[0]
+
+    def unsettled(self, time_s: float) -> float:
+        """Give a bound on how far the axis may still be off its command from a time on, oscillation included."""
+        place, rate = self._moved(max(time_s - self._time[-1], 0.0))
+        return math.hypot(place - self._command[-1], rate)
+
+    def _moved(self, gone: float) -> tuple[float, float]:
+        """Place, and rate over the natural frequency, ``gone`` after the last command."""
+        target = self._command[-1]
+        off, rate = self._place[-1] - target, self._rate[-1]
+        if not math.isfinite(gone) or (off == 0 and rate == 0):
+            return target, 0.0
+        impulse, rise = _response(gone * self.stiffness.pace, self.stiffness.damping)
+        turned = 1 - rise - 2 * self.stiffness.damping * impulse
+        return target + off * (1 - rise) + rate * impulse, -off * impulse + rate * turned
+
+
+@lru_cache(maxsize=4096)
+def _response(angle: float, damping: float) -> tuple[float, float]:
+    """Responses to a unit impulse and a unit step at one time; a vector is played with few different times."""
+    impulse, rise = responses(np.array([angle]), damping)
+    return float(impulse[0]), float(rise[0])
+
+
+@dataclass
+class VectorPlayer:
+    """Registers and clockwork of one channel's vector unit."""
+
+    ends: Ends = "exclusive"
+    unit: Unit = Unit.FEEDBACK
+    start: int = 0
+    end: int = 0
+    frequency_hz: float = 10_000.0
+    cycles: int = -1  # without end
+    external: Trigger = Trigger.OFF
+    running: bool = False
+    _began_s: float = 0.0
+    _played: int = 0
+    _edges: deque[float] = field(default_factory=deque)
+    _steps: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=MOST_STEPS))
+
+    @property
+    def length(self) -> int:
+        """Cells of one cycle."""
+        return self.end - self.start + (self.ends == "inclusive")
+
+    @property
+    def index(self) -> int:
+        """The cell that is played, or was last."""
+        return self.start + max(self._played - 1, 0) % self.length if self.length > 0 else self.start
+
+    def run(self, time_s: float) -> None:
+        """Begin with the first cell."""
+        self.running, self._began_s, self._played = True, time_s, 0
+        self._edges.clear()
+
+    def stop(self) -> None:
+        """Hold the cell that is played."""
+        self.running = False
+        self._edges.clear()
+
+    def trigger(self, rises_s: NDArray[np.float64], falls_s: NDArray[np.float64]) -> None:
+        """Take pulses at the trigger input, in order; those while the unit does not wait for any are lost."""
+        if self.running and self.external is not Trigger.OFF:
+            both = np.stack([rises_s, falls_s], axis=-1).ravel()
+            self._edges.extend((rises_s if self.external is Trigger.RISING_EDGE else both).tolist())
+
+    def due(self, now_s: float) -> Iterator[tuple[float, int]]:
+        """Give the steps (time, cell) since the last call up to now, and stop where the run is over."""
+        if not self.running or self.length < 1:
+            return
+        total = math.inf if self.cycles < 0 else self.cycles * self.length
+        for time_s in self._by_edges(now_s) if self.external is not Trigger.OFF else self._by_clock(now_s, total):
+            if self._played >= total:
+                self.stop()
+                return
+            cell = self.start + self._played % self.length
+            self._played += 1
+            self._steps.append((time_s, cell))
+            yield time_s, cell
+
+    def indices(self, times_s: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Give the cell that was played at past times; the first cell before the first step that is remembered."""
+        if not self._steps:
+            return np.full(np.shape(times_s), self.start, np.int64)
+        known, cells = (np.array(column) for column in zip(*self._steps, strict=True))
+        at = np.clip(np.searchsorted(known, times_s, side="right") - 1, 0, None)
+        return np.asarray(cells, np.int64)[at]
+
+    def _by_clock(self, now_s: float, total: float) -> Iterator[float]:
+        if self.frequency_hz <= 0:
+            return
+        due = np.floor((now_s - self._began_s) * self.frequency_hz + 1e-9)  # steps 0 .. due
+        last = int(min(due, total))
+        self._played += max(last - self._played - MOST_STEPS, 0)
+        for number in range(self._played, last + 1):
+            yield self._began_s + number / self.frequency_hz
+
+    def _by_edges(self, now_s: float) -> Iterator[float]:
+        if self._played == 0:
+            yield self._began_s
+        while self._edges and self._edges[0] <= now_s:
+            yield self._edges.popleft()
+
 
 RIM_SLACK = 1e-6  # of float32 cells
 STABLE_WITHIN = 1e-4  # of the disk's radius; about 1 px of the view
@@ -154,16 +345,12 @@ class MirrorState:
         return flags | was
 
 
-# what the logger's slots take down after power came: two outputs of the drive, then both forms of the optical feedback
-FIRST_SLOTS = (0xE802, 0xE902, 0x2300, 0x2301, 0x2302, 0x2303)
-
-
 class PositionLogger:
     """Slots, rate and rows of the logger. It stops by itself when its rows are full."""
 
     def __init__(self, state: MirrorState) -> None:
         self._state = state
-        self.slots = list(FIRST_SLOTS)
+        self.slots = [0] * LOG_SLOTS
         self.rate_hz = 10_000.0
         self._began_s: float | None = None
         self._stopped_s: float | None = None
@@ -194,7 +381,7 @@ class PositionLogger:
         register, state = self.slots[slot], self._state
         for channel in range(CHANNELS):
             registers, player = ChannelRegisters(channel), state.players[channel]
-            if register in (FEEDBACK_X + channel, FEEDBACK_A + channel):
+            if register == FEEDBACK_X + channel:
                 return state.positions(times)[:, channel].astype(">f4").tobytes()
             if register == registers.vector(VectorRegister.INDEX):
                 state.advance()

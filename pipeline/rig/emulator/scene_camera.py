@@ -29,9 +29,8 @@ from pipeline.rig.capture.capture_paths import REFERENCES, Announced, announced
 from pipeline.rig.device_settings import Pulses
 from pipeline.rig.devices import Clock
 from pipeline.rig.emulator.camera_device import CameraDevice, CameraUnit, EmulatedCapture, Floats, Ints, Raw
-from pipeline.rig.emulator.fault_names import CameraFaults
 from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.mirror.path_player import wire_positions
+from pipeline.rig.mirror.mirror_controller import wire_positions
 from pipeline.simulator.effects.effect import Aim, Bound, SweepBlock
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.render import Choice
@@ -166,11 +165,10 @@ class SceneCamera(CameraDevice):
         wired: Pulses = "position",
         kept: int = 0,
         unit: CameraUnit | None = None,
-        faults: CameraFaults | None = None,
     ) -> None:
         unit = CameraUnit() if unit is None else unit
         unit = replace(unit, wavelength_nm=tuple(view.source.wavelength_nm.tolist()))
-        super().__init__(self._seen, clock, positions=mirror.sent, unit=unit, faults=faults)
+        super().__init__(self._seen, clock, positions=mirror.sent, unit=unit)
         self.view, self.mirror, self.wired, self.kept = view, mirror, wired, kept
         self.aside = False
 

@@ -12,16 +12,14 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from pipeline.simulator.effects.effect import OFF, Blur, Bound, Merged
+from pipeline.simulator.effects.effect import Blur, Bound, Merged
 from pipeline.simulator.effects.probe import UNITS, Probe
-from pipeline.simulator.optics.defocus_disc import disc_points
-from pipeline.simulator.optics.kernel_fit import Moments
+from pipeline.simulator.optics.kernel_fit import Moments, disc_points
 from pipeline.simulator.optics.rays import normals_met, pupil_contrast, spread_of_rays, spread_of_waves
 from pipeline.simulator.rig_model import Rig
 
 Floats = NDArray[np.float64]
-AIRY, GAUSSIAN, ONE_WIDTH = "airy", "gaussian", "one-width"
-THIRD_RING = 10.173468135062722  # third zero of J1
+AIRY = "airy"
 FIRST_NM, LAST_NM = 400.0, 1000.0  # of the spectrograph
 _ALONE: Floats = np.ones(1)
 GAUSSIAN_WAY, DISC_WAY = math.sqrt(2 / math.pi), 8 / (3 * math.pi)  # mean of |x| over the standard deviation
@@ -60,53 +58,27 @@ def even(variance: Floats, bands: int) -> Moments:
 class Diffraction(Blur):
     """Diffraction at the mirror, the aperture stop: an Airy pattern, stretched along the scan by the elliptic pupil.
 
-    The pattern has no variance: its rings hold 2 / (pi v) of the light beyond v = pi D theta / lambda. The exact
-    variant is the pupil's own transfer function in every band, by few kernels (`kernel_fit`). The others put a Gaussian
-    in its place, of each band or of the middle one, of the variance of what lies inside the third dark ring (94 % of
-    the light); they pass up to 0.08 more of a wave.
+    The pattern has no variance: its rings hold 2 / (pi v) of the light beyond v = pi D theta / lambda. It is the
+    pupil's own transfer function in every band, by few kernels (`kernel_fit`).
     """
 
     name = "diffraction"
-    # Each kernel costs: of the pattern's core, of its tails, of the bands' own widths. One for all costs nothing.
-    cost_ns = MappingProxyType({AIRY: 6.5, GAUSSIAN: 1.0, ONE_WIDTH: 0.0})
+    # Each kernel costs: of the pattern's core, of its tails, of the bands' own widths.
+    cost_ns = MappingProxyType({AIRY: 6.5})
 
     def moments(self, rig: Rig, wavelength_nm: Floats, variant: str, normal: Floats | None = None) -> Moments:
-        waves, none = _waves(rig, wavelength_nm, normal), np.zeros((2, len(wavelength_nm)))
-        if variant == AIRY:
-            return Moments(none, none, waves)
-        return Moments(none, _gaussian(waves, variant))
+        none = np.zeros((2, len(wavelength_nm)))
+        return Moments(none, none, _waves(rig, wavelength_nm, normal))
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound over all positions of the sweeps: the pattern is a sum of Gaussians of many widths.
 
-        Each changes the image, or a Gaussian in its place, by no more than the difference of their variances does.
+        Each changes the image by no more than its variance does.
         """
         share, size = airy_gaussians()
         found = [_waves(rig, probe.wavelength_nm, normal) for normal in normals_met(probe.sweeps, rig.camera)]
-        missing = []
-        for waves in found:
-            instead = _gaussian(waves, variant) if variant != OFF else np.zeros_like(waves)
-            missing.append([np.abs((one * waves) ** 2 - instead) for one in size])
-        cause = "diffraction" if variant == OFF else f"diffraction as a Gaussian, {variant},"
-        return blurred_bound(probe, cause, np.max(missing, axis=0), share)
-
-
-def airy_energy(v: float) -> float:
-    """Give the share of the light of an Airy pattern within v = pi D theta / lambda (Rayleigh): 1 - J0^2 - J1^2."""
-    return float(1 - scipy.special.j0(v) ** 2 - scipy.special.j1(v) ** 2)
-
-
-def airy_variance(v: float) -> float:
-    """Give the variance per axis of an Airy pattern cut off at v and scaled to sum 1, in units of v^2.
-
-    The integral of t J1(t)^2, which is v^2 (J0^2 + J1^2) / 2 - v J0 J1, over the energy; towards 0 it is v^2 / 4.
-    """
-    if v < 1e-2:
-        return v * v / 4
-    inside = v * v / 2 * (scipy.special.j0(v) ** 2 + scipy.special.j1(v) ** 2) - v * scipy.special.j0(
-        v
-    ) * scipy.special.j1(v)
-    return float(inside) / airy_energy(v)
+        missing = [[(one * waves) ** 2 for one in size] for waves in found]
+        return blurred_bound(probe, "diffraction", np.max(missing, axis=0), share)
 
 
 @cache  # not at import: SciPy takes its time
@@ -122,21 +94,6 @@ def airy_gaussians() -> tuple[Floats, Floats]:
     share = scipy.optimize.nnls(system, np.append(pupil_contrast(u) * weight, 1e3))[0]
     held = share > 0
     return share[held] / share.sum(), size[held]
-
-
-@cache
-def _spread() -> float:
-    """Variance per axis of the Gaussian in the pattern's place [(lambda / D)^2]."""
-    return airy_variance(THIRD_RING) / math.pi**2
-
-
-def _gaussian(waves: Floats, variant: str) -> Floats:
-    """Variance (2, band) of the Gaussian: each band's, or halfway between those of the narrowest and the widest."""
-    variance = _spread() * waves**2
-    if variant == GAUSSIAN or not waves.size:
-        return variance
-    middle = (variance.min(axis=1) + variance.max(axis=1)) / 2
-    return np.repeat(middle[:, None], waves.shape[1], axis=1)
 
 
 def _waves(rig: Rig, wavelength_nm: Floats, normal: Floats | None) -> Floats:

@@ -11,14 +11,12 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Sweep, points_of_scan
-from pipeline.simulator.effects.effect import OFF, Bound, Gain, Light, SweepBlock, sweep_stream
+from pipeline.simulator.effects.effect import Bound, Gain, Light, SweepBlock, sweep_stream
 from pipeline.simulator.effects.probe import GainRange, Probe
-from pipeline.simulator.rig_model import Rig, Sky
+from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.daylight import knots_within, relative_daylight, sun_elevation_deg
 
 Floats = NDArray[np.float64]
-SPECTRAL, SCALAR, LINEAR = "spectral", "scalar", "linear"
-_RATE_OVER_S = 60.0
 _KNOTS_AT_ONCE = 512
 EDGE_SHARE = 0.1  # width of a shadow's edge, over the shadow's size (assumed)
 HOT_SPOT_RAD = float(np.deg2rad(2.0))  # from its peak to 1/e (assumed)
@@ -29,16 +27,15 @@ _LOOKS = 65  # lines of a sweep, and samples of a line, at which angles are take
 class Drift(Gain):
     """Light at a line's mid exposure over the light at the survey's start, to which the scene is stated.
 
-    ``spectral`` is SPECTRL2 under a clear sky, ``scalar`` its mean over the bands, ``linear`` a straight line in time
-    by the mean's rate in the survey's first minute, never below 0. A survey that starts in the night is relative to the
-    light of a sun 1 deg high; with the sun at the horizon or below the light is 0. Without a time of day there is none.
+    It is SPECTRL2 under a clear sky. A survey that starts in the night is relative to the light of a sun 1 deg high;
+    with the sun at the horizon or below the light is 0. Without a time of day there is none.
     """
 
     name = "drift"
-    cost_ns = MappingProxyType({SPECTRAL: 0.4, SCALAR: 0.2, LINEAR: 0.2})
+    cost_ns = MappingProxyType({"spectral": 0.4})
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound by level times the greatest change of the light, or its difference to a variant, through the survey.
+        """Bound by level times the greatest change of the light through the survey.
 
         The light is straight between its knots, so that its extremes lie on them.
         """
@@ -47,17 +44,12 @@ class Drift(Gain):
         seconds = probe.seconds + rig.camera.frame_ms * 1e-3  # to the end of the last line
         worst = np.zeros(len(probe.wavelength_nm))
         times = knots_within(rig.sky, seconds)
-        rate = _first_rate(rig.sky, probe.wavelength_nm) if variant == LINEAR else 0.0
-        dark = -1 / rate if rate < 0 else np.inf  # from here on the straight line is 0
-        times = np.append(times, dark) if dark < seconds else times
         for some in np.array_split(times, len(times) // _KNOTS_AT_ONCE + 1):
-            exact = _daylight(rig.sky, probe.wavelength_nm, some, SPECTRAL)
-            missed = exact - (1 if variant == OFF else _daylight(rig.sky, probe.wavelength_nm, some, variant))
-            worst = np.maximum(worst, np.abs(missed).max(axis=0))
+            change = relative_daylight(rig.sky, probe.wavelength_nm, some) - 1
+            worst = np.maximum(worst, np.abs(change).max(axis=0))
         low, high = sun_elevation_deg(rig.sky, np.array([0.0, seconds]))
         course = f"with the sun from {low:.1f} to {high:.1f} deg in {_spoken(seconds)}"
-        verb = "changes" if variant == OFF else "at this variant is wrong"
-        return Bound(probe.scaled(worst), f"light {verb} by at most {100 * worst.max(initial=0.0):.3g} % {course}")
+        return Bound(probe.scaled(worst), f"light changes by at most {100 * worst.max(initial=0.0):.3g} % {course}")
 
     def gain_range(self, probe: Probe, rig: Rig) -> GainRange:
         nm = np.asarray(probe.wavelength_nm, np.float64)
@@ -71,27 +63,7 @@ class Drift(Gain):
         sky = block.rig.sky
         if sky.started is None:
             return np.ones((1, 1, 1), np.float32)
-        return _daylight(sky, block.wavelength_nm, block.time_s, variant)[:, None].astype(np.float32)
-
-
-def _daylight(sky: Sky, wavelength_nm: Floats, seconds: Floats, variant: str) -> Floats:
-    """Give (time, band), or (time, 1), over the light at the start."""
-    if variant == LINEAR:
-        return np.maximum(1 + _first_rate(sky, wavelength_nm) * seconds[:, None], 0.0)
-    if variant == SCALAR:
-        return _of_all(sky, wavelength_nm, seconds)
-    return relative_daylight(sky, wavelength_nm, seconds)
-
-
-def _of_all(sky: Sky, wavelength_nm: Floats, seconds: Floats) -> Floats:
-    """Mean over the bands, (time, 1): every band counts by its light at the start, so as 1."""
-    return np.asarray(relative_daylight(sky, wavelength_nm, seconds).mean(axis=1, keepdims=True))
-
-
-def _first_rate(sky: Sky, wavelength_nm: Floats) -> float:
-    """Change of the mean in the survey's first minute [1/s], from its own value: 0 in the night."""
-    first, later = _of_all(sky, wavelength_nm, np.array([0.0, _RATE_OVER_S])).ravel()
-    return float(later - first) / _RATE_OVER_S
+        return relative_daylight(sky, block.wavelength_nm, block.time_s)[:, None].astype(np.float32)
 
 
 def _spoken(seconds: float) -> str:

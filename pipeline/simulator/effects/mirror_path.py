@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.effects.effect import OFF, Aim, Bound, SweepBlock
+from pipeline.simulator.effects.effect import Aim, Bound, SweepBlock
 from pipeline.simulator.effects.pointing import at_line_ends
 from pipeline.simulator.effects.probe import Probe
 from pipeline.simulator.rig_model import MirrorMotion, Rig
 
 Floats = NDArray[np.float64]
-EXACT, CENTRES, EULER = "exact", "centres", "euler"
+EXACT, CENTRES = "exact", "centres"
 MOST_PARTS = 8  # of an exposure; a jump of h px within a part goes unseen as a blur of at most h^2/32 px^2
 _SERIES_BELOW = 0.5  # of (1 + 2 zeta) tau; 20 terms then leave less than 1e-20
 _TERMS = 20
@@ -101,45 +101,40 @@ class Lag(Aim):
     The mirror follows its commands as a second-order system, x'' + 2 zeta x' + x = 0 in units of 1 / natural frequency.
     Calibration takes away the way that one in steady motion lies behind; what is left is the free oscillation between
     it and a mirror that starts from rest. Before a sweep it has flown back by the sweep's length, has had ``settled_s``
-    to come to rest one held position ahead, and takes the first step as line 0 begins. ``euler`` takes one implicit
-    Euler step for each held position: stable at any step, right only where lines are short.
+    to come to rest one held position ahead, and takes the first step as line 0 begins.
     """
 
     name = "lag"
-    cost_ns = MappingProxyType({EXACT: 0.15, EULER: 0.12})
+    cost_ns = MappingProxyType({EXACT: 0.15})
 
     def aim(self, block: SweepBlock, variant: str) -> Floats:
-        scan = transient(block.rig, block.sweep, block.numbers, variant)
+        scan = transient(block.rig, block.sweep, block.numbers)
         return np.stack([np.zeros_like(scan), scan], axis=-1)
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        worst = greatest_lag_px(rig, probe.sweeps, variant)
+        worst = greatest_lag_px(rig, probe.sweeps)
         moved = at_line_ends(probe.sweeps, rig.camera, 0.0, worst)
         pace = f"{rig.camera.frame_ms:g} ms a line, {rig.mirror.natural_hz:g} Hz"
-        why = f"while the mirror gets up to speed ({pace})" if variant == OFF else "where a coarse integration has them"
+        why = f"while the mirror gets up to speed ({pace})"
         return Bound(probe.moved(*moved), f"lines lie up to {worst:.2g} px off {why}")
 
 
-def greatest_lag_px(rig: Rig, sweeps: Iterable[Sweep], variant: str = OFF) -> float:
-    """Give the greatest shift along the scan of any line, or the greatest difference of a variant to the exact one."""
+def greatest_lag_px(rig: Rig, sweeps: Iterable[Sweep]) -> float:
+    """Give the greatest shift along the scan of any line. [px]"""
     worst = 0.0
     for sweep in {(one.lines, one.step): one for one in sweeps if one.lines}.values():
         numbers = np.arange(sweep.lines)
-        off = transient(rig, sweep, numbers, EXACT)
-        if variant == EULER:
-            off = off - transient(rig, sweep, numbers, EULER)
+        off = transient(rig, sweep, numbers)
         worst = max(worst, float(np.abs(off).mean(axis=1).max()))
     return worst
 
 
-def transient(rig: Rig, sweep: Sweep, numbers: NDArray[np.int64], variant: str = EXACT) -> Floats:
+def transient(rig: Rig, sweep: Sweep, numbers: NDArray[np.int64]) -> Floats:
     """Give the mean shift along the scan over each held position of some lines, (line, step). [px]"""
     camera, mirror = rig.camera, rig.mirror
     pace = 2 * math.pi * mirror.natural_hz * 1e-3  # [1/ms]
     period, held = pace * camera.frame_ms, pace * camera.exposure_ms / sweep.step
     start = _at_start(mirror, sweep, period, held)
-    if variant == EULER:
-        return _euler(mirror.damping, start, numbers, (period, held, sweep.step))
     time = numbers[:, None] * period + np.arange(sweep.step) * held
     impulse, rise = responses(time, mirror.damping)
     place: Floats = start[0] * (1 - rise) + start[1] * impulse
@@ -224,35 +219,6 @@ def _steps(mirror: MirrorMotion, sweep: Sweep, period: float, held: float) -> tu
     count = min(max(round(wanted), 1), _RAMP)
     exposed = held * sweep.step
     return period - np.arange(count) * exposed / count, sweep.step / count, period
-
-
-def _euler(damping: float, start: Floats, numbers: NDArray[np.int64], pace: tuple[float, float, int]) -> Floats:
-    period, held, step = pace
-    one, rest = _euler_step(damping, held), _euler_step(damping, max(period - held * step, 0.0))
-    matrix = rest @ np.linalg.matrix_power(one, step)
-    state = np.full(len(numbers), start[0]), np.full(len(numbers), start[1])
-    left = numbers.copy()
-    while left.any():
-        moved = _times(matrix, *state)
-        odd = left % 2 == 1
-        state = np.where(odd, moved[0], state[0]), np.where(odd, moved[1], state[1])
-        matrix, left = matrix @ matrix, left // 2
-
-    means = []
-    for _ in range(step):
-        following = _times(one, *state)
-        means.append((state[0] + following[0]) / 2)
-        state = following
-    return np.stack(means, axis=1)
-
-
-def _euler_step(damping: float, time: float) -> Floats:
-    return np.linalg.inv(np.array([[1.0, -time], [time, 1 + 2 * damping * time]]))
-
-
-def _times(matrix: Floats, place: Floats, rate: Floats) -> tuple[Floats, Floats]:
-    """A 2 x 2 matrix times states, written out: a library's product may round by the number of states."""
-    return matrix[0, 0] * place + matrix[0, 1] * rate, matrix[1, 0] * place + matrix[1, 1] * rate
 
 
 STAIRCASE, LAG = Staircase(), Lag()

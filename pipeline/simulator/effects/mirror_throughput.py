@@ -17,10 +17,6 @@ from pipeline.simulator.rig_model import Coating, Rig
 
 Floats = NDArray[np.float64]
 Light = NDArray[np.float32]
-HELD, MIDDLE = "held", "middle"
-# The share is sqrt(1 - eta / sqrt(1 + xi^2 + eta^2)) of tangents xi and eta. Its second derivative over eta is largest
-# at xi = 0 and eta = -tan 20 deg or so.
-MOST_BEND = 0.46
 EXACT = "exact"
 REST_RAD = math.radians(45)
 _LOOKS = 65  # incidences at which the sweeps' factors are taken for the bounds
@@ -58,21 +54,17 @@ METALS: Mapping[str, Floats] = MappingProxyType({"aluminium": _ALUMINIUM, "gold"
 class Vignetting(Gain):
     """Light goes with the mirror's area as the camera sees it: |n_z| over |n_z| at rest, one factor for each line.
 
-    ``held`` averages over the positions of an exposure, ``middle`` takes the one at mid exposure.
+    It is the mean over the positions of an exposure.
     """
 
     name = "vignetting"
-    cost_ns = MappingProxyType({HELD: 0.2, MIDDLE: 0.2})
+    cost_ns = MappingProxyType({"held": 0.2})
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
-        """Bound by level times the factor furthest from 1; that of the middle position by what the factor bends.
+        """Bound by level times the factor furthest from 1.
 
         It is at the ends of the sweeps: the factor never turns round in between.
         """
-        if variant == MIDDLE:
-            most = max((sweep.step for sweep in probe.sweeps), default=1)
-            bend = MOST_BEND / 2 * rig.camera.ifov_rad**2 * (most**2 - 1) / 12
-            return Bound(probe.scaled(bend), f"the factor bends by {bend:.1g} within the {most} px of an exposure")
         ends = sweep_ends(probe, rig.camera)
         if not ends.size:
             return Bound(0.0, "no line is taken")
@@ -87,7 +79,7 @@ class Vignetting(Gain):
 
     def gain(self, block: SweepBlock, variant: str) -> Light:
         sweep, camera = block.sweep, block.rig.camera
-        scan_px = sweep.held_px() if variant == HELD else sweep.line_px()[:, None]
+        scan_px = sweep.held_px()
         share = np.sqrt(1 - ahead(sweep.strip_px, scan_px[block.numbers], camera)).mean(axis=1)
         return np.asarray(share.astype(np.float32)[:, None, None])
 

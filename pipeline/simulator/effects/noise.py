@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from pipeline.lazy import deferred
 
 if TYPE_CHECKING:  # numba takes half a second to import: a plan of a survey never needs it
-    from pipeline.simulator.effects import noise_loops
+    from pipeline.simulator import compiled_loops
 else:
-    noise_loops = deferred("pipeline.simulator.effects.noise_loops")
+    compiled_loops = deferred("pipeline.simulator.compiled_loops")
 
 Floats = NDArray[np.float64]
 Light = NDArray[np.float32]
@@ -39,7 +39,7 @@ def normal_deviates(rng: np.random.Generator, count: int) -> Light:
            doi:10.1214/aoms/1177706645
     """
     drawn = np.empty(count + count % 2, np.float32)
-    noise_loops.draw_pairs(rng.bit_generator.random_raw(len(drawn) // 2).view(np.uint32), PIECE, drawn)
+    compiled_loops.draw_pairs(rng.bit_generator.random_raw(len(drawn) // 2).view(np.uint32), PIECE, drawn)
     return drawn[:count]
 
 

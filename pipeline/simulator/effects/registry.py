@@ -21,7 +21,7 @@ from pipeline.simulator.effects.haze import ABSORPTION, PATH_RADIANCE
 from pipeline.simulator.effects.lighting import BRDF, CLOUD, DRIFT
 from pipeline.simulator.effects.line import FOLDED, ROTATION, SLIT, SMEAR
 from pipeline.simulator.effects.mirror_path import LAG, STAIRCASE
-from pipeline.simulator.effects.mirror_throughput import HELD, POLARISATION, VIGNETTING
+from pipeline.simulator.effects.mirror_throughput import POLARISATION, VIGNETTING
 from pipeline.simulator.effects.pointing import HYSTERESIS, JITTER, THERMAL_DRIFT
 from pipeline.simulator.effects.sensor import PRNU, STRAY_LIGHT, STRIPING
 from pipeline.simulator.effects.spectrometer import RESPONSE, SMILE
@@ -38,7 +38,7 @@ READOUT: tuple[Effect, ...] = (DARK_CURRENT, DEFECTS, SHOT, READ_NOISE, SATURATI
 EFFECTS: tuple[Effect, ...] = (*AIMS, *RAYS, *FOOTPRINT, *LIGHT, *READOUT)
 BY_NAME = MappingProxyType({effect.name: effect for effect in EFFECTS})
 # Of any camera behind a mirror, without noise and with; cheap: beside exact ones a farm changes by .015 sigma at most.
-QUIET = Choice.of({ROTATION: "rays", SLIT: "3x1", SMEAR: FOLDED, VIGNETTING: HELD})
+QUIET = Choice.of({ROTATION: "rays", SLIT: "3x1", SMEAR: FOLDED, VIGNETTING: "held"})
 USUAL = Choice((*QUIET.effects, (SHOT, GAUSSIAN), (READ_NOISE, "exact")))
 
 

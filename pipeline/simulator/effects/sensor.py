@@ -16,7 +16,6 @@ from pipeline.simulator.effects.probe import GainRange, Probe
 from pipeline.simulator.rig_model import Optics, Rig
 
 Light = NDArray[np.float32]
-HALO, EVEN = "halo", "even"
 LEAST_MODE = 1e-8  # of a wide Gaussian's cosines; fainter ones are below float32
 
 
@@ -95,12 +94,11 @@ class StrayLight(LightChange):
     Of it ``stray_even`` falls evenly, the rest as a Gaussian ``stray_halo_px`` wide (sd), reflected at the detector's
     edges. K has no weight below 0 and keeps all light.
 
-    ``halo`` is exact: the Gaussian passes only the slowest cosines of a frame, so it is a product with few of them.
-    ``even`` lets all of the scattered light fall evenly.
+    The Gaussian passes only the slowest cosines of a frame, so it is a product with few of them.
     """
 
     name = "stray-light"
-    cost_ns = MappingProxyType({HALO: 1.2, EVEN: 0.65})
+    cost_ns = MappingProxyType({"halo": 1.2})
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound it by f (S - mean), were all to fall evenly, and what the halo differs from that."""
@@ -110,8 +108,6 @@ class StrayLight(LightChange):
         spread = float(np.max(probe.spread, initial=0))
         halo = optics.stray_share * (1 - optics.stray_even) * _most_halo(probe, rig, spread)
         why = f"{optics.stray_share:.2g} of a line's light, signals up to {spread:.3g} {probe.unit} from its mean"
-        if variant == EVEN:
-            return Bound(halo, f"{why}; {1 - optics.stray_even:.2g} of it in a halo")
         return Bound(optics.stray_share * spread + halo, why)
 
     def change(self, light: Light, block: SweepBlock, variant: str) -> Light:
@@ -120,8 +116,7 @@ class StrayLight(LightChange):
         if optics.stray_share == 0:
             return light
         for line in light:  # line by line: rounding, too, does not depend on the block
-            even = np.float32(optics.stray_share * line.mean(dtype=np.float64))
-            scattered = _scattered(line, optics) if variant == HALO else even
+            scattered = _scattered(line, optics)
             line *= np.float32(1 - optics.stray_share)
             line += scattered
         return light

@@ -18,9 +18,9 @@ from pipeline.simulator.effects.probe import Probe, difference_rates, rising_gap
 from pipeline.simulator.rig_model import Rig
 
 if TYPE_CHECKING:
-    from pipeline.simulator.effects import neighbour_bands
+    from pipeline.simulator import compiled_loops
 else:
-    neighbour_bands = deferred("pipeline.simulator.effects.neighbour_bands")
+    compiled_loops = deferred("pipeline.simulator.compiled_loops")
 
 Floats = NDArray[np.float64]
 Light = NDArray[np.float32]
@@ -29,7 +29,6 @@ FWHM2_PER_VARIANCE = 8 * math.log(2)
 BANDS_AT_ONCE = 32  # bands that one product makes
 LEAST_WEIGHT = 1e-8
 REACH_SD = 6.0  # the kernel's weight beyond it is below 1e-8
-CUBIC, LINEAR = "cubic", "linear"
 
 
 class BandGroup(NamedTuple):
@@ -146,12 +145,12 @@ class Smile(LightChange):
 
     u is the sample's way from the line's centre: s is 0 there and ``smile_nm`` at both ends. Above 0 the ends see
     longer wavelengths than their bands are called, below 0 shorter ones (a frown). Spectra are interpolated by cubics
-    with slopes of second order, or by straight lines, and never beyond the scene's first and last band.
+    with slopes of second order, and never beyond the scene's first and last band.
     """
 
     name = "smile"
     within_spectra = True  # a factor of a whole spectrum passes through
-    cost_ns = MappingProxyType({CUBIC: 0.9, LINEAR: 0.5})
+    cost_ns = MappingProxyType({"cubic": 0.9})
 
     def missed(self, probe: Probe, rig: Rig, variant: str) -> Bound:
         """Bound it by I' s, and a cubic beside its chord by I'' s (h - s) / 2 in a gap h between bands."""
@@ -169,8 +168,6 @@ class Smile(LightChange):
         if shift > between[up].min():  # bands see gaps that are not next to them
             beside = np.full_like(beside, probe.spectral_curvature.max())
         bent = float((way * (between - way) * beside)[up].max()) / 2
-        if variant == LINEAR:
-            return Bound(bent, f"{shift:.3g} nm at a line's ends, between bands {gaps.max():.3g} nm apart by lines")
         steep = float(np.max(probe.spectral_slope, initial=0))
         why = f"{shift:.3g} nm at a line's ends, on spectra of at most {steep:.3g} {probe.unit}/nm"
         # No slope of the cubic at a band is above the steepest: it adds at most 2 t (1 - t) to the way, t = s / h.
@@ -183,9 +180,9 @@ class Smile(LightChange):
         if smile == 0 or light.shape[-1] < 2:
             return light
         bands = tuple(map(float, block.wavelength_nm))
-        first, weights = _tap_weights(bands, float(smile), camera.samples, variant)
+        first, weights = _tap_weights(bands, float(smile), camera.samples)
         out = np.empty(light.shape, np.float32)
-        neighbour_bands.mix_neighbours(np.ascontiguousarray(light, np.float32), weights, first, out)
+        compiled_loops.mix_neighbours(np.ascontiguousarray(light, np.float32), weights, first, out)
         return out
 
 
@@ -198,15 +195,13 @@ def wavelength_shift(samples: int, smile_nm: float) -> Floats:
 
 
 @lru_cache(maxsize=4)
-def _tap_weights(
-    wavelength_nm: tuple[float, ...], smile_nm: float, samples: int, variant: str
-) -> tuple[int, NDArray[np.float32]]:
+def _tap_weights(wavelength_nm: tuple[float, ...], smile_nm: float, samples: int) -> tuple[int, NDArray[np.float32]]:
     """Give the offset of the first tap and the weights of all, (tap, sample, band)."""
     wavelength, shift = np.array(wavelength_nm), wavelength_shift(samples, smile_nm)
     taps: list[tuple[slice, NDArray[np.int64], Floats]] = []
     for run in rising_runs(wavelength):
         if run.stop - run.start > 1:
-            taps += [(run, off, weight) for off, weight in _run_taps(wavelength[run], shift, variant)]
+            taps += [(run, off, weight) for off, weight in _run_taps(wavelength[run], shift)]
     first = min((int(off.min()) for _, off, _ in taps), default=0)
     last = max((int(off.max()) for _, off, _ in taps), default=0)
     first, last = min(first, 0), max(last, 0)
@@ -222,7 +217,7 @@ def _tap_weights(
     return first + int(low), weights[low : high + 1].astype(np.float32)
 
 
-def _run_taps(wavelength: Floats, shift: Floats, variant: str) -> list[tuple[NDArray[np.int64], Floats]]:
+def _run_taps(wavelength: Floats, shift: Floats) -> list[tuple[NDArray[np.int64], Floats]]:
     """Taps of one run of rising wavelengths: which band beside its own, and how much of it, (sample, band) each."""
     wanted = np.clip(wavelength + shift[:, None], wavelength[0], wavelength[-1])
     gap = np.clip(np.searchsorted(wavelength, wanted, side="right") - 1, 0, len(wavelength) - 2)
@@ -230,8 +225,6 @@ def _run_taps(wavelength: Floats, shift: Floats, variant: str) -> list[tuple[NDA
     t = (wanted - wavelength[gap]) / width
     here = gap - np.arange(len(wavelength))
     near, far = 1 - t, t
-    if variant == LINEAR:
-        return [(here, near), (here + 1, far)]
     # A cubic with these slopes lies beside its chord by -h^2/2 t (1-t) [(1-t) D I_near + t D I_far].
     down, up = difference_rates(wavelength)
     bend_near, bend_far = -(width**2) / 2 * t * (1 - t) * np.stack([1 - t, t])

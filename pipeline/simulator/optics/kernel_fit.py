@@ -17,17 +17,61 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from pipeline.simulator.optics.defocus_disc import Axes, disc_contrast
 from pipeline.simulator.optics.rays import pupil_contrast
 
 Floats = NDArray[np.float64]
+Axes = tuple[float, float]
+# Radii over the disc's of rings of 6, 12, 18 points about one in the middle, and up to which diameter they stand for it
+# behind slit and pixel: fitted, no wave is off by more than 2e-3 of its amplitude.
+_FITTED = ((0.6, ()), (1.7, (0.72,)), (3.3, (0.433, 0.811)), (5.0, (0.312, 0.578, 0.864)))  # diameter [px], radii
+_PX_A_RING = 1.7  # of the diameter, where there are more rings
+_MOST_RINGS = 9
+_SMOOTH = 0.6  # sd of the Gaussian about each point over the distance of rings, where these are as many as may be
+
+
+def disc_contrast(along: Floats, scan: Floats, axes: Axes) -> Floats:
+    """Give what an even elliptic disc of diameters ``axes`` [px] passes of waves [1/px]: 2 J1(v) / v."""
+    v = np.pi * np.hypot(axes[0] * along, axes[1] * scan)
+    return np.asarray(np.where(v > 1e-6, 2 * scipy.special.j1(v) / np.maximum(v, 1e-6), 1.0))
+
+
+@lru_cache(maxsize=64)
+def disc_points(axes: Axes) -> tuple[Floats, Floats]:
+    """Give points (2, point) along line and scan [px], and the variance (2,) of a Gaussian about each [px^2].
+
+    All count alike. With the Gaussians they have the disc's mean and variance, a sixteenth of its diameters squared.
+    Small discs are one Gaussian; of very wide ones the edge is blurred.
+    """
+    radii = _rings(max(axes))
+    counts = [1, *(6 * (ring + 1) for ring in range(len(radii)))]
+    radius = np.repeat([0.0, *radii], counts)
+    turn = np.concatenate([np.arange(count) * (2 * np.pi / count) + 0.3 * ring for ring, count in enumerate(counts)])
+    size = np.array(axes) / 2
+    found: Floats = size[:, None] * radius * np.stack([np.cos(turn), np.sin(turn)])
+    return found, np.maximum(size**2 * (0.25 - (radius**2).mean() / 2), 0.0)
+
+
+def _rings(diameter: float) -> tuple[float, ...]:
+    """Radii over the disc's: each ring in the middle of as much of the disc's area as it has points, or nearly."""
+    for most, radii in _FITTED:
+        if diameter <= most:
+            return radii
+    wanted = math.ceil(diameter / _PX_A_RING)
+    rings = min(wanted, _MOST_RINGS)
+    ends = np.array([3 * ring * (ring + 1) + 1 for ring in range(rings + 1)], np.float64)
+    middle, left = (ends[:-1] + ends[1:]) / 2 / ends[-1], 0.5 / ends[-1]
+    if wanted > rings:
+        left = max(left, 2 * (_SMOOTH / (rings + 0.5)) ** 2)
+    return tuple(np.sqrt(np.maximum(middle - left, 0.0)).tolist())
+
+
 Transfer = NDArray[np.complex128]
 NEGLIGIBLE = 1.5e-3  # of a wave's amplitude, that kernels may pass too much or too little: .07 sigma of a full well's
 THINNED = 5 / 6  # variance that a thinned scene gains, over what its pixels' size squared grows
 _SHARPEST = 0.16  # least size on the ladder, over the widest wave's
 _CORE = 0.4  # of a pattern, over its wave's: the ladder reaches down to that of the narrowest
 _RATIOS = (4.1, 2.6, 1.9)  # of sizes on the ladder's lower part
-_SMOOTH = 0.14  # variance of what looks at a level, beyond that [px^2 of it]: images are then too faint to tell
+_FAINT = 0.14  # variance of what looks at a level, beyond that [px^2 of it]: images are then too faint to tell
 _FARTHEST = 64  # px, or waves: the widest Gaussian
 _SHIFTED_PX = (0.5, 2.0)  # sizes above which the ends of the bands' shifts are enough, and one shift
 _NODES = (1, 2, 3, 4, 6, 8, 12, 16)  # along the curve of the bands' moments
@@ -35,7 +79,7 @@ _MOST_NODES = 8  # beside a pupil's ladder
 _ENOUGH = 1.25  # times the least error: of what comes near it, the fewest kernels are taken
 _OWN = 4  # bands at most that have a kernel each, where there is no diffraction
 _JUDGED = 9  # bands on which a choice of kernels is judged
-_FITTED = (2, 3, 5, 7, 9, 13, 17, 25, 33, 65)  # bands that are fitted: the others are between two of them
+_BASIS = (2, 3, 5, 7, 9, 13, 17, 25, 33, 65)  # bands that are fitted: the others are between two of them
 _LESS = 0.09  # of the square of the nodes' steps, by which each is narrower
 _SUM = 30.0  # weight of the sum of 1 in the fit
 _RADII = np.concatenate([np.geomspace(0.002, 0.1, 10), np.linspace(0.13, 1.3, 18)])  # waves [1/px]
@@ -85,7 +129,7 @@ def _fit(
     chosen = next(kernels for kernels, error in tried if error <= enough)
     chosen = chosen.some(_needed(_passed(chosen, own), wanted, enough))
     passed = _passed(chosen, own)
-    for count in _FITTED:
+    for count in _BASIS:
         fitted = _some(order, count)
         shares = _shares(passed, _wanted(moments[:, fitted], own))
         between = np.stack([np.interp(place, place[fitted], one) for one in np.eye(len(fitted))])
@@ -160,7 +204,7 @@ def _steps(shift: Floats) -> Floats:
 
 
 def _size_at(level: int) -> float:
-    return math.sqrt(THINNED * (1 - 1 / level**2) + _SMOOTH)
+    return math.sqrt(THINNED * (1 - 1 / level**2) + _FAINT)
 
 
 def _nodes(moments: Floats, place: Floats, count: int) -> Floats:

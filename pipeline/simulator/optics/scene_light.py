@@ -17,9 +17,9 @@ from pipeline.simulator.optics.tap_sums import Gatherer, ScenePixels
 from pipeline.simulator.scenes.scene import THINNED_MARGIN, RasterScene
 
 if TYPE_CHECKING:
-    from pipeline.simulator.optics import band_sums
+    from pipeline.simulator import compiled_loops
 else:
-    band_sums = deferred("pipeline.simulator.optics.band_sums")
+    compiled_loops = deferred("pipeline.simulator.compiled_loops")
 
 Floats = NDArray[np.float64]
 Light = NDArray[np.float32]
@@ -32,7 +32,7 @@ class _BandProduct(NamedTuple):
 
     bands: slice
     nodes: slice
-    rows: Light  # as `band_sums.mixing_rows` has them
+    rows: Light  # as `compiled_loops.mixing_rows` has them
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class _Mixing:
             found = np.flatnonzero(between[:, some].any(axis=1))
             nodes = slice(int(found[0]), int(found[-1]) + 1)
             mixing = (between[nodes, None, some] * spectra[:, some]).reshape(-1, some.stop - some.start)
-            products.append(_BandProduct(some, nodes, band_sums.mixing_rows(mixing.astype(np.float32))))
+            products.append(_BandProduct(some, nodes, compiled_loops.mixing_rows(mixing.astype(np.float32))))
         return _Mixing(np.ascontiguousarray(shares), tuple(products))
 
     def write(self, parts: Light, light: Light) -> None:
@@ -63,9 +63,9 @@ class _Mixing:
         if self.shares.size == 1:
             np.multiply(parts, self.shares[0, 0], out=nodes)
         else:
-            band_sums.sum_nodes(parts.reshape(len(parts), -1), self.shares, nodes.reshape(len(nodes), -1))
+            compiled_loops.sum_nodes(parts.reshape(len(parts), -1), self.shares, nodes.reshape(len(nodes), -1))
         for bands, some, rows in self.products:
-            band_sums.mix_bands(nodes, some.start, some.stop, rows, bands.start, bands.stop - bands.start, light)
+            compiled_loops.mix_bands(nodes, some.start, some.stop, rows, bands.start, bands.stop - bands.start, light)
 
 
 class Looker:

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.lazy import deferred
-from pipeline.simulator.optics.defocus_disc import disc_points
-from pipeline.simulator.optics.kernel_fit import Footprint, Moments, fold
+from pipeline.simulator.optics.kernel_fit import Footprint, Moments, disc_points, fold
 from pipeline.simulator.optics.rays import RayViews
 from pipeline.simulator.optics.tap_tables import TAIL, TapTable, box_weight
 

@@ -37,7 +37,7 @@ from pipeline.simulator.effects.probe import (
 from pipeline.simulator.optics.kernel_fit import Moments
 from pipeline.simulator.optics.rays import normals_met
 from pipeline.simulator.rig_model import Rig
-from pipeline.simulator.selection.brought_light import blended_surroundings, light_brought
+from pipeline.simulator.selection.adjacency import blended_surroundings, light_brought
 
 SAFETY = 1.2  # maxima are read off a sample of the scene, derivatives off differences
 LEAST_COST_NS = 1e-3  # nothing that is computed is free: of two that bound alike, the one without cost stays on longer

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from flows.tradeoff.rectify import draw_waves
+from flows.tradeoff.stages import draw_waves
 
 SIDE, BANDS, EDGE = 256, 270, 176  # of the sweep; of the output grid, which lies inside it when turned
 TURN_DEG = 14.0

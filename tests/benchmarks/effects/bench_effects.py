@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 
 import numpy as np
-from measure import Clock, Row, ratio, time_in_turn
+from measure import Row, Timing, ratio, time_in_turn
 
 from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.effect import Effect, Light, SweepBlock
@@ -154,7 +154,7 @@ def _tolerance_row(name: str, apart: Mapping[str, float], decision: Decision) ->
     )
 
 
-def _cpu_row(name: str, against: str, clocks: Mapping[str, Clock], apart: float) -> Row:
+def _cpu_row(name: str, against: str, clocks: Mapping[str, Timing], apart: float) -> Row:
     numbers = len(LINES) * 640 * 270
     ns = {way: 1e9 * clock.cpu_min_s / numbers for way, clock in clocks.items()}
     goal = against == "cheap" and RIGS[name] == Rig()

@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from measure import Clock, Row, ratio, time_in_turn
+from measure import Row, Timing, ratio, time_in_turn
 from numpy.typing import NDArray
 
 from pipeline.geometry.scan import Sweep
@@ -171,5 +171,5 @@ def _error(light: NDArray[np.float32], exact: NDArray[np.float32], rig: Rig) -> 
     return float((np.abs(light - exact) / noise_electrons(exact, rig)).max())
 
 
-def _ns(clock: Clock, values: float) -> float:
+def _ns(clock: Timing, values: float) -> float:
     return clock.cpu_min_s / values * 1e9

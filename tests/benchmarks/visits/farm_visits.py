@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flows.tasks.survey_model import shipped_weights
-from flows.tradeoff.plans import plain_look
+from flows.tradeoff.stages import plain_look
 from flows.training.look import chosen_effects
 from models.evaluation.metrics import confusion, mean_iou
 from models.reading.inference import segment

@@ -20,11 +20,12 @@ import serial
 from rich.console import Console
 
 from flows.settings.load import load_settings
-from flows.simulate.rig_emulation import EmulateRequest, emulated_settings, run_emulate
-from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock, ServedRig
-from pipeline.rig.emulator.fault_names import make_fault
+from flows.simulate.rig_commands import EmulateRequest, emulated_settings, run_emulate
+from pipeline.rig.emulator.emulated_rig import FastClock, ServedRig
 from pipeline.rig.mirror.pro_mode import Command
 from tests.flows.conftest import CommandLine
+from tests.pipeline.rig.camera_faults import FaultyRig
+from tests.pipeline.rig.mirror_faults import make_fault
 from tests.pipeline.rig.small_rig import small_source
 
 SETS = {Command.SET_VALUE, Command.SET_VALUES, Command.SET_VECTOR}
@@ -35,7 +36,7 @@ NOWHERE = "127.0.0.1:1:1"
 def served(*faults: str) -> Iterator[ServedRig]:
     """An emulated rig behind ports, whose faults strike at the first occasion."""
     struck = [make_fault(name, at=0) for name in faults]
-    with EmulatedRig(small_source(), FastClock(20.0), mirror_faults=struck).serve() as rig:
+    with FaultyRig(small_source(), FastClock(20.0), mirror_faults=struck).serve() as rig:
         yield rig
 
 
@@ -66,28 +67,6 @@ def test_settings_file_says_where_both_are(command_line: CommandLine, tmp_path: 
         assert record["port"] == rig.port
         assert record["camera"] == f"{rig.host}:{rig.camera_port}"
         assert not still(rig)
-
-
-@pytest.mark.parametrize(
-    ("fault", "came", "mend"),
-    [
-        ("modem", "/dev/", ""),
-        ("echo", "/dev/", ""),
-        ("wrong-firmware", "LENS-DRIVER-4, version 0.0.1", "rig.expected_id"),
-        ("mirror-warm", "the mirror is too warm", "motions are refused"),
-    ],
-)
-def test_other_devices_and_states_fail_and_nothing_moves(
-    command_line: CommandLine, fault: str, came: str, mend: str
-) -> None:
-    """One row that failed says which; the exit code is 1, and the square that was asked for is not begun."""
-    with served(fault) as rig:
-        ended = command_line("rig", "check", "--port", rig.port, "--move", "--json")
-        (row,) = [row for row in json.loads(ended.out)["rows"] if row["verdict"] == "fail"]
-        assert ended.code == 1
-        assert came in row["came"]
-        assert mend in row["mend"]
-        assert still(rig)
 
 
 def refused(number: int) -> Any:
@@ -144,7 +123,6 @@ def test_one_of_two_devices_is_partly(command_line: CommandLine) -> None:
         ("check", "--port", "nonsense://x"),
         ("check", "--prot", "x"),
         ("nonsense",),
-        ("emulate", "--faults", "nonsense"),
         ("emulate", "--speed", "0"),
         ("emulate", "--baud", "-1"),
         ("emulate", "--size", "12"),
@@ -158,13 +136,7 @@ def test_usage_errors(command_line: CommandLine, words: tuple[str, ...]) -> None
 
 
 def test_rig_in_order(command_line: CommandLine, tmp_path: Path) -> None:
-    """A table of what was asked and came, and nothing moved, also where surveys park; faults are listed."""
-    ended = command_line("rig", "emulate", "--faults", "list", "--json")
-    names = [row["name"] for row in json.loads(ended.out)["faults"]]
-    assert {"reset-in-upload", "camera-full", "never-stable"} <= set(names)
-    table = command_line("rig", "emulate", "--faults", "list")
-    assert table.code == 0
-    assert "camera-cut-cube" in table.out
+    """A table of what was asked and came, and nothing moved, also where surveys park."""
     with served() as rig:
         ended = command_line("rig", "check", "--port", rig.port, "--camera", camera_of(rig))
         assert ended.code == 0
@@ -206,7 +178,7 @@ def test_emulated_rig_is_checked_by_the_file_that_it_writes(command_line: Comman
     wanted: dict[str, object] = {"size": "64x48", "bands": "40,90", "effects": "all", "seed": "3"}
     wanted |= {"rig.mirror_axes": "y,-x", "camera.samples": "320", "detector.noiseless": True, "optics.focus_m": 40.0}
     settings = emulated_settings(None, wanted)
-    request = EmulateRequest(settings, ("split-replies:1",), 0, 20.0, file)
+    request = EmulateRequest(settings, 0, 20.0, file)
     ended, codes = threading.Event(), []
     console = Console(quiet=True)
     thread = threading.Thread(target=lambda: codes.append(run_emulate(request, console, as_json=True, ended=ended)))

@@ -36,7 +36,6 @@ from pipeline.rig.capture.capture_runner import RigDevices
 from pipeline.rig.device_settings import SurveyRig
 from pipeline.rig.devices import SYSTEM_CLOCK, DeviceGone
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock
-from pipeline.rig.emulator.fault_names import CameraFault, make_fault
 from pipeline.rig.emulator.mirror_device import Mode
 from pipeline.rig.emulator.scene_camera import REFERENCE_FRAMES, SceneView
 from pipeline.rig.mirror.pro_mode import Command
@@ -51,7 +50,9 @@ from storage.arrays.cubes import open_raw_cube
 from storage.remote.opening import verify_archive
 from tests.conftest import patchy_scene
 from tests.flows.conftest import CommandLine
+from tests.pipeline.rig.camera_faults import CameraFault, FaultyRig
 from tests.pipeline.rig.in_process import InProcessRig, ManualClock
+from tests.pipeline.rig.mirror_faults import make_fault
 from tests.remembered_work import without_effects
 
 QUIET = Console(quiet=True)
@@ -80,11 +81,11 @@ def emulated(
     *,
     scene: RasterScene | None = None,
     mounting: Mounting = STRAIGHT,
-) -> Iterator[EmulatedRig]:
+) -> Iterator[FaultyRig]:
     """Devices of surveys are emulated ones before a scene, the settings' by default, with effects, mounted somehow."""
     seen = open_scene(settings)[0] if scene is None else scene
     source = replace(make_source(seen, settings), chosen=effects)
-    whole = EmulatedRig(source, ManualClock(10.0), wired=settings.rig.pulses, mounting=mounting)
+    whole = FaultyRig(source, ManualClock(10.0), wired=settings.rig.pulses, mounting=mounting)
     with InProcessRig(whole) as line:
 
         def open_devices(told: Settings, *_: object) -> RigDevices:
@@ -414,7 +415,7 @@ def test_another_device_is_not_moved(command_line: CommandLine, tmp_path: Path, 
     """What answers as no mirror controller does, or as none that is known, is told nothing but who it should say."""
     settings = small_settings(tmp_path)
     scene, _ = open_scene(settings)
-    rig = EmulatedRig(make_source(scene, settings), FastClock(20), mirror_faults=[make_fault(fault, at=0)])
+    rig = FaultyRig(make_source(scene, settings), FastClock(20), mirror_faults=[make_fault(fault, at=0)])
     with rig.serve() as served:
         told = {"port": served.port, "host": served.host, "control_port": served.camera_port, "park_at_close": True}
         assert words in told_on_the_command_line(command_line, tmp_path, **told)

@@ -20,8 +20,13 @@ from pipeline.geometry.mirror import (
     position_to_direction,
     scene_to_direction,
 )
-from pipeline.geometry.paper_equations import LINE_MODELS, line_points, straight_slope_rotation, unlimited_position
 from pipeline.geometry.scan import CostModel, Sweep, device_range, memory_loads
+from tests.pipeline.geometry.paper_equations import (
+    LINE_MODELS,
+    line_points,
+    straight_slope_rotation,
+    unlimited_position,
+)
 
 CAMERA = LineCamera()
 IFOV = CAMERA.ifov_rad

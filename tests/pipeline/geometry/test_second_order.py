@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_normal, scene_to_direction
-from pipeline.geometry.paper_equations import line_points
+from tests.pipeline.geometry.paper_equations import line_points
 
 _REST_INCIDENCE = float(np.sqrt(0.5))
 _STEEPEST, _SHALLOWEST = float(np.sin(np.deg2rad(20.0))), float(np.sin(np.deg2rad(70.0)))

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,15 +18,14 @@ from pipeline.rig.camera.camera_files import Kept, KeptInMemory
 from pipeline.rig.capture.capture_runner import RigDevices
 from pipeline.rig.capture.rig_source import RigSource
 from pipeline.rig.device_settings import SurveyRig
-from pipeline.rig.emulator.emulated_rig import EmulatedRig
-from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults
-from pipeline.rig.emulator.mirror_device import Fault
 from pipeline.simulator.effects.registry import effects_on
 from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.scene import raster_from_values
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Line
+from tests.pipeline.rig.camera_faults import CameraFault, CameraFaults, FaultyRig
 from tests.pipeline.rig.in_process import InProcessRig, ManualClock
+from tests.pipeline.rig.mirror_faults import Fault
 
 CAMERA = LineCamera(samples=48)
 NAMES = ("rotation", "slit", "smear", "vignetting", "shot", "read-noise")
@@ -67,9 +66,9 @@ class SmallRig:
     opened: int = 0
 
     @property
-    def emulated(self) -> EmulatedRig:
+    def emulated(self) -> FaultyRig:
         """Both emulated devices."""
-        return self.line.rig
+        return cast("FaultyRig", self.line.rig)
 
     @property
     def captures(self) -> list[str]:
@@ -100,7 +99,7 @@ def small_rig(
     *,
     faults: dict[CameraFault, int] | None = None,
     passes: int = 0,
-    mirror_faults: Sequence[Fault] = (),
+    mirror_faults: list[Fault] | tuple[Fault, ...] = (),
     vector_pairs: int = 1500,
     mounting: Mounting = STRAIGHT,
     **settings: Any,
@@ -111,7 +110,7 @@ def small_rig(
     """
     told = {"pulses": "position", "with_crc": True, **settings}
     looked = small_source() if source is None else source
-    rig = EmulatedRig(
+    rig = FaultyRig(
         looked,
         ManualClock(50.0),
         mirror_faults=mirror_faults,

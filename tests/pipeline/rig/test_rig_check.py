@@ -18,16 +18,14 @@ from pipeline.rig.capture.capture_paths import capture_prefix
 from pipeline.rig.device_settings import FileServer, MirrorSettings, Pulses
 from pipeline.rig.devices import Clock, DeviceGone, DeviceRefused
 from pipeline.rig.emulator.camera_device import CameraUnit
-from pipeline.rig.emulator.emulated_rig import EmulatedRig
-from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults, make_fault
 from pipeline.rig.emulator.mirror_device import Mode
 from pipeline.rig.emulator.mirror_state import MirrorUnit
-from pipeline.rig.mirror.mirror_controller import MirrorController
-from pipeline.rig.mirror.path_player import MotionLog
-from pipeline.rig.mirror.pro_mode import Command
-from pipeline.rig.mirror.registers import Status
+from pipeline.rig.mirror.mirror_controller import MirrorController, MotionLog
+from pipeline.rig.mirror.pro_mode import Command, Status
 from pipeline.rig.rig_check import SQUARE, CheckRow, check_camera, check_mirror, check_triggers, failed, works
+from tests.pipeline.rig.camera_faults import CameraFault, CameraFaults, FaultyRig
 from tests.pipeline.rig.in_process import InProcessRig, ManualClock
+from tests.pipeline.rig.mirror_faults import make_fault
 from tests.pipeline.rig.small_rig import CAMERA, FINE, small_source
 
 FRAMES = "frames with and without a CRC"
@@ -38,7 +36,7 @@ SETS = {Command.SET_VALUE, Command.SET_VALUES, Command.SET_VECTOR}
 def rig(*faults: str, camera: CameraFaults | None = None, **given: Any) -> Iterator[InProcessRig]:
     """An emulated rig whose mirror's faults strike at the first occasion."""
     struck = [make_fault(name, at=0) for name in faults]
-    whole = EmulatedRig(small_source(), ManualClock(), mirror_faults=struck, camera_faults=camera, **given)
+    whole = FaultyRig(small_source(), ManualClock(), mirror_faults=struck, camera_faults=camera, **given)
     with InProcessRig(whole) as line:
         yield line
 

@@ -95,7 +95,7 @@ def test_light_of_what_is_swept_is_kept(
 
     Of the tails of diffraction a part falls beside what is swept: they have a law of their own.
     """
-    straight = chosen | {ROTATION: OFF, DIFFRACTION: "gaussian"}
+    straight = chosen | {ROTATION: OFF, DIFFRACTION: OFF}
     light = seen(scene_of(picture), Sweep("s", "fine", along, strip, start, 40), straight)
     np.testing.assert_allclose(light.sum(axis=(0, 1)), PICTURES[picture].sum(), rtol=2e-5)
 

@@ -10,8 +10,8 @@ import pytest
 from pipeline.rig.devices import DeviceRefused
 from pipeline.rig.emulator.camera_device import CameraDevice, CameraUnit
 from pipeline.rig.emulator.camera_server import CameraConnection
-from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults
 from tests.pipeline.rig.camera.camera_line import LinesOf, control_of
+from tests.pipeline.rig.camera_faults import CameraFault, CameraFaults, FaultyCamera
 from tests.pipeline.rig.in_process import ManualClock
 
 CAPTURE = b'capture({"prefix": "", "maxCubes": 1, "maxFramesPerCube": 5})'
@@ -21,7 +21,7 @@ PROMPT = b"\r\nhpi> "
 def device_with(fault: CameraFault | None = None, times: int = 1, seed: int = 0, **unit: object) -> CameraDevice:
     """A camera with one fault."""
     faults = CameraFaults({} if fault is None else {fault: times}, seed)
-    return CameraDevice(LinesOf(), ManualClock(), unit=CameraUnit(**unit), faults=faults)  # type: ignore[arg-type]
+    return FaultyCamera(LinesOf(), ManualClock(), unit=CameraUnit(**unit), faults=faults)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

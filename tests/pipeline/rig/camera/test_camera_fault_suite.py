@@ -20,11 +20,11 @@ from pipeline.geometry.scan import Sweep
 from pipeline.rig.camera.camera_files import KeptInMemory
 from pipeline.rig.capture.capture_runner import RigDevices
 from pipeline.rig.device_settings import ControlPatience
-from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults, make_fault
-from pipeline.rig.emulator.mirror_device import Fault
-from pipeline.rig.mirror.registers import Status
+from pipeline.rig.mirror.pro_mode import Status
 from pipeline.source import Line
+from tests.pipeline.rig.camera_faults import CameraFault, CameraFaults
 from tests.pipeline.rig.mirror.test_fault_suite import moves
+from tests.pipeline.rig.mirror_faults import Fault, make_fault
 from tests.pipeline.rig.small_rig import SmallRig, assert_simulated, small_rig
 
 SEEDS = range(8)
@@ -173,7 +173,7 @@ def session(looks: Looks, undisturbed: list[Line], camera: CameraFaults, mirror:
     assert len(captures) >= len(told)
 
 
-@pytest.mark.parametrize("fault", CameraFault, ids=lambda fault: str(fault.value))
+@pytest.mark.parametrize("fault", CameraFault, ids=lambda fault: fault.name)
 def test_no_fault_of_the_camera_loses_lines_or_hangs(fault: CameraFault, looks: Looks, undisturbed: list[Line]) -> None:
     """Eight sweeps with each: struck once at some occasion, or so often that asking again does not help."""
     ended, struck = 0, 0

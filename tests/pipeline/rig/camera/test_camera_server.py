@@ -17,9 +17,9 @@ from pipeline.rig.device_settings import CameraAddress, ControlPatience, FileSer
 from pipeline.rig.devices import SYSTEM_CLOCK, DeviceGone, DeviceRefused
 from pipeline.rig.emulator.camera_device import MOST_LINE, CameraDevice, CameraUnit, FrameClock, IndexLayout
 from pipeline.rig.emulator.camera_server import CameraConnection, CameraServer
-from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults
 from pipeline.rig.transports import SocketTransport
 from tests.pipeline.rig.camera.camera_line import LinesOf, wait_for
+from tests.pipeline.rig.camera_faults import CameraFault, CameraFaults, FaultyCamera, FaultyServer
 from tests.pipeline.rig.in_process import ManualClock
 
 
@@ -35,8 +35,8 @@ def camera(
 ) -> Iterator[tuple[HeadwallCamera, CameraDevice, LinesOf]]:
     """A served camera, its driver by the same clock, and what it sees."""
     clock, lines = ManualClock(100.0), LinesOf()
-    device = CameraDevice(lines, clock, unit=unit, faults=CameraFaults(dict(faults or {})))
-    with CameraServer(device) as served:
+    device = FaultyCamera(lines, clock, unit=unit, faults=CameraFaults(dict(faults or {})))
+    with FaultyServer(device) as served:
         files = FileServer(served.host, served.file_port, stall_s=2.0, pause_s=0.01, **server)  # type: ignore[arg-type]
         driver = HeadwallCamera.at(CameraAddress(served.host, served.port), files, clock=clock)
         yield driver, device, lines
@@ -185,7 +185,7 @@ def test_server_closes_cleanly() -> None:
 
 def test_silence_on_a_real_socket() -> None:
     """By the system's clock a lost reply costs its deadline, and the next connection answers."""
-    device = CameraDevice(LinesOf(), SYSTEM_CLOCK, faults=CameraFaults({CameraFault.SILENT: 1}))
+    device = FaultyCamera(LinesOf(), SYSTEM_CLOCK, faults=CameraFaults({CameraFault.SILENT: 1}))
     with CameraServer(device) as served:
         driver = HeadwallCamera.at(
             CameraAddress(served.host, served.port), FileServer(), patience=ControlPatience(0.3, 1, 0.01)
@@ -197,7 +197,7 @@ def test_silence_on_a_real_socket() -> None:
 
 def test_closing_does_not_wait_for_what_is_late() -> None:
     """A reply that a fault holds back for a minute holds back nobody who closes the camera."""
-    device = CameraDevice(LinesOf(), SYSTEM_CLOCK, faults=CameraFaults({CameraFault.LATE: 1}))
+    device = FaultyCamera(LinesOf(), SYSTEM_CLOCK, faults=CameraFaults({CameraFault.LATE: 1}))
     with CameraServer(device) as served, socket.create_connection((served.host, served.port), timeout=5) as client:
         client.sendall(b"isCapturing\r")
         while not device.commands:

@@ -11,10 +11,9 @@ import pytest
 from pipeline.errors import RigError
 from pipeline.rig.camera.camera_files import KeptInMemory, RemoteFile, fetch_files
 from pipeline.rig.device_settings import FileServer
-from pipeline.rig.emulator.camera_device import CameraDevice, CameraUnit
-from pipeline.rig.emulator.camera_server import CameraServer
-from pipeline.rig.emulator.fault_names import CameraFault
+from pipeline.rig.emulator.camera_device import CameraUnit
 from tests.pipeline.rig.camera.camera_line import LinesOf, control_of
+from tests.pipeline.rig.camera_faults import CameraFault, FaultyCamera, FaultyServer
 from tests.pipeline.rig.chaos_line import ChaosLine
 from tests.pipeline.rig.chaotic_surveys import survey_in_chaos
 from tests.pipeline.rig.in_process import ManualClock
@@ -32,15 +31,15 @@ def test_surveys_through_chaos(first: int) -> None:
 
 
 @contextmanager
-def dark_frames() -> Iterator[tuple[bytes, CameraServer]]:
+def dark_frames() -> Iterator[tuple[bytes, FaultyServer]]:
     """A served dark reference of 32 frames, even but for some hot elements, as the camera writes it."""
     frames = np.full((32, 6, 4), 64, np.uint16)
     frames[:, 2, 1] = frames[:, 5, 3] = 3910
     clock = ManualClock()
-    device = CameraDevice(LinesOf(), clock, unit=CameraUnit(references={"darkReference": frames}))
+    device = FaultyCamera(LinesOf(), clock, unit=CameraUnit(references={"darkReference": frames}))
     control_of(device, clock).capture(1)
     clock.advance(1.0)
-    with CameraServer(device) as served:
+    with FaultyServer(device) as served:
         yield device.files()[DARK], served
 
 

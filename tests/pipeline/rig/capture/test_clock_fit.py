@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import RigError, ShapeError
-from pipeline.rig.capture.clock_fit import fit_clocks, match_edges
+from pipeline.rig.capture.line_positions import fit_clocks, match_edges
 
 ORIGIN = 1_700_000_000_000_000
 

@@ -9,9 +9,9 @@ import pytest
 
 from pipeline.errors import RigError, ShapeError
 from pipeline.geometry.camera import LineCamera
-from pipeline.rig.capture.clock_fit import FrameTimes
 from pipeline.rig.capture.line_positions import (
     CommandTimes,
+    FrameTimes,
     LinePositions,
     MirrorTrack,
     PlayedPath,

@@ -13,8 +13,9 @@ from pipeline.rig.camera.camera_files import KeptInMemory
 from pipeline.rig.camera.headwall_camera import HeadwallCamera
 from pipeline.rig.capture import JOURNAL
 from pipeline.rig.devices import DeviceGone, DeviceRefused, StateUnknown
-from pipeline.rig.emulator.fault_names import CameraFault, CameraFaults, make_fault
 from pipeline.source import Line
+from tests.pipeline.rig.camera_faults import CameraFault, CameraFaults
+from tests.pipeline.rig.mirror_faults import make_fault
 from tests.pipeline.rig.small_rig import COARSE, FINE, SmallRig, assert_simulated, small_rig, small_source
 
 

@@ -19,7 +19,7 @@ from pipeline.rig.device_settings import CameraAddress, FileServer, MirrorSettin
 from pipeline.rig.devices import SYSTEM_CLOCK, Clock, DeviceGone
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock
 from pipeline.rig.mirror.mirror_controller import MirrorController, open_mirror
-from pipeline.rig.mirror.registers import Trigger
+from pipeline.rig.mirror.pro_mode import Trigger
 from pipeline.rig.transports import SocketTransport
 from pipeline.simulator.effects.registry import QUIET
 from pipeline.simulator.simulated import SimulatedSource

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from pipeline.rig.emulator.mirror_device import MirrorDevice, Mode
 from pipeline.rig.emulator.mirror_state import MirrorUnit
-from pipeline.rig.mirror.registers import Status
+from pipeline.rig.mirror.pro_mode import Status
 from tests.pipeline.rig.in_process import ManualClock
 
 GO_PRO_CRC = b"GOPROCRC\r\n"
@@ -50,7 +50,6 @@ PRO = {
     "simple mode": ("7e 00 06 02 00 00 a1 48 7e", "7e 00 06 00 03 a0 7e"),
     "get value": ("7e 00 11 02 50 01 59 3c 7e", "7e 00 11 04 00 00 00 00 f2 81 7e"),  # the documented pair
     "get feedback": ("7e 00 11 02 23 02 3c 0d 7e", "7e 00 11 04 00 00 00 00 f2 81 7e"),
-    "get temperature": ("7e 00 11 02 22 00 bc 5c 7e", "7e 00 11 04 00 00 00 19 33 4b 7e"),
     "get cycles": ("7e 00 11 02 68 07 ca fe 7e", "7e 00 11 04 ff ff ff ff f3 15 7e"),
     "get index": ("7e 00 11 02 68 0a 0b 3b 7e", "7e 00 11 04 00 00 00 00 f2 81 7e"),
     "set value": ("7e 00 10 06 50 02 3f 00 00 00 1e 88 7e", "7e 00 10 00 0d c0 7e"),

@@ -13,72 +13,18 @@ import serial
 
 from pipeline.errors import RigError, SettingsError
 from pipeline.rig.device_settings import MirrorSettings
-from pipeline.rig.devices import SYSTEM_CLOCK, DeadlinePassed, DeviceGone
+from pipeline.rig.devices import SYSTEM_CLOCK, DeviceGone
 from pipeline.rig.emulator.emulated_rig import EmulatedPort, FastClock
-from pipeline.rig.emulator.fault_names import make_fault
 from pipeline.rig.emulator.mirror_device import MirrorDevice
 from pipeline.rig.mirror.mirror_controller import open_mirror
 from tests.pipeline.rig.in_process import InProcessTransport, ManualClock
+from tests.pipeline.rig.mirror_faults import FaultyMirror, make_fault
 
 
 def line(*faults: str, baud: int = 0) -> InProcessTransport:
     """A line to a controller with faults that strike at once."""
     clock = ManualClock()
-    return InProcessTransport(MirrorDevice(clock, [make_fault(name, at=0) for name in faults]), clock, baud=baud)
-
-
-def test_bytes_come_in_order_and_no_more_than_asked_for() -> None:
-    """Reads give what is there, in parts if fewer are asked for."""
-    transport = line()
-    transport.write(b"START\r\nGETID\r\n", 1.0)
-    assert transport.drain() == b""
-    assert [transport.read(5, 1.0), transport.read(3, 1.0), transport.read(99, 1.0)] == [b"OK\r\nM", b"R-E", b"-2\r\n"]
-    assert transport.clock.now() < 0.01
-    assert transport.sent == [b"START\r\nGETID\r\n"]
-
-
-def test_bytes_take_their_time_on_the_line() -> None:
-    """At 9600 baud 7 bytes there and 4 back take 11 times 10 bits, besides the controller's own time."""
-    transport = line(baud=9600)
-    transport.write(b"START\r\n", 1.0)
-    assert transport.read(10, 1.0) == b"OK\r\n"
-    assert transport.clock.now() == pytest.approx(110 / 9600 + 2e-4)
-
-
-@pytest.mark.parametrize(("name", "acts"), [("gone-before", 0), ("gone-within", 0), ("gone-after", 1)])
-def test_a_device_that_goes_is_gone(name: str, acts: int) -> None:
-    """Whether it is gone at once or when it is read from, and for good; only after a request it was carried out."""
-    transport = line(name)
-
-    def ask() -> None:
-        transport.write(b"START\r\n", 1.0)
-        transport.read(10, 1.0)
-
-    for _ in range(2):
-        with pytest.raises(DeviceGone, match="went away; look at the cable"):
-            ask()
-    assert len(transport.device.acts) == acts
-
-
-def test_a_port_that_hangs_takes_nothing_until_the_deadline() -> None:
-    """The first bytes go nowhere, then writing blocks until its deadline."""
-    transport = line("hangs")
-    transport.write(b"START\r\n", 1.0)
-    assert transport.read(10, 1.0) == b""
-    with pytest.raises(DeadlinePassed, match="did not take 7 bytes"):
-        transport.write(b"START\r\n", 3.0)
-    assert transport.clock.now() == 3.0
-
-
-def test_a_line_waits_until_its_deadline_and_is_closed_for_good() -> None:
-    """Where nothing comes, the clock stands at the deadline; once it is closed nothing can be sent or read."""
-    transport = line()
-    assert transport.read(10, 2.5) == b""
-    assert transport.clock.now() == 2.5
-    transport.close()
-    for use in (lambda: transport.write(b"START\r\n", 1.0), lambda: transport.read(1, 1.0)):
-        with pytest.raises(DeviceGone, match="is closed"):
-            use()
+    return InProcessTransport(FaultyMirror(clock, [make_fault(name, at=0) for name in faults]), clock, baud=baud)
 
 
 ASKED = bytes.fromhex("7e 00 11 02 50 01 59 3c 7e")
@@ -90,7 +36,7 @@ REPLIED = bytes.fromhex("7e 00 11 04 00 00 00 00 f2 81 7e")
 @contextmanager
 def opened(*faults: str, baud: int = 0) -> Iterator[tuple[EmulatedPort, serial.Serial]]:
     """An emulated port with faults that strike at once, and a user of it."""
-    device = MirrorDevice(SYSTEM_CLOCK, [make_fault(name, at=0) for name in faults])
+    device = FaultyMirror(SYSTEM_CLOCK, [make_fault(name, at=0) for name in faults])
     with (
         EmulatedPort(device, baud=baud) as port,
         serial.Serial(port.path, 115200, timeout=2.0, write_timeout=0.5, exclusive=True) as user,
@@ -143,24 +89,14 @@ def test_nothing_is_left_behind() -> None:
     assert (threading.active_count(), descriptors()) == before
 
 
-@pytest.mark.parametrize("name", ["gone-before", "gone-after"])
-def test_a_device_that_goes_takes_the_port_with_it(name: str) -> None:
+def test_a_device_that_goes_takes_the_port_with_it() -> None:
     """The user's next read or write fails as with a pulled cable, and the port still closes cleanly."""
     before = threading.active_count()
-    with opened(name) as (_, user):
+    with opened("gone-before") as (_, user):
         user.write(b"START\r\n")
         with pytest.raises((serial.SerialException, OSError)):
             user.read(1)
     assert threading.active_count() == before
-
-
-def test_a_port_that_hangs_makes_writing_block() -> None:
-    """Once the system's own room is full, writing times out; nothing is answered."""
-    with opened("hangs") as (_, user):
-        user.write(b"START\r\n")
-        with pytest.raises(serial.SerialTimeoutException):
-            user.write(bytes(1 << 20))
-        user.reset_output_buffer()
 
 
 def test_bytes_keep_to_the_speed() -> None:
@@ -181,7 +117,7 @@ def test_the_driver_drives_it() -> None:
         mirror.settle(2.0)
         assert device.positions(SYSTEM_CLOCK.now()) == pytest.approx((0.1, -0.2), abs=1e-3)
         mirror.load_path([(0.0, 0.0), (0.1, 0.1)], "all")
-    device = MirrorDevice(SYSTEM_CLOCK, [make_fault("gone-before", at=5)])
+    device = FaultyMirror(SYSTEM_CLOCK, [make_fault("gone-before", at=5)])
     with EmulatedPort(device) as port, pytest.raises(DeviceGone, match=f"{port.path} went away"):
         open_mirror(MirrorSettings(port=port.path)).goto(0.0, 0.0)
 

@@ -9,36 +9,32 @@ import pytest
 from numpy.typing import NDArray
 
 from pipeline.geometry.scan import Ends
-from pipeline.rig.emulator import mirror_motion
 from pipeline.rig.emulator.mirror_device import MirrorDevice
-from pipeline.rig.emulator.mirror_motion import MOST_STEPS, AxisMotion, Stiffness, VectorPlayer
-from pipeline.rig.emulator.mirror_state import MirrorUnit
+from pipeline.rig.emulator.mirror_state import AxisMotion, Stiffness, VectorPlayer
 from pipeline.rig.mirror.pro_mode import (
-    ErrorCode,
-    Frame,
-    FrameReader,
-    Value,
-    cell_float,
-    cell_int,
-    encode,
-    get_value,
-    get_vector,
-    refuse,
-    set_values,
-    set_vector,
-)
-from pipeline.rig.mirror.registers import (
     FEEDBACK_X,
     FEEDBACK_Y,
     LOG_RATE,
     LOG_RUN,
     VECTOR_MEMORY,
+    ErrorCode,
+    Frame,
+    FrameReader,
     Trigger,
     Unit,
+    Value,
     VectorRegister,
     X,
     Y,
+    cell_float,
+    cell_int,
+    encode,
+    get_value,
+    get_vector,
     log_slot,
+    refuse,
+    set_values,
+    set_vector,
 )
 from tests.pipeline.rig.in_process import ManualClock
 from tests.pipeline.rig.mirror.mirror_bytes import set_value
@@ -79,27 +75,6 @@ def test_steps_add_up() -> None:
         assert axis.place(time_s) == pytest.approx(float(axis.places(time_s)), abs=1e-14)
 
 
-def test_the_bound_on_what_is_left_is_one() -> None:
-    """From any time on the axis never is farther off its command than the bound said then."""
-    axis = AxisMotion(Stiffness(20.0, 0.05))
-    axis.command(0.0, 1.0)
-    for time_s in np.linspace(0, 0.5, 50).tolist():
-        later = time_s + np.linspace(0, 0.3, 300)
-        assert np.max(np.abs(axis.places(later) - 1)) <= axis.unsettled(time_s) * (1 + 1e-9)
-
-
-def test_an_old_past_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The memory of an axis is bounded; what it still knows is unchanged."""
-    monkeypatch.setattr(mirror_motion, "KEPT_STEPS", 100)
-    axis, short = AxisMotion(STIFF), AxisMotion(STIFF)
-    for number in range(1000):
-        axis.command(number * 0.01, number % 2)
-        if number >= 700:
-            short.command(number * 0.01, number % 2)
-    assert len(axis._time) <= 200
-    assert axis.place(20.0) == pytest.approx(short.place(20.0), abs=1e-9)
-
-
 def player(**settings: object) -> VectorPlayer:
     """A unit that plays cells 4 to 7 at 100 Hz."""
     return VectorPlayer(**{"start": 4, "end": 7, "frequency_hz": 100.0, "cycles": 2, **settings})  # type: ignore[arg-type]
@@ -119,15 +94,6 @@ def test_cells_are_played_in_turn_as_often_as_asked(ends: Ends, cells: list[int]
     assert unit.index == cells[-1]
 
 
-def test_it_does_not_matter_how_often_it_is_asked() -> None:
-    """Steps asked for at many moments are those asked for at once."""
-    often, once = player(cycles=-1), player(cycles=-1)
-    often.run(0.0)
-    once.run(0.0)
-    steps = [step for now in np.linspace(0, 1, 337) for step in often.due(float(now))]
-    assert steps == list(once.due(1.0))
-
-
 @pytest.mark.parametrize(
     ("kind", "cells"), [(Trigger.RISING_EDGE, [4, 5, 6, 4]), (Trigger.BOTH_EDGES, [4, 5, 6, 4, 5, 6])]
 )
@@ -141,20 +107,6 @@ def test_edges_take_one_cell_each(kind: Trigger, cells: list[int]) -> None:
     assert [cell for _, cell in unit.due(0.55)] == cells[: 2 if kind is Trigger.RISING_EDGE else 3]
     assert [cell for _, cell in unit.due(2.0)][-1] == cells[-1]
     assert unit.index == cells[-1]
-
-
-def test_a_long_silence_costs_no_more_than_its_end() -> None:
-    """Of an hour only the last steps are played, to the right cell; the cell at a past time is its last step's."""
-    unit = player(cycles=-1, frequency_hz=10_000.0)
-    unit.run(0.0)
-    steps = list(unit.due(3600.0))
-    assert len(steps) <= MOST_STEPS + 1
-    assert unit.index == 4 + 36_000_000 % 3
-    unit = player(cycles=1)
-    assert unit.indices(np.array([0.0])).tolist() == [4]
-    unit.run(0.0)
-    list(unit.due(1.0))
-    assert unit.indices(np.array([-1.0, 0.0, 0.0099, 0.0101, 5.0])).tolist() == [4, 4, 4, 5, 6]
 
 
 PATH = np.array([(0.1, 0.0), (0.2, 0.1), (0.3, -0.1), (0.2, 0.2)])
@@ -225,26 +177,6 @@ def test_a_run_moves_the_mirror_along_the_path() -> None:
     assert cell_int(ask(device, get_value(X.vector(VectorRegister.RUN))).payload) == 0
 
 
-def test_the_index_and_the_output_tell_the_cell() -> None:
-    """While it runs, index and output are those of the cell that is held; unfollowed, a unit moves nothing."""
-    clock = ManualClock()
-    device = loaded(clock, cycles=-1)
-    do(device, set_values({X.vector(VectorRegister.RUN): 1, Y.vector(VectorRegister.RUN): 1}))
-    clock.advance(1.0)
-    np.testing.assert_array_equal(device.positions(clock.now()), (0, 0))
-    run(device)
-    for number in range(6):
-        clock.advance(0.01)
-        assert cell_int(ask(device, get_value(Y.vector(VectorRegister.INDEX))).payload) == 4 + number % 4
-        output = cell_float(ask(device, get_value(Y.vector(VectorRegister.OUTPUT))).payload)
-        assert output == pytest.approx(PATH[number % 4, 1], abs=1e-7)
-        clock.advance(0.01)
-    clock.advance(0.01)
-    do(device, set_values({X.vector(VectorRegister.RUN): 0, Y.vector(VectorRegister.RUN): 0}))
-    clock.advance(1.0)
-    np.testing.assert_allclose(device.positions(clock.now()), PATH[2], atol=1e-6)
-
-
 def test_a_cameras_pulses_step_through_the_path() -> None:
     """The first position is taken at the run command, each pulse takes the next; pulses may lie in the future."""
     clock = ManualClock()
@@ -279,17 +211,3 @@ def test_the_log_holds_the_true_positions() -> None:
     assert len(ask(device, get_vector(log_slot(0), 95, 5)).payload) == 20
     beyond = get_vector(log_slot(0), 96, 5)
     assert ask(device, beyond) == refuse(beyond.command, ErrorCode.VECTOR_INDEX)
-
-
-def test_a_log_that_is_full_stops_and_can_be_run_anew() -> None:
-    """The logger runs no longer than it has rows, and says so; a second run begins at row 0 again."""
-    clock = ManualClock()
-    device = MirrorDevice(clock, unit=MirrorUnit(log_rows=20))
-    device.receive(b"X=0.5\r\nGOPRO\r\n")
-    do(device, set_value(log_slot(0), FEEDBACK_X))
-    for _ in range(2):
-        do(device, set_value(LOG_RUN, 1))
-        assert cell_int(ask(device, get_value(LOG_RUN)).payload) == 1
-        clock.advance(1.0)
-        assert cell_int(ask(device, get_value(LOG_RUN)).payload) == 0
-    assert cell_float(ask(device, get_vector(log_slot(0), 0, 1)).payload) == pytest.approx(0.5, abs=1e-6)

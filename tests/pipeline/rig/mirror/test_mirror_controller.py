@@ -16,7 +16,7 @@ from pipeline.rig.emulator.mirror_device import MirrorDevice
 from pipeline.rig.mirror import mirror_controller
 from pipeline.rig.mirror.mirror_controller import MirrorController, open_mirror
 from pipeline.rig.mirror.mirror_requests import Identity
-from pipeline.rig.mirror.registers import Status, Trigger
+from pipeline.rig.mirror.pro_mode import Status, Trigger
 from tests.pipeline.rig.in_process import InProcessTransport, ManualClock
 from tests.pipeline.rig.mirror import mirror_bytes as w
 from tests.pipeline.rig.mirror.mirror_bytes import connected, pair

@@ -11,11 +11,18 @@ from hypothesis import strategies as st
 
 from pipeline.errors import ShapeError
 from pipeline.rig.mirror.pro_mode import (
+    FEEDBACK_X,
+    FEEDBACK_Y,
+    VECTOR_MEMORY,
     Command,
     Damaged,
     ErrorCode,
     Frame,
     FrameReader,
+    Status,
+    VectorRegister,
+    X,
+    Y,
     ask_status,
     cell_float,
     cell_int,
@@ -27,6 +34,7 @@ from pipeline.rig.mirror.pro_mode import (
     get_vector,
     go_simple,
     int_cell,
+    log_slot,
     read_register,
     read_registers,
     read_values,
@@ -38,7 +46,6 @@ from pipeline.rig.mirror.pro_mode import (
     to_cell,
     values_reply,
 )
-from pipeline.rig.mirror.registers import FEEDBACK_X, FEEDBACK_Y, VECTOR_MEMORY, Status, VectorRegister, X, Y, log_slot
 from tests.pipeline.rig.mirror.mirror_bytes import ASK_FIRMWARE, set_value
 
 nasty = st.one_of(

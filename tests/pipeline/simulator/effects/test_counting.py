@@ -90,35 +90,6 @@ def test_the_bound_of_the_cheap_draw_is_stated_for_a_patch() -> None:
     assert SHOT.bound(probe(100, 10_000), RIG, "exact").value == 0
 
 
-def test_dark_current_bound_holds() -> None:
-    """The mean of all numbers moves by no more than said, and by nearly as much at the darkest sample."""
-    light = np.linspace(50, 8000, 6 * 64 * 3).reshape(6, 64, 3).astype(np.float32)
-    rig = Rig(camera=LineCamera(samples=64, exposure_ms=800.0))
-    block = block_of(rig, NM)
-    on, off = (read_out(light, block, chosen).astype(np.float64) for chosen in ({DARK_CURRENT: "exact"}, {}))
-    measured = np.max((on - off) * 5 / np.sqrt(light + 400.0))
-    assert measured <= DARK_CURRENT.bound(probe_of(light, NM), rig).value * 1.02
-    assert measured > DARK_CURRENT.bound(probe_of(light, NM), rig).value / 2
-
-
-def test_defects_bound_holds() -> None:
-    """Dead and hot elements change no number by more than said, in both units."""
-    light = np.random.default_rng(0).uniform(50, 8000, (6, 640, 3)).astype(np.float32)
-    for unit, sigma in (("sigma", np.sqrt(light + 400.0) / 5), ("dn", 1.0)):
-        for detector in (
-            Detector(dead_share=0.01),
-            Detector(hot_share=0.01),
-            Detector(dead_share=0.01, hot_share=0.01),
-        ):
-            rig = Rig(detector=detector)
-            block = block_of(rig, NM)
-            on, off = (read_out(light, block, chosen).astype(np.float64) for chosen in ({DEFECTS: "exact"}, {}))
-            measured = float(np.max(np.abs(on - off) / sigma))
-            bound = DEFECTS.bound(probe_of(light, NM, unit), rig).value
-            assert measured <= bound * 1.02 + 0.5
-            assert measured > bound / 6
-
-
 def test_defects_of_bands_that_are_not_used_do_not_matter() -> None:
     """A sensor without defects, or whose masks are empty, has a bound of 0."""
     assert DEFECTS.bound(probe(100, 1000), RIG).value == 0

@@ -131,16 +131,6 @@ def test_air_as_bright_as_the_scene_is_not_seen() -> None:
     assert PATH_RADIANCE.bound(probe, shaded).value > 1
 
 
-@pytest.mark.parametrize("relief", ["plane", "step"])
-def test_bound_of_one_distance_for_all(relief: str) -> None:
-    """With relief, the middle distance is wrong by no more than its bound; without, it is right."""
-    rig = rig_with(Air(30.0, relief=relief, nearest_m=10.0, farthest_m=100.0))
-    seen = measured(PATH_RADIANCE, rig, "uniform")
-    assert 0 < seen <= 1.2 * PATH_RADIANCE.bound(probe_of(rig), rig, "uniform").value
-    flat = rig_with(CLEAR_30_M)
-    assert PATH_RADIANCE.bound(probe_of(flat), flat, "uniform").value == 0 == measured(PATH_RADIANCE, flat, "uniform")
-
-
 def test_bound_with_the_sun_rising() -> None:
     """The air's own light rises with the sun, and the bound with it."""
     rig = rig_with(HAZY_300_M, started=MORNING)

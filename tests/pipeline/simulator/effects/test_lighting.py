@@ -119,31 +119,27 @@ FOUR_HOURS = 4 * 3600.0
 
 
 def test_four_hours_from_a_low_sun_need_it() -> None:
-    """From 20 deg over 4 h the light triples; no variant but the exact one will do."""
+    """From 20 deg over 4 h the light triples."""
     rig = rig_with(started=MORNING)
     bound = DRIFT.bound(probe_of(rig, seconds=FOUR_HOURS), rig)
     assert bound.value > 50
     assert "the sun from 20" in bound.why
-    for variant in DRIFT.variants[1:]:
-        assert DRIFT.bound(probe_of(rig, seconds=FOUR_HOURS), rig, variant).value > 1
 
 
 @pytest.mark.parametrize("started", [NOON, MORNING, NIGHT])
-@pytest.mark.parametrize("variant", ["off", "scalar", "linear"])
-def test_drift_bound_holds_and_is_near(started: datetime, variant: str) -> None:
+def test_drift_bound_holds_and_is_near(started: datetime) -> None:
     """What is left out is within the bound, and near it: the end of the survey is among what is measured."""
     rig = rig_with(started=started)
     seconds = FOUR_HOURS + 5.9
-    bound = DRIFT.bound(probe_of(rig, seconds=seconds), rig, variant).value
-    looks = [measured(DRIFT, rig, variant, started_s=start) for start in (0, 7200, 10800, 14400)]
+    bound = DRIFT.bound(probe_of(rig, seconds=seconds), rig).value
+    looks = [measured(DRIFT, rig, "off", started_s=start) for start in (0, 7200, 10800, 14400)]
     assert max(looks) <= 1.0001 * bound
     assert max(looks) > bound / 6
 
 
-@pytest.mark.parametrize("variant", DRIFT.variants)
-def test_night_is_dark(variant: str) -> None:
-    """With the sun down all the time no light is left but what a straight line from the start keeps."""
+def test_night_is_dark() -> None:
+    """With the sun down all the time no light is left."""
     rig = rig_with(started=NIGHT)
-    gain = DRIFT.gain(block_of(rig), variant)
+    gain = DRIFT.gain(block_of(rig), "spectral")
     assert np.isfinite(gain).all()
-    assert gain.max() == (1 if variant == "linear" else 0)
+    assert gain.max() == 0

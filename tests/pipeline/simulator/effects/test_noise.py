@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import stats
 
+from pipeline.simulator.compiled_loops import draw_pairs, read_merged
 from pipeline.simulator.effects.noise import (
     CHIP_SAMPLES,
     MOST_VARIATION,
@@ -21,7 +22,6 @@ from pipeline.simulator.effects.noise import (
     rounded_counts,
     told_apart,
 )
-from pipeline.simulator.effects.noise_loops import draw_pairs, read_merged
 
 DRAWS = 200_000
 DARK_DN = 1000.0

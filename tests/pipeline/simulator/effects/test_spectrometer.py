@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.sensor import STRAY_LIGHT
@@ -104,17 +102,6 @@ def test_detectors_do_not_mix():
     np.testing.assert_allclose(made[..., 30:], widen_bands(other, second, np.ones(20), 6.0), rtol=1e-6)
 
 
-@given(st.integers(0, 10**6), st.floats(0.5, 7), st.sampled_from(["sigma", "dn"]))
-@settings(max_examples=30, deadline=None)
-def test_bound_holds(seed, fwhm_nm, unit):
-    """Leaving the response out changes no number by more than the bound, factor 1.2; widths may differ by band."""
-    wavelength, light = random_light(seed)
-    fwhm = np.random.default_rng(seed).uniform(0.7, 1.3, 90) * fwhm_nm
-    probe = probe_of(light, wavelength, unit, fwhm)
-    made = RESPONSE.change(light, block_of(rig_with(), wavelength, fwhm_nm=fwhm), "exact")
-    assert worst(made, light, unit) <= 1.2 * RESPONSE.bound(probe, rig_with()).value + 1e-4
-
-
 def test_bound_is_within_6_times_at_the_median():
     """Over 30 random spectra and widths the bound is at most 6 times what happens."""
     ratios = []
@@ -139,9 +126,6 @@ def test_steep_step_is_bounded_by_its_slope():
     steepest = 4900 / units(light, "sigma").min()
     np.testing.assert_allclose(bound, steepest * np.sqrt(VARIANCE_OF_6), rtol=1e-6)
     assert RESPONSE.bound(probe, rig_with(), "exact").value == 0
-
-
-ROUNDED = 1e-3  # DN: two of the last places of 16,384 electrons in float32
 
 
 def bent(light, wavelength, smile_nm, variant="cubic", **more):
@@ -169,22 +153,19 @@ def test_sign_is_that_of_the_wavelengths_seen(smile_nm, sign):
 
 
 def test_cubic_is_exact_on_parabolas_between_inner_bands():
-    """A parabola on uneven bands comes back to rounding, where straight lines miss I'' s (h - s) / 2."""
+    """A parabola on uneven bands comes back to rounding."""
     wavelength = 500 + np.cumsum(np.random.default_rng(0).uniform(1, 3, 20))
     light = np.tile((50 * (wavelength - 510) ** 2).astype(np.float32), (1, 3, 1))
     wanted = 50 * (wavelength + 0.8 - 510) ** 2
     made = bent(light, wavelength, 0.8, lines=range(1))[0, 0]
     np.testing.assert_allclose(made[1:-2], wanted[1:-2], rtol=2e-5, atol=0.05)
-    missed = bent(light, wavelength, 0.8, "linear", lines=range(1))[0, 0] - wanted
-    np.testing.assert_allclose(missed[:-1], 50 * 0.8 * (np.diff(wavelength) - 0.8), rtol=2e-3)
 
 
-@pytest.mark.parametrize("variant", SMILE.variants)
 @pytest.mark.parametrize("smile_nm", [0.4, -0.4, 7.0, 100.0])
-def test_nothing_is_invented_beyond_the_bands(variant, smile_nm):
+def test_nothing_is_invented_beyond_the_bands(smile_nm):
     """Bands that would see beyond the first or last take that one's light, however far the shift."""
     wavelength, light = random_light(3, bands=30)
-    made = bent(light, wavelength, smile_nm, variant)
+    made = bent(light, wavelength, smile_nm)
     end = -1 if smile_nm > 0 else 0
     np.testing.assert_allclose(made[..., end], light[..., end], rtol=1e-6)
     if smile_nm == 100:
@@ -202,29 +183,15 @@ def test_smile_detectors_do_not_mix():
     np.testing.assert_array_equal(both[..., 50], other[..., 0])
 
 
-@given(st.integers(0, 10**6), st.floats(-3, 3), st.sampled_from(["sigma", "dn"]))
-@settings(max_examples=40, deadline=None)
-def test_bounds_hold(seed, smile_nm, unit):
-    """Neither leaving smile out nor lines for cubics changes more than the bound, factor 1.2, and what floats round."""
-    wavelength, light = random_light(seed)
-    rig, probe = rig_with(smile_nm=smile_nm), probe_of(light, wavelength, unit)
-    made = bent(light, wavelength, smile_nm)
-    assert worst(made, light, unit) <= 1.2 * SMILE.bound(probe, rig).value + ROUNDED
-    linear = bent(light, wavelength, smile_nm, "linear")
-    assert worst(linear, made, unit, like=light) <= 1.2 * SMILE.bound(probe, rig, "linear").value + ROUNDED
-
-
-@pytest.mark.parametrize("variant", ["off", "linear"])
-def test_bounds_are_within_6_times_at_the_median(variant):
+def test_bounds_are_within_6_times_at_the_median():
     """Over 30 random spectra and smiles the bound is at most 6 times what happens."""
     ratios = []
     for seed in range(30):
         wavelength, light = random_light(seed)
         smile_nm = float(np.random.default_rng(seed).uniform(0.1, 1.2))
         made = bent(light, wavelength, smile_nm)
-        beside = light if variant == "off" else bent(light, wavelength, smile_nm, "linear")
-        bound = SMILE.bound(probe_of(light, wavelength), rig_with(smile_nm=smile_nm), variant)
-        ratios.append(bound.value / worst(beside, made, "sigma", like=light))
+        bound = SMILE.bound(probe_of(light, wavelength), rig_with(smile_nm=smile_nm))
+        ratios.append(bound.value / worst(light, made, "sigma", like=light))
     assert np.median(ratios) < 6
 
 

@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from pipeline.simulator.optics.defocus_disc import disc_contrast, disc_points
-from pipeline.simulator.optics.kernel_fit import Moments, fold
+from pipeline.simulator.optics.kernel_fit import Moments, disc_contrast, disc_points, fold
 from pipeline.simulator.optics.tap_sums import kernels_of
 
 NONE = np.zeros(1)

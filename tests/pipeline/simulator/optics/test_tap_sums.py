@@ -14,7 +14,7 @@ from scipy.special import ndtr
 from pipeline.geometry.camera import LineCamera, footprint_kernel
 from pipeline.geometry.mirror import position_to_normal
 from pipeline.geometry.scan import Sweep
-from pipeline.simulator.effects.blurs import ABERRATION, DIFFRACTION, KEYSTONE
+from pipeline.simulator.effects.blurs import ABERRATION, KEYSTONE
 from pipeline.simulator.effects.effect import SweepBlock
 from pipeline.simulator.effects.line import ROTATION, SLIT
 from pipeline.simulator.optics.rays import exact_views, middle_normal
@@ -27,7 +27,7 @@ from tests.pipeline.simulator.small_scenes import image_scene, seen_at
 
 CAMERA = LineCamera()
 RIG = Rig(camera=CAMERA, optics=Optics(keystone_px=0.3))
-BLURS: dict[Any, str] = {DIFFRACTION: "gaussian", ABERRATION: "gaussian", KEYSTONE: "linear"}
+BLURS: dict[Any, str] = {ABERRATION: "gaussian", KEYSTONE: "linear"}
 CORNER = Sweep("corner", "fine", "x", strip_px=960.0, start_px=-1279.0, lines=2560)
 MIDDLE = Sweep("middle", "fine", "y", strip_px=0.0, start_px=-1279.0, lines=2560)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.simulator.selection.change_loops import greatest_changes
+from pipeline.simulator.compiled_loops import greatest_changes
 
 ROUNDING = 1e-3
 

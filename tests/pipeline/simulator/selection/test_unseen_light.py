@@ -21,9 +21,8 @@ from pipeline.simulator.effects.probe import (
 )
 from pipeline.simulator.rig_model import Optics, Rig
 from pipeline.simulator.scenes.scene import DEFAULT_EXPOSURE_MS, to_bands
-from pipeline.simulator.selection.line_means import line_means
-from pipeline.simulator.selection.reached_cells import reached_cells
-from pipeline.simulator.selection.surroundings import seen_widely
+from pipeline.simulator.selection.adjacency import reached_cells, seen_widely
+from pipeline.simulator.selection.sample_views import line_means
 from pipeline.simulator.selection.survey_probe import probe_scene
 from tests.pipeline.simulator.bound_trials import trials
 from tests.pipeline.simulator.made_up_effects import steep_probe

@@ -13,9 +13,8 @@ from pipeline.geometry.scan import Sweep
 from pipeline.simulator.effects.registry import EFFECTS
 from pipeline.simulator.rig_model import Air, Detector, MirrorMotion, Optics, Rig, Sky
 from pipeline.simulator.scenes.scene import RasterScene
-from pipeline.simulator.selection.choice import Decision, decide, list_effects, sum_up
+from pipeline.simulator.selection.choice import Decision, decide, everything, list_effects, pays, sum_up
 from pipeline.simulator.selection.survey_probe import probe_survey
-from pipeline.simulator.selection.unweighed import everything, pays
 from tests.pipeline.simulator.outdoors import NOON
 from tests.pipeline.simulator.small_scenes import image_scene
 

@@ -1,4 +1,4 @@
-"""What `rig emulate` does and shows: a rig behind a pty and sockets, until it is told to end."""
+"""The verbs `rig check` and `rig emulate`: a table of what was asked and came; a rig behind a pty and sockets."""
 
 from __future__ import annotations
 
@@ -7,26 +7,133 @@ import signal
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import cast
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
+from rich.table import Table
 
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
 from flows.simulate.command import open_simulation
 from flows.tasks.stages.effects import choose_effects, source_with
-from flows.terminal.progress import print_json
+from flows.terminal.processes import DONE, FAILED, PARTLY
+from flows.terminal.progress import on_stdout, print_json
 from pipeline.errors import SettingsError
+from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import STRAIGHT
-from pipeline.rig.device_settings import SurveyRig
+from pipeline.geometry.scan import CostModel
+from pipeline.rig.device_settings import CameraLimits, SurveyRig
+from pipeline.rig.devices import SYSTEM_CLOCK
 from pipeline.rig.emulator.emulated_rig import EmulatedRig, FastClock, ServedRig
-from pipeline.rig.emulator.fault_names import read_faults
+from pipeline.rig.opening import open_camera_driver, open_devices, open_mirror_driver
+from pipeline.rig.rig_check import TRIGGERS, CheckRow, Device, check_camera, check_mirror, check_triggers, works
 from pipeline.simulator.simulated import SimulatedSource
+
+_COLOURS = {"ok": "green", "warn": "yellow", "fail": "bold red"}
+
+
+@dataclass(frozen=True)
+class CheckRequest:
+    """Which devices to check; None leaves one out."""
+
+    rig: SurveyRig
+    mirror: bool = True
+    camera: bool = True
+    move: bool = False
+    vector_pairs: int = CostModel.vector_pairs
+    exposed: LineCamera = field(default_factory=LineCamera)  # times of a capture whose edges are counted
+
+
+def check_request(settings: Path | None, port: str | None, camera: str | None, *, move: bool = False) -> CheckRequest:
+    """What to check: both devices of the settings, or those that are named (SettingsError: they cannot be used)."""
+    wanted = load_settings(settings)
+    rig = wanted.rig
+    if port is not None:
+        rig = replace(rig, port=port)
+    if camera is not None:
+        rig = _at(rig, camera)
+    both = settings is not None or port is camera is None
+    mirror_asked, camera_asked = both or port is not None, both or camera is not None
+    return CheckRequest(rig, mirror_asked, camera_asked, move, wanted.cost.vector_pairs, wanted.camera)
+
+
+def run_check(request: CheckRequest, console: Console, *, as_json: bool = False) -> int:
+    """Check the devices, with a table on stdout; 0 where nothing failed, 3 where one of two works, 1 otherwise."""
+    rig = replace(request.rig, park_at_close=False)  # the square ends at 0; 0 by itself
+    limits = CameraLimits(most_rate_hz=request.exposed.max_rate_hz)
+    asked: dict[Device, bool] = {"mirror": request.mirror, "camera": request.camera}
+    rows: list[CheckRow] = []
+    if request.mirror:
+        with console.status(f"asking the mirror at {rig.port}"):
+            open_mirror = partial(open_mirror_driver, rig, request.vector_pairs)
+            rows += check_mirror(open_mirror, SYSTEM_CLOCK, move=request.move)
+    if request.camera:
+        with console.status(f"asking the camera at {rig.host}"):
+            rows += check_camera(partial(open_camera_driver, rig, limits))
+    why_not = _why_no_triggers(request, rows)
+    if request.mirror and why_not:
+        rows.append(CheckRow("mirror", TRIGGERS, f'not tried {why_not}; pulses = "{rig.pulses}" is taken on trust'))
+    elif request.mirror:
+        with console.status("asking what steps a path"):
+            connect = partial(open_devices, rig, request.vector_pairs, limits)
+            rows += check_triggers(connect, SYSTEM_CLOCK, rig.pulses, request.exposed)
+    good = [works(rows, device) for device, is_asked in asked.items() if is_asked]
+    code = DONE if all(good) else PARTLY if any(good) else FAILED
+    if not as_json:
+        _print(rows, on_stdout())
+        return code
+    print_json(
+        {
+            "port": rig.port if request.mirror else None,
+            "camera": f"{rig.host}:{rig.control_port}" if request.camera else None,
+            "move": request.move,
+            "rows": [row.record() for row in rows],
+            "failed": sum(row.verdict == "fail" for row in rows),
+            "warned": sum(row.verdict == "warn" for row in rows),
+            "exit_code": code,
+        }
+    )
+    return code
+
+
+def _why_no_triggers(request: CheckRequest, rows: Sequence[CheckRow]) -> str:
+    """Return why no path is played; "" where one is."""
+    if not request.move:
+        return "without --move"
+    if not request.camera:
+        return "without a camera"
+    return "" if all(row.verdict == "ok" for row in rows) else "as not all of the above is in order"
+
+
+def _print(rows: Sequence[CheckRow], console: Console) -> None:
+    table = Table("device", "asked", "came", "", box=SIMPLE_HEAD)
+    for row in rows:
+        verdict = f"[{_COLOURS[row.verdict]}]{row.verdict}[/]"
+        table.add_row(row.device, escape(row.asked), escape(row.came), verdict)
+    console.print(table)
+    mend = [row for row in rows if row.mend]
+    for row in mend:
+        say = f"[{_COLOURS[row.verdict]}]{row.verdict}[/] {row.device}, {escape(row.asked)}: {escape(row.mend)}"
+        console.print(say, soft_wrap=True)
+    if not mend:
+        console.print("nothing to mend")
+
+
+def _at(rig: SurveyRig, camera: str) -> SurveyRig:
+    """The rig with the camera at HOST, HOST:PORT or HOST:PORT:FILE_PORT."""
+    host, *ports = camera.split(":")
+    if not host or len(ports) > 2 or not all(port.isdecimal() and 0 < int(port) < 65536 for port in ports):
+        raise SettingsError(f"--camera expects HOST, HOST:PORT or HOST:PORT:FILE_PORT, got {camera!r}")
+    control, files = (*map(int, ports), *(rig.control_port, rig.file_port)[len(ports) :])
+    return replace(rig, host=host, control_port=control, file_port=files)
+
 
 EVERY_S = 0.2
 KEPT_CAPTURES = 64
@@ -39,14 +146,12 @@ class EmulateRequest:
     """What to emulate, and how."""
 
     settings: Settings
-    faults: tuple[str, ...] = ()
     baud: int = SurveyRig.baud
     speed: float = 1.0
     out: Path | None = None  # a survey's TOML to write
 
     def check(self) -> None:
-        """Refuse a fault, a speed or a file that cannot be (SettingsError), before minutes are spent on the scene."""
-        read_faults(self.faults)
+        """Refuse a speed or a file that cannot be (SettingsError), before minutes are spent on the scene."""
         FastClock(self.speed)
         if self.baud < 0:
             raise SettingsError(f"--baud expects bits a second, or 0 for no pace, got {self.baud}")
@@ -66,19 +171,12 @@ def run_emulate(
 ) -> int:
     """Emulate a rig until Ctrl-C, SIGTERM or ``ended``; how to connect goes to stdout, its state to ``console``."""
     request.check()
-    mirror_faults, camera_faults = read_faults(request.faults)
     with console.status("drawing the scene"):
         source, notes = emulated_source(request.settings)
     for note in notes:
         console.print(f"[dim]note: {escape(note)}[/]")
-    rig = EmulatedRig(
-        source,
-        FastClock(request.speed),
-        mirror_faults=mirror_faults,
-        camera_faults=camera_faults,
-        kept=KEPT_CAPTURES,
-        mounting=request.settings.rig.mounting,
-    )
+    clock = FastClock(request.speed)
+    rig = EmulatedRig(source, clock, kept=KEPT_CAPTURES, mounting=request.settings.rig.mounting)
     with _ending(ended or threading.Event()) as end, rig.serve(baud=request.baud) as served:
         _tell(request, served, console, as_json=as_json)
         with console.status(_state(rig)) as line:
@@ -105,8 +203,7 @@ def _tell(request: EmulateRequest, served: ServedRig, console: Console, *, as_js
             raise SettingsError(f"cannot write {request.out}: {error.strerror}; choose another --out") from error
         console.print(f"survey it with: spectralzoom survey {escape(str(request.out))}")
     if as_json:
-        faults = list(request.faults)
-        print_json({"rig": table, "speed": request.speed, "faults": faults, "toml": request.out and str(request.out)})
+        print_json({"rig": table, "speed": request.speed, "toml": request.out and str(request.out)})
     else:
         sys.stdout.write(f"{_toml_table('rig', table)}\n")
     sys.stdout.flush()

@@ -1,19 +1,32 @@
-"""Faults of the emulated controller: bytes and replies on their way, what it answers, what it is in, ports that go."""
+"""Faults of the emulated mirror controller, wrapped around it, by name; a seed draws when and how each strikes."""
 
 from __future__ import annotations
 
+import errno
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from random import Random
+from typing import Any
 
 import numpy as np
 
 from pipeline.rig.emulator import Chunk
-from pipeline.rig.emulator.mirror_device import Fault, MirrorDevice, Mode, Request, VanishedError
-from pipeline.rig.mirror.mirror_requests import END, ID, VERSION
-from pipeline.rig.mirror.pro_mode import CELL, Command, Frame, encode, int_cell, read_vector, refuse
-from pipeline.rig.mirror.registers import VECTOR_MEMORY, Status
+from pipeline.rig.emulator.mirror_device import MirrorDevice, Mode, Request
+from pipeline.rig.mirror.mirror_requests import END, ID, VERSION, Reply
+from pipeline.rig.mirror.pro_mode import (
+    CELL,
+    VECTOR_MEMORY,
+    Command,
+    ErrorCode,
+    Frame,
+    Status,
+    encode,
+    int_cell,
+    read_vector,
+    refuse,
+)
 
 LATE_S = 20.0  # beyond any deadline
 SLOW_S = 0.02  # from byte to byte
@@ -25,6 +38,117 @@ _OTHER_FIRMWARE = 0xDEAD0001
 
 Change = Callable[[bytes, int, Random], bytes]  # some bytes, and the place of the one that is changed
 Spoil = Callable[[MirrorDevice, list[Chunk], Random], list[Chunk]]
+
+
+class VanishedError(OSError):
+    """The device went away: no port knows it any more."""
+
+    def __init__(self) -> None:
+        super().__init__(errno.EIO, "the device is gone")
+
+
+@dataclass
+class Chance:
+    """When a fault strikes: at one of the opportunities that come, early ones as likely as later twice as many."""
+
+    random: Random
+    at: int
+    seen: int = 0
+    struck: int = 0
+
+    @classmethod
+    def drawn(cls, name: str, seed: int, span: int, at: int | None = None) -> Chance:
+        """Draw the opportunity, from 0 to ``span``, exclusive; ``at`` says it instead."""
+        random = Random(f"{name} {seed}")
+        drawn = int(2 ** random.uniform(0, math.log2(span + 1))) - 1
+        return cls(random, min(drawn, span - 1) if at is None else at)
+
+    def comes(self) -> bool:
+        """Take note of an opportunity and say whether it is the one."""
+        self.seen += 1
+        now = self.seen == self.at + 1
+        self.struck += now
+        return now
+
+    def lasts(self) -> bool:
+        """Take note of an opportunity and say whether it is the one, or comes after it."""
+        return self.comes() or self.seen > self.at
+
+
+@dataclass
+class Fault:
+    """A fault that never strikes. Hooks are called in the order in which they stand here."""
+
+    chance: Chance
+
+    def begin(self, device: FaultyMirror) -> None:
+        """Take a hand as the controller is switched on."""
+
+    def opened(self, device: FaultyMirror) -> list[Chunk]:
+        """Give what is found in the port as it is opened."""
+        return []
+
+    def instead(self, device: FaultyMirror, data: bytes) -> list[Chunk] | None:
+        """Answer bytes in the controller's place; None leaves them to it."""
+        return None
+
+    def incoming(self, device: FaultyMirror, data: bytes) -> bytes:
+        """Give the bytes that reach the controller."""
+        return data
+
+    def verdict(self, device: FaultyMirror, request: Request) -> bytes | None:
+        """Give a reply to a request that then is not carried out; None lets the controller do it."""
+        return None
+
+    def outgoing(self, device: FaultyMirror, request: Request, chunks: list[Chunk]) -> list[Chunk]:
+        """Give the bytes that leave the controller, and when."""
+        return chunks
+
+
+class FaultyMirror(MirrorDevice):
+    """A controller that fails; ``gone`` and ``hung`` say that no port knows it any more, or that it takes no bytes."""
+
+    def __init__(self, clock: Any, faults: Sequence[Fault] = (), **given: Any) -> None:
+        self.faults: tuple[Fault, ...] = ()
+        self.gone = self.hung = False
+        super().__init__(clock, **given)
+        self.have(faults)
+
+    def have(self, faults: Sequence[Fault]) -> None:
+        """Fail so from now on."""
+        self.faults = tuple(faults)
+        for fault in self.faults:
+            fault.begin(self)
+
+    def opened(self) -> list[Chunk]:
+        """Give what a user finds in the port when it is opened."""
+        return [chunk for fault in self.faults for chunk in fault.opened(self)]
+
+    def receive(self, data: bytes) -> list[Chunk]:
+        """Take bytes and give what comes back; VanishedError where a fault took the device away."""
+        self.take_pulses()
+        with self._lock:
+            if self.gone:
+                raise VanishedError
+            for fault in self.faults:
+                instead = fault.instead(self, data)
+                if instead is not None:
+                    return instead
+                data = fault.incoming(self, data)
+            return super().receive(data)
+
+    def _answer(self, request: Request, out: list[Chunk]) -> None:
+        if self.gone:
+            return
+        reply: bytes | None = None
+        for fault in self.faults:
+            reply = fault.verdict(self, request) if reply is None else reply
+        if reply is None:
+            reply = self.carry_out(request)
+        chunks = [Chunk(self.unit.turnaround_s, reply)] if reply else []
+        for fault in self.faults:
+            chunks = fault.outgoing(self, request, chunks)
+        out += chunks
 
 
 # what may become of bytes
@@ -108,7 +232,7 @@ class SpoiltReply(Fault):
     spoil: Spoil
     lasting: bool = False
 
-    def outgoing(self, device: MirrorDevice, request: Request, chunks: list[Chunk]) -> list[Chunk]:
+    def outgoing(self, device: FaultyMirror, request: Request, chunks: list[Chunk]) -> list[Chunk]:
         if not chunks or not (self.chance.lasts() if self.lasting else self.chance.comes()):
             return chunks
         return self.spoil(device, chunks, self.chance.random)
@@ -120,7 +244,7 @@ class OldReplyAgain(Fault):
 
     last: bytes = b""
 
-    def outgoing(self, device: MirrorDevice, request: Request, chunks: list[Chunk]) -> list[Chunk]:
+    def outgoing(self, device: FaultyMirror, request: Request, chunks: list[Chunk]) -> list[Chunk]:
         whole = b"".join(data for _, data in chunks)
         if not whole:
             return chunks
@@ -133,7 +257,7 @@ class OldReplyAgain(Fault):
 class StaleBytes(Fault):
     """What another program asked for lies in the port when it is opened, and some more follows."""
 
-    def opened(self, device: MirrorDevice) -> list[Chunk]:
+    def opened(self, device: FaultyMirror) -> list[Chunk]:
         self.chance.struck += 1
         left = self.chance.random.choice(_LEFT_BEHIND)
         cut = self.chance.random.randrange(1, len(left))
@@ -146,7 +270,7 @@ class RequestByte(Fault):
 
     change: Change
 
-    def incoming(self, device: MirrorDevice, data: bytes) -> bytes:
+    def incoming(self, device: FaultyMirror, data: bytes) -> bytes:
         out = b""
         for byte in data:
             one = bytes((byte,))
@@ -158,7 +282,7 @@ class RequestByte(Fault):
 class ProAtConnect(Fault):
     """An earlier session left the controller in pro mode."""
 
-    def begin(self, device: MirrorDevice) -> None:
+    def begin(self, device: FaultyMirror) -> None:
         self.chance.struck += 1
         device.set_mode(self.chance.random.choice((Mode.PRO, Mode.PRO_CRC)))
 
@@ -170,7 +294,7 @@ class SilentReset(Fault):
     boot_s: float
     commands: Collection[int] | None = None  # frames that can be struck; None is any request
 
-    def verdict(self, device: MirrorDevice, request: Request) -> bytes | None:
+    def verdict(self, device: FaultyMirror, request: Request) -> bytes | None:
         """Restart instead of doing what was asked, and answer nothing."""
         if (self.commands is not None and request.command not in self.commands) or not self.chance.comes():
             return None
@@ -184,7 +308,7 @@ class AnswersLine(Fault):
 
     answer: str
 
-    def verdict(self, device: MirrorDevice, request: Request) -> bytes | None:
+    def verdict(self, device: FaultyMirror, request: Request) -> bytes | None:
         if request.mode is not Mode.SIMPLE or not self.chance.comes():
             return None
         return self.answer.encode("ascii") + END
@@ -197,7 +321,7 @@ class AnswersError(Fault):
     code: int
     commands: Collection[int] | None = None  # that can be struck; None is any
 
-    def verdict(self, device: MirrorDevice, request: Request) -> bytes | None:
+    def verdict(self, device: FaultyMirror, request: Request) -> bytes | None:
         command = request.command
         if command is None or (self.commands is not None and command not in self.commands):
             return None
@@ -208,7 +332,7 @@ class AnswersError(Fault):
 class CellLost(Fault):
     """One cell of the vector memory keeps what it held, though its writing is acknowledged."""
 
-    def verdict(self, device: MirrorDevice, request: Request) -> bytes | None:
+    def verdict(self, device: FaultyMirror, request: Request) -> bytes | None:
         """Have the cells written, put one that changed back, and acknowledge all of them."""
         if request.frame is None or request.command != Command.SET_VECTOR or len(request.frame.payload) < 5 + CELL:
             return None
@@ -231,7 +355,7 @@ class StatusBit(Fault):
 
     bit: Status
 
-    def verdict(self, device: MirrorDevice, request: Request) -> bytes | None:
+    def verdict(self, device: FaultyMirror, request: Request) -> bytes | None:
         if self.chance.lasts():
             device.state.flags |= self.bit
         return None
@@ -241,7 +365,7 @@ class StatusBit(Fault):
 class OtherFirmware(Fault):
     """The controller is another model of its maker."""
 
-    def verdict(self, device: MirrorDevice, request: Request) -> bytes | None:
+    def verdict(self, device: FaultyMirror, request: Request) -> bytes | None:
         """Answer whoever asks for the model, the version or the firmware as that other model would."""
         if request.line in _OTHER_TEXTS:
             self.chance.struck += 1
@@ -256,10 +380,10 @@ class OtherFirmware(Fault):
 class GoneBefore(Fault):
     """The device goes away before a request reaches it."""
 
-    def incoming(self, device: MirrorDevice, data: bytes) -> bytes:
+    def incoming(self, device: FaultyMirror, data: bytes) -> bytes:
         if self.chance.comes():
             device.gone = True
-            raise VanishedError("the device went away")
+            raise VanishedError
         return data
 
 
@@ -267,7 +391,7 @@ class GoneBefore(Fault):
 class GoneWithin(Fault):
     """The device goes away in the middle of a request, of which it took a part."""
 
-    def incoming(self, device: MirrorDevice, data: bytes) -> bytes:
+    def incoming(self, device: FaultyMirror, data: bytes) -> bytes:
         for place in range(len(data)):
             if self.chance.comes():
                 device.gone = True
@@ -279,7 +403,7 @@ class GoneWithin(Fault):
 class GoneAfter(Fault):
     """The device carries a request out and goes away before it answers."""
 
-    def outgoing(self, device: MirrorDevice, request: Request, chunks: list[Chunk]) -> list[Chunk]:
+    def outgoing(self, device: FaultyMirror, request: Request, chunks: list[Chunk]) -> list[Chunk]:
         if self.chance.comes():
             device.gone = True
             return []
@@ -290,7 +414,7 @@ class GoneAfter(Fault):
 class PortHangs(Fault):
     """From one request on the port takes no more bytes, and writing to it blocks."""
 
-    def incoming(self, device: MirrorDevice, data: bytes) -> bytes:
+    def incoming(self, device: FaultyMirror, data: bytes) -> bytes:
         if self.chance.lasts():
             device.hung = True
             return b""
@@ -301,7 +425,7 @@ class PortHangs(Fault):
 class Echo(Fault):
     """A loop of wire instead of a controller: all that is sent comes back."""
 
-    def instead(self, device: MirrorDevice, data: bytes) -> list[Chunk]:
+    def instead(self, device: FaultyMirror, data: bytes) -> list[Chunk]:
         """Send back all that came."""
         self.chance.struck += 1
         return [Chunk(device.unit.turnaround_s, data)]
@@ -313,7 +437,7 @@ class Modem(Fault):
 
     typed: bytes = field(default=b"", init=False)
 
-    def instead(self, device: MirrorDevice, data: bytes) -> list[Chunk]:
+    def instead(self, device: FaultyMirror, data: bytes) -> list[Chunk]:
         """Show what is typed, and at each CR answer OK to a line that begins with AT, ERROR to any other."""
         self.chance.struck += 1
         answers = []
@@ -325,3 +449,84 @@ class Modem(Fault):
             else:
                 self.typed = (self.typed + bytes((byte,)))[-64:]
         return [Chunk(device.unit.turnaround_s, data + b"".join(answers))]
+
+
+_VALUES = frozenset({Command.GET_VALUE, Command.SET_VALUE, Command.GET_VALUES, Command.SET_VALUES})
+_SETTING = frozenset({Command.SET_VALUE, Command.SET_VALUES})
+_VECTORS = frozenset({Command.SET_VECTOR, Command.GET_VECTOR})
+_UPLOAD = frozenset({Command.SET_VECTOR})
+_BYTES = 1024  # within so many bytes to the controller
+HARMLESS = ("split-replies", "merged-replies", "stale-bytes", "pro-at-connect")  # a driver copes with them
+
+
+def _reply(spoil: Spoil, *, lasting: bool = False) -> tuple[Callable[[Chance], Fault], int]:
+    return partial(SpoiltReply, spoil=spoil, lasting=lasting), 64
+
+
+def _line(answer: Reply) -> tuple[Callable[[Chance], Fault], int]:
+    return partial(AnswersLine, answer=answer), 6
+
+
+def _code(code: int, commands: Collection[int] | None = None, span: int = 64) -> tuple[Callable[[Chance], Fault], int]:
+    return partial(AnswersError, code=code, commands=commands), span
+
+
+def _bit(bit: Status) -> tuple[Callable[[Chance], Fault], int]:
+    return partial(StatusBit, bit=bit), 32
+
+
+# how each fault is built, and the number of opportunities within which it strikes
+KINDS: dict[str, tuple[Callable[[Chance], Fault], int]] = {
+    "request-byte-lost": (partial(RequestByte, change=lose), _BYTES),
+    "request-bit-flipped": (partial(RequestByte, change=flip), _BYTES),
+    "request-byte-doubled": (partial(RequestByte, change=double), _BYTES),
+    "reply-byte-lost": _reply(changed(lose)),
+    "reply-bit-flipped": _reply(changed(flip)),
+    "reply-byte-doubled": _reply(changed(double)),
+    "split-replies": _reply(split, lasting=True),
+    "merged-replies": _reply(merge, lasting=True),
+    "stale-bytes": (StaleBytes, 64),
+    "noise": _reply(noise),
+    "old-reply-again": (OldReplyAgain, 64),
+    "late-reply": _reply(late),
+    "just-late-reply": _reply(just_late),
+    "no-reply": _reply(lost),
+    "mute": _reply(lost, lasting=True),
+    "slow-bytes": _reply(slow, lasting=True),
+    "answers-no": _line(Reply.NO),
+    "answers-ol": _line(Reply.BELOW),
+    "answers-ou": _line(Reply.ABOVE),
+    "answers-error": _line(Reply.ERROR),
+    "error-frame": _code(ErrorCode.FRAME_INVALID),
+    "error-length": _code(ErrorCode.LENGTH_MISMATCH),
+    "error-crc": _code(ErrorCode.CRC_WRONG),
+    "error-no-register": _code(ErrorCode.NO_REGISTER, _VALUES, 8),
+    "error-range": _code(ErrorCode.OUT_OF_RANGE, _SETTING, 4),
+    "error-read-only": _code(ErrorCode.READ_ONLY, _SETTING, 4),
+    "error-vector-index": _code(ErrorCode.VECTOR_INDEX, _VECTORS),
+    "error-chain": _code(ErrorCode.CHAIN, _SETTING, 4),
+    "error-unknown": _code(0xBEEF),
+    "wrong-firmware": (OtherFirmware, 64),
+    "cell-lost": (CellLost, 16),
+    "pro-at-connect": (ProAtConnect, 64),
+    "silent-reset": (partial(SilentReset, boot_s=0.0), 64),
+    "reset-in-upload": (partial(SilentReset, boot_s=1.0, commands=_UPLOAD), 16),
+    "never-stable": _bit(Status.NOT_STABLE),
+    "trimmed": _bit(Status.TRIMMED),
+    "mirror-warm": _bit(Status.MIRROR_WARM),
+    "electronics-warm": _bit(Status.ELECTRONICS_WARM),
+    "disconnected": _bit(Status.DISCONNECTED),
+    "eeprom-invalid": _bit(Status.EEPROM_INVALID),
+    "gone-before": (GoneBefore, 64),
+    "gone-within": (GoneWithin, _BYTES),
+    "gone-after": (GoneAfter, 64),
+    "hangs": (PortHangs, 64),
+    "echo": (Echo, 64),
+    "modem": (Modem, 64),
+}
+
+
+def make_fault(name: str, seed: int = 0, at: int | None = None) -> Fault:
+    """Build a fault; the seed draws when and how it strikes, ``at`` says when instead."""
+    build, span = KINDS[name]
+    return build(Chance.drawn(name, seed, span, at))

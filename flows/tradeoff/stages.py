@@ -1,0 +1,432 @@
+"""The measure of each stage: kernel, tolerance of effects, plan, share of patches, codec.
+
+`tests/benchmarks` measures plans and kernels with the same scenes and readers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flows.settings.load import CHEAP_POLICY
+from flows.tasks.reading_costs import ReadingCosts
+from flows.tasks.seat_budget import SeatBudget
+from flows.tasks.stages.accuracy import columns_of_all_seats
+from flows.tasks.survey_model import PLAIN_STEPS, shipped_weights
+from flows.tradeoff.entries import Setting, Tradeoff
+from models.evaluation.metrics import confusion, mean_iou
+from models.network.machine import keep_freed_memory
+from models.network.sizes import multiply_adds
+from models.policies.policies import score_seats
+from models.reading.inference import (
+    CoarseLook,
+    DrawnMap,
+    Glance,
+    glance,
+    glance_of_columns,
+    look_coarsely,
+    read_glance,
+    segment,
+)
+from models.weights.files import Weights, load_weights
+from pipeline.errors import SettingsError
+from pipeline.geometry.camera import LineCamera
+from pipeline.geometry.grid import SceneGrid
+from pipeline.geometry.scan import Axis, CostModel, Sweep
+from pipeline.planning.coverage import cheapest_full, coarse_sweeps, full_sweeps, plain_sweeps
+from pipeline.planning.fine_pass import plan_fine
+from pipeline.planning.plain_scans import scan_words
+from pipeline.planning.prices import raw_bytes
+from pipeline.planning.selection import frame_seats
+from pipeline.rectify.kernels import Kernel
+from pipeline.rectify.region import mosaic_rows
+from pipeline.rectify.resample import resample
+from pipeline.simulator.effects.effect import Effect, SweepBlock
+from pipeline.simulator.effects.probe import noise_electrons
+from pipeline.simulator.effects.registry import EFFECTS
+from pipeline.simulator.readout import dark_frame, read_out
+from pipeline.simulator.render import expected_light
+from pipeline.simulator.rig_model import Rig
+from pipeline.simulator.scenes.farm.farm_scene import farm_scene
+from pipeline.simulator.scenes.scene import RasterScene
+from pipeline.simulator.selection.choice import Decision, decide
+from pipeline.simulator.selection.survey_probe import probe_scene
+from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep, sweep_block
+from storage.arrays.layout import CODECS, store_in_memory
+
+Values = NDArray[np.float32]
+Floats = NDArray[np.float64]
+MEMORY = 2**30  # bytes that rectifying may take
+
+# rectify: kernels on plane waves, which are known at every point
+
+SIDE, BANDS, POINTS = 256, 64, 40_000
+PERIODS_PX = (4.0, 40.0)
+CONTRAST = 0.2  # standard deviation of the scene over its mean, which fills half of the converter's range
+WAVES = 24
+
+
+@dataclass(frozen=True)
+class Waves:
+    """Sum of plane waves, in every band with other phases and amplitudes: a scene known at every point."""
+
+    frequency: Floats  # (wave, 2) cycles per px down and across
+    cosine: Floats  # (wave, band)
+    sine: Floats
+
+    def at(self, coordinates: Floats) -> Floats:
+        """Return exact values at (n, 2) positions [px], (n, band)."""
+        phase = 2 * np.pi * coordinates @ self.frequency.T
+        values: Floats = np.cos(phase) @ self.cosine + np.sin(phase) @ self.sine
+        return values
+
+
+def draw_waves(seed: int, bands: int, periods_px: tuple[float, float]) -> Waves:
+    """Draw waves of random directions, their periods even in logarithm."""
+    rng = np.random.default_rng(seed)
+    period = np.exp(rng.uniform(np.log(periods_px[0]), np.log(periods_px[1]), WAVES))
+    angle = rng.uniform(0, np.pi, WAVES)
+    frequency = np.stack([np.sin(angle), np.cos(angle)], axis=-1) / period[:, None]
+    return Waves(frequency, rng.standard_normal((WAVES, bands)), rng.standard_normal((WAVES, bands)))
+
+
+@dataclass(frozen=True)
+class Scattered:
+    """Samples on a grid, points between them, and the truth there."""
+
+    samples: Values  # (line, sample, band)
+    coordinates: Floats  # (n, 2)
+    truth: Floats  # (n, band)
+
+
+def scatter_points(seed: int) -> Scattered:
+    """Draw point samples of waves, and points at least 2 px inside, in the order of lines as a lookup gives them."""
+    waves, rng = draw_waves(seed, BANDS, PERIODS_PX), np.random.default_rng([seed, 1])
+    grid = np.argwhere(np.ones((SIDE, SIDE), bool)).astype(np.float64)
+    samples = waves.at(grid).astype(np.float32).reshape(SIDE, SIDE, BANDS)
+    coordinates = rng.uniform(2, SIDE - 3, (POINTS, 2))
+    coordinates = coordinates[np.lexsort((coordinates[:, 1], np.floor(coordinates[:, 0])))]
+    return Scattered(samples, coordinates, waves.at(coordinates))
+
+
+def noise_level(camera: LineCamera) -> tuple[str, float]:
+    """Return a tenth of the noise over the scene's standard deviation."""
+    electrons = camera.full_well_e / 2
+    noise = float(np.sqrt(electrons + camera.read_noise_e**2))
+    return "0.1 σ of noise", 0.1 * noise / (CONTRAST * electrons)  # noqa: RUF001
+
+
+RECTIFY = Tradeoff(
+    stage="rectify",
+    knob="kernel",
+    error="rmse / standard deviation",
+    unit="px*band",
+    reference=f"waves of {PERIODS_PX[0]:g} to {PERIODS_PX[1]:g} px, evaluated at the output pixels",
+    settings=("nearest", "bilinear", "catmull-rom"),
+    prepare=scatter_points,
+    run=lambda state, kernel: resample(
+        state.samples, np.ones(state.samples.shape[:2], bool), state.coordinates, cast("Kernel", kernel)
+    )[0],
+    judge=lambda state, _kernel, out: float(np.sqrt(np.mean((out - state.truth) ** 2)) / np.std(state.truth)),
+    work=lambda state: float(state.truth.size),
+    level=lambda _state: noise_level(LineCamera()),
+)
+
+
+# simulate: effects left out by their bounds, on lines of a farm
+
+LAND_SHAPE = (512, 1280)
+LINES = 8  # at each end of a sweep and in its middle
+PATCH, FACTOR = 16, 4
+EXACT = "exact"
+TOLERANCES = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)  # sigma
+
+
+@dataclass(frozen=True)
+class FarmLines:
+    """Lines of an outer sweep over a farm, the decision for every tolerance, and the exact light of the samples."""
+
+    scene: RasterScene
+    rig: Rig
+    blocks: tuple[SweepBlock, ...]
+    decisions: Mapping[Setting, Decision]
+    exact: Values  # (line, sample, band) [e-], those of the dark among them
+    noise: Values  # one sigma at each
+
+    def simulate(self, setting: Setting) -> tuple[Values, NDArray[np.uint16]]:
+        """Return expected electrons before the readout, and raw numbers, (line, sample, band) each."""
+        return _simulate(self.scene, self.blocks, self.decisions[setting].chosen)
+
+    def greatest_change(self, setting: Setting, made: tuple[Values, Any]) -> float:
+        """Return the greatest change against everything on, in sigmas of the noise at the sample."""
+        shown = made[0] + _dark(self.blocks[0], self.decisions[setting].chosen)
+        return float(np.abs((shown - self.exact) / self.noise).max())
+
+
+def _simulate(
+    scene: RasterScene, blocks: tuple[SweepBlock, ...], chosen: Mapping[Effect, str]
+) -> tuple[Values, NDArray[np.uint16]]:
+    light = [expected_light(scene, block, chosen) for block in blocks]
+    raw = [read_out(one, block, chosen) for one, block in zip(light, blocks, strict=True)]
+    return np.concatenate(light), np.concatenate(raw)
+
+
+def _dark(block: SweepBlock, chosen: Mapping[Effect, str]) -> Values:
+    return dark_frame(block, chosen) * np.float32(block.rig.camera.electrons_per_dn)
+
+
+def decide_for_lines(seed: int) -> FarmLines:
+    """Draw a farm, plan its full scan, and decide for every tolerance; take lines of the first sweep."""
+    scene, rig = farm_scene(seed, LAND_SHAPE), Rig()
+    sweeps = full_sweeps(SceneGrid(*LAND_SHAPE, PATCH, FACTOR), rig.camera, "x")
+    probe = probe_scene(scene, rig, sweeps)
+    starts = (0, (sweeps[0].lines - LINES) // 2, sweeps[0].lines - LINES)
+    blocks = tuple(sweep_block(scene, rig, sweeps[0], range(at, at + LINES), seed=seed) for at in starts)
+    decisions: dict[Setting, Decision] = {EXACT: decide(probe, rig, EFFECTS, 0.0)}
+    decisions |= {one: decide(probe, rig, EFFECTS, one) for one in TOLERANCES}
+    chosen = decisions[EXACT].chosen
+    exact = _simulate(scene, blocks, chosen)[0] + _dark(blocks[0], chosen)
+    return FarmLines(scene, rig, blocks, decisions, exact, noise_electrons(exact, rig))
+
+
+SIMULATE = Tradeoff(
+    stage="simulate",
+    knob="tolerance",
+    error="greatest change of a sample [σ of its noise]",  # noqa: RUF001
+    unit="px*band",
+    reference="everything that the rig has, exact; on average over the noise",
+    settings=(EXACT, *TOLERANCES),
+    prepare=decide_for_lines,
+    run=FarmLines.simulate,
+    judge=FarmLines.greatest_change,
+    work=lambda state: float(state.exact.size),
+    level=lambda _state: ("0.1 σ of noise", 0.1),  # noqa: RUF001
+    beside={"bound [σ]": lambda state, setting, _made: state.decisions[setting].error},  # noqa: RUF001
+)
+
+
+# survey: uniform scans and two passes, by the camera's seconds
+
+SURVEY_SHAPE = (384, 512)
+SCANS = {scan_words(step, ms): (step, ms) for step in (1, 2, 4) for ms in (100.0, 50.0, 25.0, 12.0, 6.0)}
+BUDGETS = {f"two passes, budget {budget:g}": budget for budget in (0.8, 0.65, 0.5, 0.4)}
+PART_OF = (1, 25.0)  # step and exposure [ms] of the scan of which parts are read in detail
+PARTS = {f"{scan_words(*PART_OF)} in part, {share} of the multiply-adds": share for share in ("50%", "35%", "25%")}
+
+
+@dataclass(frozen=True)
+class PlannedLook:
+    """The coarse look of a plan, its patches with their spectral features, and its cost."""
+
+    seen: Glance
+    seats: NDArray[np.intp]
+    columns: Values  # (seat, p, p, column)
+    seconds: float
+    bytes_raw: int
+    weights: Weights  # that read it
+
+
+@dataclass(frozen=True)
+class PlannedField:
+    """A farm that training never saw, by every plan."""
+
+    labels: NDArray[np.uint8]
+    bands: int
+    looks: Mapping[Setting, PlannedLook]
+
+    def read(self, plan: Setting) -> DrawnMap:
+        """Return the class map of a plan."""
+        look = self.looks[plan]
+        return segment(look.weights, look.seen, look.columns, look.seats)
+
+    def miss(self, plan: Setting, drawn: DrawnMap) -> float:
+        """Return 1 - mIoU of a map."""
+        return 1 - mean_iou(confusion(self.labels, drawn.classes, self.looks[plan].weights.config.classes))
+
+    def billion_multiply_adds(self, plan: Setting, _drawn: DrawnMap) -> float:
+        """Return the multiply-adds of the network for a plan, in billions."""
+        look = self.looks[plan]
+        return multiply_adds(look.weights.config, look.seen.grid, len(look.seats), self.bands).total / 1e9
+
+
+def plain_look(
+    weights: Weights, source: SimulatedSource, sweeps: list[Sweep], grid: SceneGrid, cost: CostModel
+) -> PlannedLook:
+    """Read a uniform scan whole; its coarse look are the means of its own pixels, on a field of whole cells."""
+    columns = columns_of_all_seats(source, sweeps, grid, weights, memory=MEMORY, kernel="catmull-rom")
+    down, across = grid.seat_shape
+    p, s, camera = grid.patch, grid.factor, source.camera
+    cells = columns.reshape(down, across, p // s, s, p // s, s, -1).mean(axis=(3, 5), dtype=np.float32)
+    small = cells.swapaxes(1, 2).reshape(down * p // s, across * p // s, -1)
+    seats, size = grid.valid_seats(), raw_bytes(sweeps, camera, len(source.wavelength_nm))
+    seconds = cost.seconds(sweeps, camera)
+    return PlannedLook(glance_of_columns(weights, small, grid), seats, columns[seats], seconds, size, weights)
+
+
+def part_of(look: PlannedLook, bands: int, compute: str) -> PlannedLook:
+    """Return the same scan with the patches alone that edges promise most of, for a share of the multiply-adds."""
+    costs = ReadingCosts(look.weights.config, look.seen.grid, bands)
+    budget = SeatBudget(costs, look.seats, CHEAP_POLICY, compute)
+    kept = np.sort(budget.choose(score_seats(CHEAP_POLICY, look.seen)))
+    return replace(look, seats=kept, columns=look.columns[np.searchsorted(look.seats, kept)])
+
+
+def coarse_mosaic(source: SimulatedSource, coarse: list[Sweep], grid: SceneGrid) -> Values:
+    """Take coarse sweeps and put them together, (y, x, band)."""
+    rows = mosaic_rows([SimulatedSweep(source, sweep) for sweep in coarse], source.camera, grid, rows=64)
+    return np.concatenate([values for _, values, _ in rows])
+
+
+def plan_every_way(seed: int) -> PlannedField:
+    """Take a farm by every uniform scan, by parts of one, and in two passes of every budget."""
+    camera, cost = LineCamera(), CostModel()
+    scene = farm_scene(seed, SURVEY_SHAPE, camera=camera)
+    weights, of_scans = load_weights(shipped_weights()), load_weights(shipped_weights(plain=True))
+    grid, finer = (SceneGrid(*SURVEY_SHAPE, read.config.patch, read.config.factor) for read in (weights, of_scans))
+    source, bands = SimulatedSource(scene, Rig(camera), seed), len(scene.wavelength_nm)
+    along, full, full_s = cheapest_full(grid, camera, cost)
+    looks: dict[Setting, PlannedLook] = {}
+    for words, (step, exposure_ms) in SCANS.items():
+        read_with, on = (of_scans, finer) if step in PLAIN_STEPS else (weights, grid)
+        sweeps = plain_sweeps(on, camera, along, step=step, exposure_ms=exposure_ms)
+        looks[words] = plain_look(read_with, source, sweeps, on, cost)
+    whole = looks[scan_words(*PART_OF)]
+    looks |= {words: part_of(whole, bands, share) for words, share in PARTS.items()}
+    coarse = coarse_sweeps(grid, camera, along)
+    sweeps = plain_sweeps(grid, camera, along, step=1, exposure_ms=camera.exposure_ms)
+    every = plain_look(weights, source, sweeps, grid, cost)
+    seen = glance(weights, coarse_mosaic(source, coarse, grid), scene.wavelength_nm, grid)
+    coarse_s, scores = cost.seconds(coarse, camera), score_seats("gain", seen)
+    for words, budget in BUDGETS.items():
+        plan = plan_fine(grid, camera, cost, along, scores, budget_s=budget * full_s - coarse_s, full=full)
+        columns = every.columns[np.searchsorted(every.seats, plan.seats)]
+        size = raw_bytes([*coarse, *plan.sweeps], camera, bands)
+        looks[words] = PlannedLook(seen, plan.seats, columns, coarse_s + plan.seconds, size, weights)
+    return PlannedField(np.asarray(scene.labels, np.uint8), bands, looks)
+
+
+SURVEY = Tradeoff(
+    stage="survey",
+    knob="plan",
+    error="1 - mIoU",
+    unit="scene px",
+    reference=f"labels of a farm of {SURVEY_SHAPE[1]} x {SURVEY_SHAPE[0]} px; two passes by gain, parts by edges",
+    settings=(*SCANS, *PARTS, *BUDGETS),
+    prepare=plan_every_way,
+    run=PlannedField.read,
+    judge=PlannedField.miss,
+    work=lambda field: float(field.labels.size),
+    modelled_s=lambda field, plan, _drawn: field.looks[plan].seconds,
+    beside={
+        "MB raw": lambda field, plan, _drawn: field.looks[plan].bytes_raw / 1e6,
+        "billion multiply-adds": PlannedField.billion_multiply_adds,
+    },
+)
+
+
+# segment and store: a farm seen coarsely and finely
+
+FARM_SHAPE = (384, 480)
+SHARES = (1.0, 0.35, 0.2, 0.15, 0.1, 0.05, 0.0)
+POLICY = "gain"
+RAW_LINES = 96
+
+
+@dataclass(frozen=True)
+class FarmLook:
+    """A farm, the weights that read it, and its sweeps."""
+
+    weights: Weights
+    source: SimulatedSource
+    grid: SceneGrid
+    along: Axis
+    full: list[Sweep]
+
+
+def look_at_farm(seed: int) -> FarmLook:
+    """Draw a farm and plan its full scan, with the shipped weights at hand."""
+    weights, camera = load_weights(shipped_weights()), LineCamera()
+    grid = SceneGrid(*FARM_SHAPE, weights.config.patch, weights.config.factor)
+    along, full, _ = cheapest_full(grid, camera, CostModel())
+    return FarmLook(weights, SimulatedSource(farm_scene(seed, FARM_SHAPE), Rig(camera), seed), grid, along, list(full))
+
+
+@dataclass(frozen=True)
+class FarmToSegment:
+    """A farm seen coarsely, and the spectral features of every patch of it."""
+
+    weights: Weights
+    labels: NDArray[np.uint8]
+    look: CoarseLook
+    columns: Values  # (seat, p, p, column), valid or not
+
+    def draw(self, share: Setting) -> DrawnMap:
+        """Predict coarsely, score and draw; with every patch there is nothing to choose."""
+        valid, wanted = self.look.grid.valid_share().ravel() > 0, float(share)
+        if wanted == 1:
+            seats = np.flatnonzero(valid)
+            return segment(self.weights, self.look, self.columns[seats], seats)
+        seen = read_glance(self.weights, self.look)
+        seats = frame_seats(score_seats(POLICY, seen), wanted, valid).seats
+        return segment(self.weights, seen, self.columns[seats], seats)
+
+    def miss(self, _share: Setting, drawn: DrawnMap) -> float:
+        """Return 1 - mIoU of a map."""
+        return 1 - mean_iou(confusion(self.labels, drawn.classes, self.weights.config.classes))
+
+
+def see_farm(seed: int) -> FarmToSegment:
+    """Take a farm coarsely and finely everywhere."""
+    keep_freed_memory()  # as surveys do
+    farm = look_at_farm(seed)
+    mosaic = coarse_mosaic(farm.source, coarse_sweeps(farm.grid, farm.source.camera, farm.along), farm.grid)
+    look = look_coarsely(farm.weights, [mosaic], farm.source.wavelength_nm, farm.grid)
+    columns = columns_of_all_seats(farm.source, farm.full, farm.grid, farm.weights, memory=MEMORY, kernel="catmull-rom")
+    return FarmToSegment(farm.weights, np.asarray(farm.source.scene.labels, np.uint8), look, columns)
+
+
+SEGMENT = Tradeoff(
+    stage="segment",
+    knob="share of patches",
+    error="1 - mIoU",
+    unit="scene px",
+    reference=f"labels of a farm of {FARM_SHAPE[1]} x {FARM_SHAPE[0]} px; policy {POLICY}, scores included",
+    settings=SHARES,
+    prepare=see_farm,
+    run=FarmToSegment.draw,
+    judge=FarmToSegment.miss,
+    work=lambda state: float(state.labels.size),
+)
+
+
+def capture_raw(seed: int) -> NDArray[np.uint16]:
+    """Take some raw lines (line, sample, band) of a farm."""
+    farm = look_at_farm(seed)
+    return SimulatedSweep(farm.source, farm.full[0]).read(0, RAW_LINES)
+
+
+STORE = Tradeoff(
+    stage="store",
+    knob="codec",
+    error="bytes stored a sample",
+    unit="sample",
+    reference=f"{RAW_LINES} raw lines of a farm, uint16, given back exactly",
+    settings=CODECS,
+    prepare=capture_raw,
+    run=lambda raw, codec: store_in_memory(raw, str(codec)),
+    judge=lambda raw, _codec, made: made[0] / raw.size if np.array_equal(made[1], raw) else np.inf,
+    work=lambda raw: float(raw.size),
+)
+
+TRADEOFFS = {one.stage: one for one in (RECTIFY, SEGMENT, SIMULATE, STORE, SURVEY)}
+
+
+def find_tradeoff(stage: str) -> Tradeoff:
+    """Return the measure of one stage; SettingsError naming the stages there are."""
+    if stage not in TRADEOFFS:
+        raise SettingsError(f"no trade-off for stage {stage!r}; there are: {', '.join(TRADEOFFS)}")
+    return TRADEOFFS[stage]

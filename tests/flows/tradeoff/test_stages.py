@@ -1,0 +1,56 @@
+"""The measures of the stages: their errors are those known of resampling, simulating, segmenting and storing."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from flows.tradeoff import stages
+from flows.tradeoff.entries import Tradeoff, measure_tradeoff
+from flows.tradeoff.stages import EXACT, PERIODS_PX, RECTIFY, SEGMENT, SIMULATE, STORE, TOLERANCES, draw_waves
+from pipeline.geometry.camera import LineCamera
+
+
+def errors(entry: Tradeoff, state: object) -> dict[object, float]:
+    """Error of every setting."""
+    return {setting: entry.judge(state, setting, entry.run(state, setting)) for setting in entry.settings}
+
+
+def test_waves_and_noise_are_what_they_claim():
+    """Periods of 4 to 40 px, the same for a seed; a tenth of shot and read noise."""
+    waves = draw_waves(3, 64, PERIODS_PX)
+    period = 1 / np.hypot(*waves.frequency.T)
+    assert 4 <= period.min() <= period.max() <= 40
+    np.testing.assert_array_equal(waves.at(np.ones((1, 2))), draw_waves(3, 64, PERIODS_PX).at(np.ones((1, 2))))
+    electrons = LineCamera().full_well_e / 2
+    assert stages.noise_level(LineCamera())[1] * 2 * electrons == pytest.approx(math.sqrt(electrons + 20**2))
+
+
+def test_errors_of_kernels_are_those_known():
+    """Kernels err by their taps (erratum E10)."""
+    found = [point.error for point in measure_tradeoff(RECTIFY, repeats=1).points]
+    assert found == pytest.approx((0.24, 0.093, 0.029), rel=0.03)
+
+
+def test_what_is_chosen_keeps_its_bound_and_the_bound_its_tolerance(monkeypatch):
+    """Exact errs by nothing, and every tolerance by no more than it says."""
+    monkeypatch.setattr(stages, "LAND_SHAPE", (96, 640))
+    monkeypatch.setattr(stages, "LINES", 1)
+    state = SIMULATE.prepare(0)
+    found = errors(SIMULATE, state)
+    bounds = {one: SIMULATE.beside["bound [σ]"](state, one, None) for one in SIMULATE.settings}  # noqa: RUF001
+    assert found[EXACT] == bounds[EXACT] == 0
+    assert all(found[one] <= bounds[one] <= one for one in TOLERANCES)
+    assert found[TOLERANCES[-1]] > 0
+
+
+def test_more_patches_draw_a_better_map_and_codecs_are_smaller(monkeypatch):
+    """The map of every patch errs least, that of none most; every codec stores a sample in under two bytes."""
+    monkeypatch.setattr(stages, "FARM_SHAPE", (128, 192))
+    found = errors(SEGMENT, SEGMENT.prepare(0))
+    assert 0 < found[1.0] < found[0.0] < 1
+    sizes = errors(replace(STORE, settings=("none", "zstd-3", "lz4-5")), STORE.prepare(0))
+    assert sizes["zstd-3"] < sizes["lz4-5"] < sizes["none"] == pytest.approx(2, rel=1e-3)

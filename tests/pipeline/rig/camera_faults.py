@@ -1,0 +1,193 @@
+"""Faults of the emulated camera, wrapped around it: replies, captures, cubes and transfers that go wrong."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from enum import StrEnum
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import RigError
+from pipeline.rig.emulator import Chunk
+from pipeline.rig.emulator.camera_device import PROMPT, CameraDevice, EmulatedCapture
+from pipeline.rig.emulator.camera_server import CameraServer, FileHandler
+from pipeline.rig.emulator.emulated_rig import EmulatedRig
+from pipeline.rig.emulator.scene_camera import SceneCamera
+from pipeline.simulator.simulated import SimulatedSource
+from tests.pipeline.rig.mirror_faults import Fault, FaultyMirror
+
+SLOW_S, LATE_S = 1.0, 60.0
+_CUBE = re.compile(r"raw_(\d+)")
+
+
+class CameraFault(StrEnum):
+    """A fault of the camera."""
+
+    SLOW = "a reply comes late, and in time"
+    LATE = "a reply comes after any deadline"
+    SILENT = "a command is done and its reply is lost"
+    SPLIT = "a reply comes in pieces"
+    MERGED = "a reply comes together with one to a command that was not sent"
+    STALE = "a reply to another command comes before the right one"
+    NOT_JSON = "a reply is no JSON"
+    HANGS_UP = "a command is done, and the connection closed without a reply"
+    FULL = "a capture is refused: the disk is full"
+    BUSY = "a capture is refused: the camera is busy"
+    CUT_CUBE = "a cube ends within a line"
+    BREAKS_OFF = "a transfer of a file is closed half way"
+    REFUSES_FILES = "a connection for files is closed at once"
+
+
+@dataclass
+class CameraFaults:
+    """Faults still to come, each so many times, after ``passes`` occasions; the seed draws where pieces are cut."""
+
+    left: dict[CameraFault, int] = field(default_factory=dict)
+    seed: int = 0
+    passes: int = 0
+
+    def __post_init__(self) -> None:
+        self.rng = np.random.default_rng(self.seed)
+
+    def strikes(self, fault: CameraFault) -> bool:
+        """Whether the fault strikes now; it is then one less to come."""
+        if self.left.get(fault, 0) < 1:
+            return False
+        if self.passes > 0:
+            self.passes -= 1
+            return False
+        self.left[fault] -= 1
+        return True
+
+
+class FaultyCamera(CameraDevice):
+    """A camera that fails."""
+
+    def __init__(self, *given: Any, faults: CameraFaults | None = None, **named: Any) -> None:
+        self.faults = CameraFaults() if faults is None else faults
+        self._missing: dict[str, int] = {}  # bytes at the end of the last cube, by folder
+        super().__init__(*given, **named)
+
+    def greet(self) -> list[Chunk]:
+        """Greet, perhaps in pieces."""
+        return self._in_pieces(b"".join(data for _, data in super().greet()))
+
+    def command(self, line: str) -> list[Chunk] | None:
+        """Do a command, and answer it or not."""
+        with self._lock:
+            said = super().command(line)
+            if said is None or self.faults.strikes(CameraFault.HANGS_UP):
+                return None
+            if self.faults.strikes(CameraFault.SILENT):
+                return []
+            data = b"".join(data for _, data in said)
+            if self.faults.strikes(CameraFault.NOT_JSON):
+                data = f"{line}\r\nSegmentation fault".encode() + PROMPT
+            foreign = b'%b\r\n{"success": true, "response": [], "errorMessage": ""}' + PROMPT  # its echo is another's
+            if self.faults.strikes(CameraFault.STALE):
+                other = b"isCapturing" if line.startswith("listFiles") else b"listFiles"
+                return [Chunk(0.0, foreign % other), Chunk(0.1, data)]
+            if self.faults.strikes(CameraFault.MERGED):
+                return [Chunk(0.0, foreign % b"stopCapture" + data)]
+            if self.faults.strikes(CameraFault.LATE):
+                return [Chunk(LATE_S, data)]
+            if self.faults.strikes(CameraFault.SLOW):
+                return [Chunk(SLOW_S, data)]
+            return self._in_pieces(data)
+
+    def files(self) -> dict[str, bytes]:
+        """Give the files, with cubes that are cut off."""
+        found = super().files()
+        for folder, missing in self._missing.items():
+            cubes = [name for name in found if name.startswith(folder + "/") and _CUBE.fullmatch(name.split("/")[-1])]
+            if cubes:
+                last = max(cubes, key=lambda name: int(name.rpartition("_")[2]))
+                found[last] = found[last][:-missing]
+        return found
+
+    def _in_pieces(self, data: bytes) -> list[Chunk]:
+        if not self.faults.strikes(CameraFault.SPLIT):
+            return [Chunk(0.0, data)]
+        rng, most = self.faults.rng, max(len(data) - 1, 0)
+        ends = sorted(int(end) + 1 for end in rng.permutation(most)[: int(rng.integers(1, 7))])
+        return [Chunk(0.002, data[start:stop]) for start, stop in pairwise([0, *ends, len(data)])]
+
+    def _capture(self, argument: Any) -> Any:
+        for fault, why in {CameraFault.BUSY: "busy capturing", CameraFault.FULL: "disk full"}.items():
+            if self.faults.strikes(fault):
+                raise RigError(why)
+        return super()._capture(argument)
+
+    def _begun(self, folder: str, frames: int, cubes: int) -> EmulatedCapture:
+        if self.faults.strikes(CameraFault.CUT_CUBE):
+            now_s = np.array([self.clock.now()])
+            self._missing[folder] = self._lines(self._positions(now_s), now_s)[0].size * 3  # a line and a half
+        else:
+            self._missing.pop(folder, None)
+        return super()._begun(folder, frames, cubes)
+
+
+class FaultySceneCamera(FaultyCamera, SceneCamera):
+    """A camera that looks at a scene, and fails."""
+
+
+class _HalfOf:
+    """Gives half of what is left of a producer's file, and closes the session."""
+
+    def __init__(self, producer: Any, transfer: Any) -> None:
+        rest = producer.file.read()
+        self._data, self._transfer = rest[: len(rest) // 2], transfer
+
+    def more(self) -> bytes:
+        data: bytes = self._data[:65536]
+        self._data = self._data[65536:]
+        if not data:
+            self._transfer.cmd_channel.close()
+        return data
+
+
+class _FaultyTransfer(FileHandler.dtp_handler):  # type: ignore[misc, name-defined]
+    def push_with_producer(self, producer: Any) -> None:
+        if self.cmd_channel.device.faults.strikes(CameraFault.BREAKS_OFF):
+            producer = _HalfOf(producer, self)
+        super().push_with_producer(producer)
+
+
+class _FaultyHandler(FileHandler):
+    dtp_handler = _FaultyTransfer
+
+    def handle(self) -> None:
+        if self.device.faults.strikes(CameraFault.REFUSES_FILES):
+            self.close()
+            return
+        super().handle()
+
+
+class FaultyServer(CameraServer):
+    """A camera's ports, whose transfers fail as the camera's faults say."""
+
+    handler = _FaultyHandler
+
+
+class FaultyRig(EmulatedRig):
+    """An emulated rig whose devices fail."""
+
+    mirror_kind, camera_kind, server_kind = FaultyMirror, FaultySceneCamera, FaultyServer
+    mirror: FaultyMirror
+    camera: FaultySceneCamera
+
+    def __init__(
+        self,
+        source: SimulatedSource,
+        clock: Any,
+        *,
+        mirror_faults: tuple[Fault, ...] | list[Fault] = (),
+        camera_faults: CameraFaults | None = None,
+        **given: Any,
+    ) -> None:
+        super().__init__(source, clock, **given)
+        self.mirror.have(mirror_faults)
+        self.camera.faults = camera_faults or self.camera.faults
