@@ -1,4 +1,4 @@
-"""The verbs `ls`, `explain`, `verify`, `gc` and `seal`: storage does the work, this shows it and gives exit codes."""
+"""The verbs `ls`, `explain`, `verify` and `gc`: storage does the work, this shows it and gives exit codes."""
 
 from __future__ import annotations
 
@@ -19,8 +19,6 @@ from flows.tasks.scores import score_of
 from flows.terminal.figures import known_number
 from flows.terminal.processes import DONE, FAILED, PARTLY
 from flows.terminal.progress import StageProgress, put_out
-from models.weights.files import seal_weights
-from pipeline.errors import SettingsError
 from pipeline.lazy import deferred
 from storage.archive.archive import Archive
 from storage.archive.lineage import Catalogue, changes_between, find_product, version_before
@@ -112,24 +110,6 @@ def gc(
     }
     put_out(content, show_clearance, as_json=as_json)
     return DONE if done.obstacle is None else PARTLY
-
-
-def seal(*weights: Path) -> int:
-    """Give WEIGHTS of an earlier version the hashes by which damage is told; those that have them are checked.
-
-    Nothing else of a file changes, and nothing that was made with it counts as made with other weights.
-
-    Parameters
-    ----------
-    weights
-        Files of weights.
-    """
-    if not weights:
-        raise SettingsError("seal needs files of weights: spectralzoom seal FILE ...")
-    for path in weights:
-        done = "sealed" if seal_weights(path) else "sealed already, every tensor as it was written"
-        stderr.print(f"{path}: {done}", markup=False, soft_wrap=True)
-    return 0
 
 
 def run_verify(

@@ -26,7 +26,6 @@ VERBS = {  # by what is typed: the module of the function, loaded once it is ask
     "explain": "flows.archive.commands",
     "verify": "flows.archive.commands",
     "gc": "flows.archive.commands",
-    "seal": "flows.archive.commands",
     "compare": "flows.archive.compare_command",
     "export": "flows.archive.export_command",
     "ingest": "flows.archive.ingest_command",

@@ -33,7 +33,6 @@ from flows.terminal.progress import StageProgress, on_stdout
 from flows.training.data import alike_notes
 from models.evaluation.metrics import LEVEL, agreement, false_pixels, iou_per_class, mean_iou
 from models.network.machine import keep_freed_memory
-from models.weights.files import describe_weights, unsealed_note
 from pipeline.lazy import deferred
 from storage.archive.whole_files import to_json
 
@@ -55,9 +54,6 @@ def run_evaluate(request: EvaluateRequest, console: Console, *, as_json: bool = 
         print_evaluation(content, on_stdout())
     for note in content["data_notes"]:
         console.print(f"note: {note}", markup=False, soft_wrap=True)
-    for path in (*request.weights, *request.controls):
-        if not describe_weights(path).sealed:
-            console.print(f"note: {unsealed_note(path)}", markup=False, soft_wrap=True)
     for path in content["files"]:
         console.print(path, soft_wrap=True)
     return content

@@ -6,8 +6,8 @@ from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 
 from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
-from models.weights.companion_files import TrainedOn
 from models.weights.files import Description
+from models.weights.parts import TrainedOn
 from pipeline.geometry.grid import SceneGrid
 from pipeline.ground.map_grid import median_footprint_m
 from pipeline.ground.view import GroundView

@@ -1,4 +1,4 @@
-"""The weights that a survey reads with, and what lies beside them: opened, and refused where it does not fit."""
+"""The weights that a survey reads with: opened, and refused where they do not fit."""
 
 from __future__ import annotations
 
@@ -13,26 +13,16 @@ from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
 from flows.settings.values import UNKNOWN_AUTO, UNKNOWN_OFF
 from models.network.machine import choose_device
 from models.policies.vgg_file import VggFile
-from models.weights.companion_files import (
-    TRAINED_ON,
-    FamiliarFile,
-    ReaderFile,
-    TrainedOn,
-    describe_familiar,
-    describe_reader,
-    familiar_path,
-    load_familiar,
-    load_memory,
-)
 from models.weights.files import (
     Description,
     Weights,
     check_two_scale,
-    content_key,
     describe_weights,
+    load_familiar,
+    load_reader,
     load_weights,
-    unsealed_note,
 )
+from models.weights.parts import TRAINED_ON, FamiliarPart, TrainedOn
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.lazy import Once
 
@@ -41,14 +31,11 @@ PLAIN_STEPS = (1, 2)  # pixels from line to line of what the weights for plain s
 
 @dataclass(frozen=True)
 class SurveyModel:
-    """The weights of a survey, and what lies beside them."""
+    """The weights of a survey."""
 
     path: Path
     described: Description
     load: Once[Weights]
-    key: str
-    reader: ReaderFile | None
-    familiar: FamiliarFile | None
     vgg: VggFile | None
 
     @staticmethod
@@ -60,25 +47,20 @@ class SurveyModel:
         """
         described, load = describe_weights(path), Once(lambda: load_weights(path).on(choose_device(settings.device)))
         check_two_scale(described.config, path)
-        key = content_key(path)
-        reader, familiar = describe_reader(path, described), describe_familiar(path, described, key)
-        model = SurveyModel(path, described, load, key, reader, familiar, vgg_file(settings))
+        model = SurveyModel(path, described, load, vgg_file(settings))
         if not planning:
             load()
-            if reader is not None:
-                load_memory(reader.path, described)
-            if familiar is not None and settings.unknown != UNKNOWN_OFF:
-                load_familiar(path, described)
+            if described.reader is not None:
+                load_reader(path)
+            if described.familiar is not None and settings.unknown != UNKNOWN_OFF:
+                load_familiar(path)
             if model.vgg is not None:
                 model.vgg.saliency(load())  # refuses one that does not go with the weights
         return model
 
     def notes(self, *, planning: bool) -> tuple[str, ...]:
         """What is to be said of these files."""
-        sealing = () if self.described.sealed else (unsealed_note(self.path),)
-        if self.vgg is None or planning:
-            return sealing
-        return (*sealing, f"VGG19 from {self.vgg.path.name}: {self.vgg.report()}")
+        return () if self.vgg is None or planning else (f"VGG19 from {self.vgg.path.name}: {self.vgg.report()}",)
 
     def check_bands(self, wavelength_nm: NDArray[np.floating]) -> None:
         """Refuse weights of which no spectral column is reached by a band (WeightsError)."""
@@ -93,20 +75,19 @@ class SurveyModel:
 
     @property
     def trained_on(self) -> TrainedOn | None:
-        """What the weights were trained on, by their record, or by the file beside them; None where neither tells."""
+        """What the weights were trained on, by their record or what is familiar to them; None where neither tells."""
         if TRAINED_ON in self.described.record:
             return TrainedOn.read(self.described.record[TRAINED_ON])
-        return None if self.familiar is None else self.familiar.trained_on
+        return None if self.described.familiar is None else self.described.familiar.trained_on
 
-    def asked_familiar(self, settings: Settings) -> FamiliarFile | None:
+    def asked_familiar(self, settings: Settings) -> FamiliarPart | None:
         """What is familiar, where pixels may be called unknown; WeightsError where it is asked and nobody knows it."""
-        if settings.unknown not in (UNKNOWN_AUTO, UNKNOWN_OFF) and self.familiar is None:
+        if settings.unknown not in (UNKNOWN_AUTO, UNKNOWN_OFF) and self.described.familiar is None:
             raise WeightsError(
                 f"--unknown {settings.unknown}: nobody measured what is familiar to {self.path.name}; do so with: "
-                f"spectralzoom train DATASET --familiar {self.path} -o {familiar_path(self.path)}, or leave --unknown"
-                " out"
+                f"spectralzoom train DATASET --familiar {self.path} -o {self.path}, or leave --unknown out"
             )
-        return None if settings.unknown == UNKNOWN_OFF else self.familiar
+        return None if settings.unknown == UNKNOWN_OFF else self.described.familiar
 
 
 def weights_path(settings: Settings) -> Path:

@@ -25,12 +25,12 @@ from flows.tasks.stages.accuracy import columns_of_all_seats
 from flows.tasks.survey_model import shipped_weights
 from flows.training.look import chosen_effects
 from models.evaluation.metrics import confusion, mean_iou
+from models.network.memory_reader import MemoryReader
 from models.reading.doubts import SeatDoubts
 from models.reading.inference import DrawnMap, glance_of_columns, segment
 from models.reading.remembered import COME_TRUE, Looked, Remembered, carried, first_belief, recall
 from models.training.looks import REFERENCE_MS
-from models.weights.companion_files import MemoryWeights, load_memory, memory_path
-from models.weights.files import Weights, describe_weights, load_weights
+from models.weights.files import Weights, load_reader, load_weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel, Sweep
@@ -169,8 +169,8 @@ def _weights() -> Weights:
 
 
 @cache
-def _memory() -> MemoryWeights:
-    return load_memory(memory_path(WEIGHTS), describe_weights(WEIGHTS))
+def _memory() -> MemoryReader:
+    return load_reader(WEIGHTS)
 
 
 def fields(seeds: Sequence[int]) -> Iterator[tuple[Field, Mapping[float, Scan], Sequence[Scan]]]:
@@ -218,7 +218,7 @@ def two_looks(ground: Field, seconds: float, first: Scan, again: Sequence[Scan])
     first_score = ground.score(before.drawn.classes)
     doubts = _doubts(before.drawn.log_probability, grid)
     belief = first_belief(before.looked(first))
-    unseen = carried(Remembered(belief, before.coarse, 0.0), _memory().reader)
+    unseen = carried(Remembered(belief, before.coarse, 0.0), _memory())
     remembered = _doubts(unseen.log_probability, grid, come_true=COME_TRUE)
     by_truth, by_doubts, by_memory = [first_score], [(0.0, first_score, "none")], [(0.0, first_score)]
     for second in again:
@@ -238,7 +238,7 @@ def two_looks(ground: Field, seconds: float, first: Scan, again: Sequence[Scan])
         by_doubts.append((worth, _score_of(ground, first, joint, shown), words))
         shown, _ = _seats_of(grid, rows, _runs_by_price(rows, gains["memory"], second[1], left))
         own = read(ground.columns(second, 1), grid, every_class=True).looked(second, _pixels(shown, grid))
-        after = recall(Remembered(belief, before.coarse, 0.0), own, _memory().reader)
+        after = recall(Remembered(belief, before.coarse, 0.0), own, _memory())
         by_memory.append((float(gains["memory"][shown].sum()), ground.score(after.classes()[0])))
     expected, score, words = max(by_doubts)
     instead = 100 * float(doubts.worth(_wrong_after(record, (scan.step, scan.exposure_ms))).sum())

@@ -69,7 +69,7 @@ class Strips:
 
     def chosen(self, before: Seen, belief: Belief, days: float, seconds: float) -> tuple[Mask, float]:
         """(seat,) that the memory has looked at in so many seconds, and the share of the lines that show them."""
-        unseen = carried(Remembered(belief, None, days), shipped_memory().reader)
+        unseen = carried(Remembered(belief, None, days), shipped_memory())
         names, scans = shipped().class_names, ScanRecord.read(shipped().record["scans"])
         iou = np.array([scans.expected(*QUICK)[name] for name in names])
         strips = [(unseen.log_probability, unseen.age_days)]
@@ -95,7 +95,7 @@ def parts() -> Iterator[Row]:
         now = look_at_farm(seed, FIRST_DAY + days, HOUR, QUICK, 1)
         first = first_belief(before.looked)
         score = partial(_part_score, before, now, first, days, field.grid)
-        unseen = carried(Remembered(first, None, days), shipped_memory().reader)
+        unseen = carried(Remembered(first, None, days), shipped_memory())
         found.setdefault(f"{days} d, nothing looked at, 0 s", []).append(now.score(unseen.classes()[0]))
         for share in PART_SHARES:
             seconds = share * field.whole_s
@@ -131,7 +131,7 @@ def season_of_parts() -> Iterator[Row]:
 
 def unwatched() -> Iterator[Row]:
     """A memory that nobody looks after: half an hour later, and how much it expects to be wrong as weeks go by."""
-    field, names, reader = Strips.of_field(), shipped().class_names, shipped_memory().reader
+    field, names, reader = Strips.of_field(), shipped().class_names, shipped_memory()
     soon: list[tuple[float, float]] = []
     for seed in SEEDS:
         before, anew = (look_at_farm(seed, FIRST_DAY, HOUR + later_h, ANEW) for later_h in (0.0, SOON_H))
@@ -163,7 +163,7 @@ def _season_score(field: Strips, quick: Sequence[Seen], share: float | None, eve
 
     At the others the map is the memory brought to that day.
     """
-    moments, reader = [day + hour / 24 for day, hour in SEASON], shipped_memory().reader
+    moments, reader = [day + hour / 24 for day, hour in SEASON], shipped_memory()
     before, belief, scores, last = quick[0], first_belief(quick[0].looked), [quick[0].score(quick[0].alone)], moments[0]
     for number in range(1, len(quick)):
         now, days = quick[number], moments[number] - last

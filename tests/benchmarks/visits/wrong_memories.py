@@ -72,7 +72,7 @@ def _with_any_memory(looked: Looked, today: Seen, days: float) -> Classes:
     shift = whole_pixels(replace(lies, shift=(factor * lies.shift[0], factor * lies.shift[1])))
     there = _moved(looked, shift)
     memory = Remembered(first_belief(there), there.coarse, days)
-    after = recall(memory, today.looked, shipped_memory().reader)
+    after = recall(memory, today.looked, shipped_memory())
     other = compare(memory, today.looked, after, np.s_[:, :]).is_of_another_field
     return today.alone if other else after.classes()[0]
 

@@ -14,8 +14,8 @@ from flows.publish.findings import changed_hectares, ground_words, older_hectare
 from flows.publish.receipt_words import sentences
 from models.evaluation.expected_scores import MapScores, expected_counts, expected_score
 from models.reading.familiar import Familiar, Limits
-from models.weights.companion_files import MAP_SCORES, FamiliarWeights, TrainedOn, familiar_path, save_familiar
-from models.weights.files import content_key, describe_weights
+from models.weights.files import add_familiar, describe_weights
+from models.weights.parts import MAP_SCORES, TrainedOn
 from pipeline.errors import WeightsError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.field_places import NoPlace
@@ -73,7 +73,7 @@ def _judged(weights: Path, folder: Path, content: dict[str, Any], limit: float =
     one, table = np.eye(3), np.full((1, 1, 2), limit)
     limits = Limits(np.array([0.001, 0.05]), np.ones(1), (1,), table, table[0])
     familiar = Familiar(np.zeros((1, 3)), one[None], 1e-9 * one[None], 1e-9 * one, limits, 3)
-    save_familiar(FamiliarWeights(familiar, content_key(path), SEEN, {MAP_SCORES: content}), familiar_path(path))
+    add_familiar(path, path, familiar, SEEN, {MAP_SCORES: content})
     return path
 
 

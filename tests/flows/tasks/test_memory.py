@@ -23,8 +23,7 @@ from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
 from flows.settings.load import load_settings
 from models.network.memory_reader import MemoryReader
 from models.network.sizes import MemorySizes
-from models.weights.companion_files import MemoryWeights, memory_path, save_memory
-from models.weights.files import load_weights
+from models.weights.files import add_reader, load_weights
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
 from storage.archive.archive import Archive
@@ -225,24 +224,21 @@ def test_a_plan_knows_what_is_remembered(visited: Path, scene_files: Path, weigh
     assert sorted(visited.rglob("*")) == before
 
 
-def test_a_reader_beside_the_weights_is_used(visited: Path, survey_png: Survey, weights: Path, tmp_path: Path) -> None:
+def test_a_reader_in_the_weights_is_used(visited: Path, survey_png: Survey, weights: Path, tmp_path: Path) -> None:
     """Its key stands in the receipt and its multiply-adds count; one for others ends the survey before it begins."""
     own = Path(shutil.copy(weights, tmp_path / "own.safetensors"))
     config = load_weights(own).config
     reader = MemoryReader(MemorySizes(config.classes, config.columns, config.factor, 8, 4))
     torch.nn.init.normal_(reader.leave.weight, std=0.2)
-    save_memory(MemoryWeights(reader, "any", load_weights(own).class_names, {}), memory_path(own))
+    add_reader(own, own, reader, {})
     flags = {**PLAIN, "visit": "2026-06-07T10:00:00Z", "prior": "latest", "weights": str(own)}
     published = survey_png(visited, **flags)
     assert len(published.receipt["memory"]["reader"]) == 20
     first = survey_png(tmp_path / "alone", **{**flags, "prior": "none"})
     decode = [one.receipt["savings"]["multiply_adds"]["decode"] for one in (published, first)]
     assert decode[0] - decode[1] == reader.sizes.multiply_adds(96 * 128)
-    save_memory(
-        MemoryWeights(MemoryReader(MemorySizes(3, 7, 4)), "any", ("class_0", "class_1", "class_2"), {}),
-        memory_path(own),
-    )
-    with pytest.raises(WeightsError, match=r"own\.memory\.safetensors reads memories of 3 classes, 7 columns"):
+    add_reader(own, own, MemoryReader(MemorySizes(3, 7, 4)), {})
+    with pytest.raises(WeightsError, match=r"own\.safetensors.* reader of prior maps is for another network"):
         survey_png(visited, **flags)
 
 

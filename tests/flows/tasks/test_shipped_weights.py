@@ -1,20 +1,12 @@
-"""Files of weights: those that come with SpectralZoom are small and good; those without hashes are told of."""
+"""The weights that come with SpectralZoom are small and good."""
 
 from __future__ import annotations
 
-import io
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from rich.console import Console
-from safetensors.torch import load_file, save_file
 
-from flows.cli import main as cli
-from flows.evaluate import command as evaluate_command
-from flows.evaluate.command import run_evaluate
-from flows.evaluate.frames import EvaluateRequest
 from flows.settings.load import load_settings
 from flows.tasks.run import open_run
 from flows.tasks.stages.accuracy import columns_of_all_seats
@@ -22,8 +14,7 @@ from flows.tasks.survey_model import PLAIN_STEPS, shipped_weights, weights_offer
 from models.evaluation.metrics import mean_iou
 from models.evaluation.placement import Controls, run_controls
 from models.reading.inference import glance
-from models.weights.files import UNSEALED, Weights, content_key, describe_weights, load_weights
-from models.weights.sealed_files import SEAL, TENSORS
+from models.weights.files import Weights, content_key, describe_weights, load_weights
 from pipeline.errors import BudgetError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
@@ -34,7 +25,6 @@ from pipeline.simulator.rig_model import Rig
 from pipeline.simulator.scenes.farm.farm_plan import CLASSES
 from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, farm_scene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
-from tests.flows.small_fields import write_field, write_weights
 
 PATH = shipped_weights()
 SHAPE = (512, 640)  # smaller farms hold too few pixels of rare classes to rank placements by them
@@ -61,9 +51,8 @@ def controls(weights: Weights) -> Controls:
     return run_controls(weights, seen, columns, np.asarray(scene.labels), share=0.35, seed=41)
 
 
-def test_file_is_sealed_small_and_tells_its_making(weights: Weights) -> None:
-    """Hashes, the key of before, at most 8 MB; command, seed, law of the data, and figures of scenes not trained on."""
-    assert describe_weights(PATH).sealed
+def test_file_is_small_and_tells_its_making(weights: Weights) -> None:
+    """The key that its products know, at most 8 MB; command, seed, law of the data, figures of unseen scenes."""
     assert content_key(PATH) == "1e1fce42c3bb18c27d7d"
     assert PATH.stat().st_size <= 8e6
     assert weights.record["command"].startswith("spectralzoom train farm")
@@ -130,51 +119,3 @@ def test_detail_where_the_map_is_unsure_beats_chance(controls: Controls) -> None
     none, every = mean_iou(controls.none), mean_iou(controls.every)
     assert every - none > 0.05
     assert mean_iou(controls.policies["entropy"]) > (none + every) / 2
-
-
-SAID = "was made before weights had hashes: damage to its numbers cannot be told; to add them now: spectralzoom seal "
-
-
-@pytest.fixture
-def earlier(tmp_path: Path) -> Path:
-    """Small weights as an earlier version wrote them."""
-    path = write_weights(tmp_path / "w.safetensors")
-    about = {name: value for name, value in describe_weights(path).about.items() if name not in (TENSORS, SEAL)}
-    save_file(load_file(path), path, {"about": json.dumps({**about, "format": UNSEALED}, sort_keys=True)})
-    return path
-
-
-def test_a_survey_says_so_until_they_are_sealed(
-    earlier: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """One note with the command; its stages keep their keys."""
-    data = write_field(tmp_path / "data")
-    flags = {
-        "scene": str(data / "images" / "001_image.png"),
-        "source": "sim",
-        "weights": str(earlier),
-        "out": str(tmp_path / "a"),
-    }
-    settings = load_settings(None, {**flags, "budget": 1})
-    before = open_run(settings)
-    assert [note for note in before.notes if SAID in note] == [f"w.safetensors {SAID}{earlier}"]
-    with pytest.raises(SystemExit) as ended:
-        cli.main(["seal", str(earlier)])
-    assert (ended.value.code, capsys.readouterr().err) == (0, f"{earlier}: sealed\n")
-    after = open_run(settings)
-    assert not any(SAID in note for note in after.notes)
-    assert after.weights_key == before.weights_key
-
-
-def test_evaluate_says_so_and_sealing_needs_files(
-    earlier: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """After the figures; without a file one message, exit code 2."""
-    told = io.StringIO()
-    monkeypatch.setattr(evaluate_command, "evaluate_weights", lambda request, show: {"files": [], "data_notes": []})
-    request = EvaluateRequest("data", (earlier,))
-    run_evaluate(request, Console(file=told, width=500), as_json=True)
-    assert f"note: w.safetensors {SAID}{earlier}" in told.getvalue()
-    with pytest.raises(SystemExit) as ended:
-        cli.main(["seal"])
-    assert (ended.value.code, capsys.readouterr().err[:30]) == (2, "error: seal needs files of wei")

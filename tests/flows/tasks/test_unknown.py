@@ -22,8 +22,8 @@ from flows.settings.load import load_settings
 from flows.settings.values import parse_unknown
 from flows.tasks.beyond_training import beyond_training
 from models.reading.familiar import Familiar, Limits
-from models.weights.companion_files import FamiliarWeights, TrainedOn, familiar_path, save_familiar
-from models.weights.files import content_key, describe_weights
+from models.weights.files import add_familiar, describe_weights
+from models.weights.parts import TrainedOn
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.grid import UNLABELLED
 from storage.arrays.class_maps import ClassNames, with_unknown
@@ -43,7 +43,7 @@ def judging(weights: Path, tmp_path_factory: pytest.TempPathFactory) -> Maker:
         one, table = np.eye(3), np.full((1, 1, 2), limit)
         limits = Limits(np.array([0.001, 0.05]), np.ones(1), (1,), table, table[0])
         familiar = Familiar(np.zeros((1, 3)), one[None], 1e-9 * one[None], 1e-9 * one, limits, 3)
-        save_familiar(FamiliarWeights(familiar, content_key(path), SEEN), familiar_path(path))
+        add_familiar(path, path, familiar, SEEN, {})
         return path
 
     return make

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import struct
 from dataclasses import replace
@@ -17,33 +16,31 @@ from safetensors.torch import load_file, save_file
 from models.network.sizes import PRESETS, Preset
 from models.weights.files import (
     FORMAT,
-    UNSEALED,
     Weights,
     check_two_scale,
-    content_key,
     describe_weights,
     load_any_weights,
     load_weights,
     save_weights,
-    seal_weights,
     with_record,
 )
-from models.weights.sealed_files import SEAL, TENSORS
+from models.weights.sealed_files import SEAL, TENSORS, _seal, hash_of
 from pipeline.errors import WeightsError
 from tests.models.conftest import Maker, make_any_weights
 
 
 def _about(path: Path) -> dict[str, Any]:
-    """What a file says of itself, without its hashes: as files of an earlier version did."""
+    """What a file says of itself, without its hashes."""
     raw = path.read_bytes()
     (size,) = struct.unpack("<Q", raw[:8])
     about: dict[str, Any] = json.loads(json.loads(raw[8 : 8 + size])["__metadata__"]["about"])
-    return {name: value for name, value in about.items() if name not in (TENSORS, SEAL)} | {"format": UNSEALED}
+    return {name: value for name, value in about.items() if name not in (TENSORS, SEAL)}
 
 
 def _rewritten(path: Path, about: dict[str, Any], tensors: dict[str, torch.Tensor] | None = None) -> Path:
     tensors = load_file(path) if tensors is None else tensors
-    save_file(tensors, path, {"about": json.dumps(about, sort_keys=True)})
+    about = {**about, TENSORS: {name: hash_of(tensor) for name, tensor in tensors.items()}}
+    save_file(tensors, path, {"about": json.dumps({**about, SEAL: _seal(about)}, sort_keys=True)})
     return path
 
 
@@ -223,15 +220,12 @@ def test_a_description_that_was_changed_is_refused(saved: Path):
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
-@pytest.mark.parametrize("sealed", [True, False])
-def test_numbers_that_are_not_finite_are_refused(tiny: Maker, tmp_path: Path, value: float, sealed: bool):
-    """A network of NaN would draw a map of nothing; the tensor is named, whether the file has hashes or not."""
+def test_numbers_that_are_not_finite_are_refused(tiny: Maker, tmp_path: Path, value: float):
+    """A network of NaN would draw a map of nothing; the tensor is named."""
     weights, path = tiny(), tmp_path / "w.safetensors"
     with torch.no_grad():
         weights.segmenter.fine_classes.bias[1] = value
     save_weights(weights, path)
-    if not sealed:
-        _rewritten(path, _about(path))
     with pytest.raises(WeightsError, match=r"1 of 3 numbers of tensor fine_classes.bias are not finite; copy or train"):
         load_any_weights(path)
 
@@ -263,32 +257,6 @@ def test_a_header_of_petabytes_is_refused_unread(saved: Path):
     saved.write_bytes(len(text).to_bytes(8, "little") + text + bytes(64))
     with pytest.raises(WeightsError, match="not a readable safetensors file"):
         load_weights(saved)
-
-
-def test_weights_of_an_earlier_version_are_sealed_in_place(saved: Path):
-    """They load, say that they have no hashes, and have them after sealing, under the same key; then damage is told."""
-    written = saved.read_bytes()
-    _rewritten(saved, _about(saved))
-    key = content_key(saved)
-    assert key == hashlib.sha256(saved.read_bytes()).hexdigest()[:20]  # as before there were hashes
-    assert not describe_weights(saved).sealed
-    load_weights(saved)
-    assert seal_weights(saved)
-    assert saved.read_bytes() == written
-    assert content_key(saved) == key
-    assert describe_weights(saved).sealed
-    assert not seal_weights(saved)
-
-
-def test_what_is_damaged_is_not_sealed(saved: Path):
-    """A file of an earlier version with a NaN stays as it is."""
-    tensors = load_file(saved)
-    tensors["fine_classes.bias"][0] = float("nan")
-    _rewritten(saved, _about(saved), tensors)
-    before = saved.read_bytes()
-    with pytest.raises(WeightsError, match="not finite"):
-        seal_weights(saved)
-    assert saved.read_bytes() == before
 
 
 @pytest.mark.parametrize("preset", [preset for preset in PRESETS if preset != "two-scale"])
