@@ -274,17 +274,6 @@ def test_a_rig_is_read_from_its_tables(toml):
     assert rig.camera == found.camera
 
 
-def test_receipts_of_before_are_read():
-    """Keys that there are no longer are left out of a receipt's settings, in its tables too; the others stay."""
-    now = Settings(seed=3, optics=Optics(smile_nm=1.0)).to_dict()
-    before = now | {"patch": 16, "rounds": 1, "rig": {**now["rig"], "old": 1}}
-    before["optics"] = {**now["optics"], "polarisation": 0.02}
-    assert of_this_version(before) == now
-    assert parse_settings(of_this_version(before)) == Settings(seed=3, optics=Optics(smile_nm=1.0))
-    with pytest.raises(SettingsError, match=r"its survey had 2 rounds of detail, .* survey the field by hand"):
-        of_this_version(before | {"rounds": 2})
-
-
 @pytest.mark.parametrize(
     ("given", "wanted"),
     [

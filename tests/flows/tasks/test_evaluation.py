@@ -114,18 +114,6 @@ def _before(truth: list[int], *maps: list[int]) -> tuple[dict[str, Any], float]:
     return {**found[0], "none": found[1], "all": found[2]}, now
 
 
-@given(st.lists(st.integers(0, 2), min_size=24, max_size=24), MAP, MAP, MAP)
-def test_an_older_receipt_scores_as_it_would_now_or_not_at_all(
-    truth: list[int], this: list[int], none: list[int], every: list[int]
-):
-    """Its mean is taken over the classes of the truth, as far as its three maps tell which these are."""
-    accuracy, now = _before(truth, this, none, every)
-    found = score_of({"accuracy": accuracy})["miou"]
-    maps = [accuracy["per_class_iou"], accuracy["none"]["per_class_iou"], accuracy["all"]["per_class_iou"]]
-    unclear = any(all(one[name] == 0 for one in maps) for name in NAMES)
-    assert (found is None) if unclear else found == pytest.approx(now)
-
-
 def test_a_receipt_of_now_gives_its_own_figures():
     """Both means; the worst class of the truth; and each map that shows a false class, with its pixels."""
     assert score_of(make_receipt()) == {"miou": 0.75, "overall_accuracy": 0.934}

@@ -99,13 +99,6 @@ def test_a_later_look_goes_on_from_the_one_before(twice: tuple[Path, Any, Any]) 
     np.testing.assert_array_equal(belief.changed.values, there)
 
 
-def test_two_looks_know_more_than_one(twice: tuple[Path, Any, Any], survey_png: Survey, tmp_path: Path) -> None:
-    """Without a reader, on a field that stays: no surer look is thrown away, the map is as good as without a memory."""
-    _, _, later = twice
-    alone = survey_png(tmp_path / "alone", **PLAIN, visit=LATER)
-    assert later.receipt["accuracy"]["miou"] >= alone.receipt["accuracy"]["miou"] - 0.005
-
-
 def test_by_hand_nothing_is_remembered_unless_asked(visited: Path, survey_png: Survey) -> None:
     """The default of a survey is none, and its map that of a first look, found and not made again."""
     published = survey_png(visited, **PLAIN, visit=LATER)
@@ -327,17 +320,6 @@ def test_a_thousand_visits_cost_as_much_as_sixty(visited: Path, twice: Any, monk
     assert {name.rpartition("-")[2] for name in read} == {"north"}
 
 
-def test_a_look_is_no_memory_of_itself(visited: Path, twice: Any, survey_png: Survey) -> None:
-    """Asked for again, a visit goes on from the one before it and finds its own map; so does the first."""
-    again = survey_png(visited, **PLAIN, visit=LATER, prior="latest")
-    assert again.receipt["memory"]["run"] == twice[1].folder.name
-    first = survey_png(visited, **PLAIN, visit=FIRST, prior="latest")
-    assert "memory" not in first.receipt
-    for published in (again, first):
-        (row,) = (stage for stage in published.receipt["stages"] if stage["name"] == "draw_map")
-        assert row["state"] == "cached"
-
-
 def test_two_visits_at_once_are_both_kept(visited: Path, twice: Any, survey_png: Survey) -> None:
     """Neither waits for the other or goes on from it half made: both are published, and rest on finished runs."""
     at = ["2026-06-09T10:00:00Z", "2026-06-09T11:00:00Z"]
@@ -347,23 +329,3 @@ def test_two_visits_at_once_are_both_kept(visited: Path, twice: Any, survey_png:
     assert both[0].receipt["memory"]["run"] == twice[2].folder.name
     assert both[1].receipt["memory"]["run"] in {twice[2].folder.name, both[0].folder.name}
     assert not problems(visited)
-
-
-def test_weights_of_another_factor_go_on_from_what_is_believed(
-    visited: Path, survey_png: Survey, make_weights: WeightsMaker
-) -> None:
-    """Both coarse looks are laid on each other in the larger pixels; what they show is not compared any further."""
-    flags = {"weights": str(make_weights(factor=2)), "visit": "2026-06-07T10:00:00Z", "prior": "latest"}
-    words, published = words_of(visited, survey_png, **flags)
-    assert "3 days earlier" in words
-    assert published.receipt["memory"]["shift_px"] == [0, 0]
-    assert published.receipt["memory"]["put_aside"] is None
-    assert not problems(visited)
-
-
-def test_a_coarse_look_in_no_pixels_of_ours_is_no_memory(visited: Path) -> None:
-    """Pixels wider than a patch cannot be laid beside today's: said, with both sizes."""
-    settings = load_settings(None, {"prior": "latest", "visit": "2026-06-20T10:00:00Z"})
-    found, notes = memory.find_prior(Archive.open(visited), settings, "north", SceneGrid(96, 128, 2, 2), CLASSES)
-    assert found is None
-    assert "cannot be used: its coarse look has 32 x 24 px, these weights read 64 x 48" in notes[0]

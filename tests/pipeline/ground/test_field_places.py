@@ -16,10 +16,7 @@ from pipeline.ground.field_places import (
     PlacedPicture,
     PosedField,
     areas_by_number,
-    field_of_view_deg,
     footprint_of,
-    scale_of_angles,
-    scale_of_pixels,
     scale_of_view,
 )
 from pipeline.ground.georeference import class_areas_m2
@@ -106,21 +103,6 @@ def test_a_view_of_the_horizon_ends_where_the_map_does():
     found = footprint_of(looking(1), (800, 400))
     assert np.isfinite(found.outline_m).all()
     assert found.range_m[2] < 100 * 12 / np.tan(np.deg2rad(1))
-
-
-def test_without_a_place_there_are_degrees_alone():
-    """Who knows no distance gets pixels and angles, and no hectares."""
-    found = scale_of_angles((512, 640), IFOV)
-    assert found.view_deg == field_of_view_deg((512, 640), IFOV)
-    assert found.view_deg[1] == pytest.approx(np.rad2deg(2 * np.arctan(0.032)))
-    assert (found.pixel_m, found.hectares, found.hectares_per_hour(10)) == (None,) * 3
-
-
-def test_a_picture_with_a_pixel_size_has_its_area():
-    """A georeferenced scene of 100 x 200 px of half a metre is half a hectare."""
-    found = scale_of_pixels((100, 200), IFOV, 0.5)
-    assert found.hectares == pytest.approx(0.5)
-    assert found.hectares_per_hour(0) is None
 
 
 def test_a_rig_that_looks_up_has_no_footprint():

@@ -45,12 +45,6 @@ def test_lines_stay_where_they_lie(shown: np.ndarray) -> None:
         assert np.isin(sweep.held_px(), whole[sweep.name].held_px()).all()
 
 
-def test_of_the_whole_field_nothing_is_cut() -> None:
-    """The same sweeps, value by value."""
-    sweeps = coarse_sweeps(GRID, CAMERA, "y")
-    assert sweeps_over(sweeps, GRID, CAMERA, GRID.valid_share().ravel() > 0) == sweeps
-
-
 def test_strips_beside_the_area_are_left_out() -> None:
     """A corner of the field needs one strip of three."""
     sweeps = full_sweeps(GRID, CAMERA, "x")

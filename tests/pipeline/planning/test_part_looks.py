@@ -155,13 +155,6 @@ def test_what_is_worth_much_is_looked_at_first() -> None:
     assert len(look.runs) == 1
 
 
-def test_nothing_is_looked_at_where_nothing_is_worth_it() -> None:
-    """Without any worth, and without the seconds of a single row, there is no look."""
-    nothing, one = np.zeros(int(np.prod(GRID.seat_shape))), np.ones(int(np.prod(GRID.seat_shape)))
-    assert part_look(ROWS, nothing, CAMERA, COST, exposure_ms=EXPOSURE_MS, seconds=WHOLE_S) is None
-    assert part_look(ROWS, one, CAMERA, COST, exposure_ms=EXPOSURE_MS, seconds=1.0) is None
-
-
 @pytest.mark.parametrize(
     ("runs", "told"),
     [
