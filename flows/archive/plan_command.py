@@ -19,14 +19,13 @@ from flows.cli.app import AsJson
 from flows.cli.survey_verbs import NO_FLAGS, SurveyFlags, by_setting
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
-from flows.tasks.extent import PastCosts
 from flows.tasks.open_survey import JUDGED, STAGES, OpenSurvey
 from flows.tasks.run import SurveyRun, open_run
 from flows.tasks.scan_choice import ScanChoice, as_told
 from flows.tasks.stage import Stage, Wanted
 from flows.tasks.stages.accuracy import evaluate
 from flows.tasks.stages.attention import load_plan
-from flows.terminal.figures import format_bytes, format_percent, format_points, format_seconds
+from flows.terminal.figures import format_bytes, format_percent, format_points
 from flows.terminal.processes import DONE
 from flows.terminal.progress import put_out
 from pipeline.errors import IncompleteStoreError, PipelineError
@@ -54,7 +53,7 @@ State = Literal["cached", "to run", "blocked"]
 def plan(
     settings: Path | None = None, *, flags: SurveyFlags = NO_FLAGS, preview: Path | None = None, as_json: AsJson = False
 ) -> int:
-    """Tell what a survey would run: what is stored, what is to be made and why, and about how long it takes.
+    """Tell what a survey would run: what is stored, what is to be made and why, and the camera's seconds.
 
     Nothing is captured, started or written, but for the preview. Give the settings that you would give to `survey`.
 
@@ -71,15 +70,12 @@ def plan(
 
 @dataclass(frozen=True)
 class StageForecast:
-    """What would become of one stage. ``seconds`` and ``size`` are None where the archive has nothing to go by."""
+    """What would become of one stage."""
 
     stage: str
     state: State
     key: str | None  # None while an input of it is not known
     why: str
-    seconds: float | None = 0.0
-    size: int | None = 0  # [bytes]
-    basis: str = ""  # what the estimate comes from, or why there is none
     changes: tuple[Change, ...] = ()  # against the newest store of the same stage and scene
 
 
@@ -165,7 +161,6 @@ class Planner(OpenSurvey):
         self.catalogue = catalogue
         self.rows: list[StageForecast] = []
         self._planned: dict[str, Store] = {}  # by address
-        self._costs = PastCosts(catalogue, run)
 
     def __call__(self, stage: str, /, *inputs: StageRef) -> StageRef:
         """Note what would become of a stage, and return where its store would be."""
@@ -173,7 +168,7 @@ class Planner(OpenSurvey):
             row, ref = self._look(STAGES[stage], STAGES[stage].wants(self.run, *inputs))
         except (PipelineError, OSError) as error:  # what is there cannot be used: the survey would stop here
             why = f"waits for {error}" if isinstance(error, _WaitsError) else str(error)
-            row = StageForecast(stage, "blocked", None, why, *self._costs.estimate(stage))
+            row = StageForecast(stage, "blocked", None, why)
             ref = _Awaited(STAGES[stage].product.name, "", Path(), stage)
         self.rows.append(row)
         self.products[stage] = ref
@@ -181,8 +176,6 @@ class Planner(OpenSurvey):
 
     def _look(self, stage: Stage, wanted: Wanted) -> tuple[StageForecast, StageRef]:
         key = stage.key(wanted)
-        if stage.name == "capture_fine":
-            self._costs.plan_fine(sum(sweep["lines"] for sweep in wanted.params["sweeps"]))
         found = stage.find(self.run.archive, wanted)
         if found is not None:
             return StageForecast(stage.name, "cached", key, "stored"), found
@@ -191,21 +184,28 @@ class Planner(OpenSurvey):
         facts = {"version": stage.product.version, "params": plain(wanted.params), "inputs": inputs}
         self._planned[ref.uri] = Store(ref, facts)
         why, changes = self._reason(stage.name, self._planned[ref.uri])
-        row = StageForecast(stage.name, "to run", key, why, *self._costs.estimate(stage.name), changes)
-        return row, _Awaited(ref.stage, key, ref.path, stage.name)
+        return StageForecast(stage.name, "to run", key, why, changes), _Awaited(ref.stage, key, ref.path, stage.name)
 
     def _reason(self, stage: str, store: Store) -> tuple[str, tuple[Change, ...]]:
         """What differs from the newest store of the same stage of the same scene, in words and in full."""
         there = self.catalogue.stores.get(store.ref.uri)
         if there is not None and there.cleared:
             return "its files were cleared away by gc", ()
-        stored = self._costs.stored(stage)
-        before = next((one for one in stored if self._costs.of_scene(one)), None)
+        asked = STAGES[stage]
+        stored = [one for one in self.catalogue.stores.values() if one.ref.stage == asked.product.name]
+        stored = [one for one in stored if one.problem is None and asked.inputs in (None, len(one.inputs))]
+        before = max(filter(self._of_scene, stored), key=lambda one: one.created, default=None)
         if before is None:
             return ("nothing stored yet of this scene" if stored else "nothing stored yet"), ()
         known = replace(self.catalogue, stores=self.catalogue.stores | self._planned)
         found = tuple(change for change in changes_between(known, before, store) if change.kind != "library")
         return _in_words(found, store.ref.stage), found
+
+    def _of_scene(self, store: Store) -> bool:
+        """Whether a store is of the run's scene, or of none: a lookup is of a path."""
+        stores = self.catalogue.stores
+        below = [store, *(stores[uri] for uri in self.catalogue.ancestors([store.ref.uri]) if uri in stores)]
+        return {str(one.params["scene"]) for one in below if "scene" in one.params} <= {self.run.scene.key}
 
 
 def _in_words(changes: Sequence[Change], stage: str) -> str:
@@ -236,17 +236,14 @@ COLOURS = {"cached": "green", "to run": "bold", "blocked": "yellow"}
 
 
 def plan_content(settings: Settings, preview: Path | None = None) -> dict[str, Any]:
-    """The forecast as plain tables, with sums of what is known; ``refused``: why this machine would not begin."""
+    """The forecast as plain tables; ``refused``: why this machine would not begin."""
     found = forecast(settings, preview)
     rows = found.stages
     ahead = [row for row in rows if row.state in ("to run", "blocked")]
     return {
         "archive": settings.out,
-        "stages": [{"bytes" if name == "size" else name: value for name, value in asdict(row).items()} for row in rows],
+        "stages": [asdict(row) for row in rows],
         "to_make": len(ahead),
-        "estimated": sum(row.seconds is not None for row in ahead),
-        "seconds": _sum(ahead, "seconds"),
-        "bytes": _sum(ahead, "size"),
         "refused": found.refused,
         "scans": scans_content(found.scans),
         "field": found.figures,
@@ -267,35 +264,26 @@ def scans_content(scans: ScanChoice) -> dict[str, Any]:
     }
 
 
-def _sum(rows: Sequence[StageForecast], name: str) -> float | None:
-    """Sum of what is known; None where there are rows and nothing is known of any."""
-    known = [getattr(row, name) for row in rows if getattr(row, name) is not None]
-    return sum(known) if known or not rows else None
-
-
 def show_plan(content: dict[str, Any], console: Console) -> None:
     """Print the forecast as a table."""
     table = Table(header_style="dim", box=SIMPLE_HEAD, collapse_padding=True)
     for name in ("stage", "state", "why"):
         table.add_column(name, overflow="fold", no_wrap=name != "why")
-    for name in ("about", "size"):
-        table.add_column(name, justify="right", no_wrap=True)
     for row in content["stages"]:
-        ahead = row["state"] in ("to run", "blocked")
-        figures = (format_seconds(row["seconds"]), format_bytes(row["bytes"])) if ahead else ("", "")
         state = f"[{COLOURS[row['state']]}]{row['state']}[/]"
         table.add_row(
             row["stage"],
             state,
             escape(row["why"] if len(row["why"]) <= MOST_LETTERS else f"{row['why'][: MOST_LETTERS - 3]}..."),
-            *figures,
         )
     console.print(table)
     for line in figure_lines(content["field"]):
         console.print(escape(line), soft_wrap=True)
     if "kept" in content:
         console.print(escape(kept_words(content["kept"])), soft_wrap=True)
-    console.print(escape(_sentence(content)), soft_wrap=True)
+    count = content["to_make"]
+    ahead = f"{count} stages to make" if count else "everything is stored: the survey would only publish a run"
+    console.print(ahead, soft_wrap=True)
     if content["scans"]["frontier"]:
         _show_scans(content["scans"], console)
     if "preview" in content:
@@ -329,14 +317,3 @@ def _show_scans(scans: dict[str, Any], console: Console) -> None:
         figures = f"{seconds:.1f}", format_bytes(scan["bytes_raw"]), expected
         table.add_row(scan_words(scan["step"], scan["exposure_ms"]), said, *figures)
     console.print(table)
-
-
-def _sentence(content: dict[str, Any]) -> str:
-    count, known = content["to_make"], content["estimated"]
-    if not count:
-        return "everything is stored: the survey would only publish a run"
-    if not known:
-        return f"{count} stages to make; the archive has no record of what such stages took"
-    about = f"about {format_seconds(content['seconds'])} and {format_bytes(content['bytes'])}"
-    rest = "" if known == count else f" without {count - known} stages of which there is no record"
-    return f"{count} stages to make, {about} by the archive's own records{rest}"

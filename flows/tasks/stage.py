@@ -1,9 +1,9 @@
-"""A stage of the survey as one record: its name, title and version, what it stores, and how its work grows.
+"""A stage of the survey as one record: its name, title and version, and what it stores.
 
 A stage says which store it wants; the archive makes the key, finds the store, or has it built. Arrays stay inside the
 stage. The record is made where the function is, in a module of `flows.tasks.stages`:
 
-    @stage("rectify", "mosaic", MOSAIC, unit="mosaic values")
+    @stage("rectify", "mosaic", MOSAIC)
     def rectify(run, raw, lookup): ...
 
 The order of the stages stands in `flows.survey`, which calls them with the opened survey and with the stores that
@@ -15,25 +15,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 from flows.tasks.prefect_tasks import as_task
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef, stage_key
 
 Build = Callable[[Path], None]
-Unit = Literal[
-    "pixels",
-    "coarse pixels",
-    "scene values",
-    "mosaic values",
-    "coarse values",
-    "fine values",
-    "patch values",
-    "operations of the map",
-    "operations of a glance",
-    "surveys",
-]
 
 
 @dataclass(frozen=True)
@@ -72,8 +60,6 @@ class Stage:
     title: str  # on terminals and pages
     product: Product
     wants: Callable[..., Wanted]
-    unit: Unit  # of work: what its seconds grow with
-    size: Unit | None  # what its bytes grow with, where that is another
     inputs: int | None  # of its stores, where another stage has the same product
     retries: int  # by Prefect, where a device or a disk failed
     named: str | None  # what receipts call its store, or the file in it, where another stage has the same product
@@ -119,19 +105,11 @@ def run_stage(survey: Survey, stage: str, *inputs: StageRef) -> StageRef:
 
 
 def stage(
-    name: str,
-    title: str,
-    product: Product,
-    *,
-    unit: Unit,
-    size: Unit | None = None,
-    inputs: int | None = None,
-    retries: int = 0,
-    named: str | None = None,
+    name: str, title: str, product: Product, *, inputs: int | None = None, retries: int = 0, named: str | None = None
 ) -> Callable[[Callable[..., Wanted]], Stage]:
     """Make a function a stage; see `Stage` for the parameters. Its module lies in `flows.tasks.stages`."""
 
     def record(wants: Callable[..., Wanted]) -> Stage:
-        return Stage(name, title, product, wants, unit, size, inputs, retries, named)
+        return Stage(name, title, product, wants, inputs, retries, named)
 
     return record

@@ -54,7 +54,7 @@ RECORD = "accuracy.json"
 ACCURACY = Product("evaluate", version=9, files=(RECORD,), by_weights=True)
 
 
-@stage("evaluate", "accuracy (not part of the survey)", ACCURACY, unit="operations of a glance", size="surveys")
+@stage("evaluate", "accuracy (not part of the survey)", ACCURACY)
 def evaluate(run: SurveyRun, mosaic: StageRef, patches: StageRef, class_map: StageRef, *captures: StageRef) -> Wanted:
     """Judge the map by the labels, and other placements, with the survey's effects; no part of the survey's cost.
 

@@ -34,7 +34,7 @@ from storage.arrays.mosaics import Attention, load_attention, mosaic_brightness,
 ATTENTION = Product("attend", version=7, files=("attention.zarr", "plan.json"), by_weights=True)
 
 
-@stage("attend", "attention and plan", ATTENTION, unit="pixels")
+@stage("attend", "attention and plan", ATTENTION)
 def attend(run: SurveyRun, mosaic: StageRef) -> Wanted:
     """Score every seat by the coarse mosaic, and plan the sweeps that show the most score in the time left."""
     settings = run.settings
@@ -196,7 +196,7 @@ FILE = "orientation.json"
 TURNED = Product("turned", version=1, files=(FILE,))
 
 
-@stage("compare_turned", "the plan with lines along the other axis", TURNED, unit="pixels")
+@stage("compare_turned", "the plan with lines along the other axis", TURNED)
 def compare_turned(run: SurveyRun, mosaic: StageRef, attention: StageRef) -> Wanted:
     """Plan the scores with lines along the other axis, and find which way crop rows run."""
     settings = run.settings

@@ -26,13 +26,13 @@ RAW = Product("capture", version=9)
 RIG_RECORD = "rig.json"  # beside the cubes: what a rig's captures were like
 
 
-@stage("capture_coarse", "coarse sweep", RAW, inputs=1, unit="coarse values", retries=2, named="raw_coarse")
+@stage("capture_coarse", "coarse sweep", RAW, inputs=1, retries=2, named="raw_coarse")
 def capture_coarse(run: SurveyRun, effects: StageRef) -> Wanted:
     """Sweep the whole field once, fast."""
     return sweeps_wanted(run, run.plan.coarse, [effects])
 
 
-@stage("capture_fine", "fine sweeps", RAW, inputs=2, unit="fine values", retries=2, named="raw_fine")
+@stage("capture_fine", "fine sweeps", RAW, inputs=2, retries=2, named="raw_fine")
 def capture_fine(run: SurveyRun, attention: StageRef, effects: StageRef) -> Wanted:
     """Go back for the places that the plan chose."""
     return sweeps_wanted(run, load_plan(attention).sweeps, [attention, effects], begins_s=run.plan.coarse_s)

@@ -38,7 +38,7 @@ LOOK = {
 DRAFT, VERIFIED = 0.3, 1.0
 
 
-@stage("choose_effects", "effects that matter", MANIFEST, unit="surveys")
+@stage("choose_effects", "effects that matter", MANIFEST)
 def choose_effects(run: CaptureRun) -> Wanted:
     """Decide for scene and rig which effects to simulate, and check it on the worst lines of the scene.
 

@@ -44,7 +44,7 @@ LEFT_OUT = "left_out.npy"  # beside a map while it is drawn: the pixels of which
 MOST_TURN_PX = 12.0  # that a field's corners may lie off by, as it is turned, so that its memory is of use
 
 
-@stage("draw_map", "class map", CLASS_MAP, unit="operations of the map", size="pixels")
+@stage("draw_map", "class map", CLASS_MAP)
 def draw_map(run: SurveyRun, mosaic: StageRef, patches: StageRef) -> Wanted:
     """Draw the class map from coarse and fine patches, region by region; no class where the scene has no value."""
 

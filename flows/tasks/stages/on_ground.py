@@ -23,7 +23,7 @@ STORE = "ground_map.zarr"
 GROUND = Product("ground", version=4, files=(STORE,))
 
 
-@stage("ground", "map on the ground", GROUND, unit="pixels")
+@stage("ground", "map on the ground", GROUND)
 def ground(run: SurveyRun, class_map: StageRef, mosaic: StageRef) -> Wanted:
     """Draw the class map, its memory and the coarse picture on the ground, by the settings' pose."""
     grid, choice = survey_grid(run), run.settings.map

@@ -46,9 +46,7 @@ def record_of(registration: StageRef | None) -> Path | None:
     return None if registration is None else registration.path / RECORD
 
 
-@stage(
-    "register_coarse", "seams of the coarse sweeps", POINTING, inputs=1, unit="coarse values", named="coarse_pointing"
-)
+@stage("register_coarse", "seams of the coarse sweeps", POINTING, inputs=1, named="coarse_pointing")
 def register_coarse(run: SurveyRun, raw: StageRef) -> Wanted:
     """Find pointing and light of the coarse sweeps from what neighbours show twice."""
     prior = run.settings.pointing_px
@@ -105,7 +103,7 @@ def _window_record(seen: SeamWindow, names: Sequence[str]) -> dict[str, Any]:
     }
 
 
-@stage("register_fine", "fine sweeps on the mosaic", POINTING, inputs=2, unit="fine values", named="fine_pointing")
+@stage("register_fine", "fine sweeps on the mosaic", POINTING, inputs=2, named="fine_pointing")
 def register_fine(run: SurveyRun, raw: StageRef, mosaic: StageRef) -> Wanted:
     """Find where each fine sweep lies on the coarse mosaic, which itself may be off by as much."""
     prior = run.settings.pointing_px
@@ -146,7 +144,7 @@ SEATS_AT_ONCE = 64
 CACHE_SHARE = 8  # raw lines kept for the next patches may take this part of the memory
 
 
-@stage("locate", "lookup", LOOKUP, unit="coarse pixels")
+@stage("locate", "lookup", LOOKUP)
 def locate(run: SurveyRun, raw: StageRef, *registration: StageRef) -> Wanted:
     """Look up where each coarse pixel was seen: a table that every survey along the same path shares."""
     grid = PixelGrid.of_scene(run.grid, 1 if run.plan.plain else run.grid.factor)
@@ -178,7 +176,7 @@ def locate(run: SurveyRun, raw: StageRef, *registration: StageRef) -> Wanted:
     return Wanted(build, params)  # keyed by the paths, not by what was seen along them
 
 
-@stage("rectify", "mosaic", MOSAIC, unit="mosaic values")
+@stage("rectify", "mosaic", MOSAIC)
 def rectify(run: SurveyRun, raw: StageRef, lookup: StageRef, *registration: StageRef) -> Wanted:
     """Bring the coarse sweeps onto the scene grid and blend them into one mosaic, tile by tile."""
 
@@ -216,7 +214,7 @@ def rectify(run: SurveyRun, raw: StageRef, lookup: StageRef, *registration: Stag
     return Wanted(build, params, [raw, lookup, *registration])
 
 
-@stage("cut_patches", "fine patches", PATCHES, unit="patch values")
+@stage("cut_patches", "fine patches", PATCHES)
 def cut_patches(run: SurveyRun, attention: StageRef, raw: StageRef, *registration: StageRef) -> Wanted:
     """Bring every chosen seat onto the scene grid, one patch a seat; NaN where nothing was seen, or is no scene.
 

@@ -19,7 +19,7 @@ from storage.arrays.tile_work import Thumbnail
 from storage.rasters.raster_work import RasterPixels, write_means, write_patches
 
 
-@stage("average_raster", "coarse means of the raster", MOSAIC, inputs=0, unit="mosaic values")
+@stage("average_raster", "coarse means of the raster", MOSAIC, inputs=0)
 def average_raster(run: SurveyRun) -> Wanted:
     """Store the means of factor x factor pixels of a raster: what attention looks at first."""
 
@@ -39,7 +39,7 @@ def average_raster(run: SurveyRun) -> Wanted:
     return Wanted(build, _params(run))
 
 
-@stage("take_patches", "patches of the raster", PATCHES, inputs=1, unit="patch values")
+@stage("take_patches", "patches of the raster", PATCHES, inputs=1)
 def take_patches(run: SurveyRun, attention: StageRef) -> Wanted:
     """Store the patches that attention asks for, at the raster's own pixels; NaN where it has no value."""
 

@@ -13,7 +13,6 @@ import pytest
 from flows.archive.plan_command import StageForecast, forecast, plan_content, show_plan
 from flows.settings.load import load_settings
 from flows.settings.survey_settings import Settings
-from flows.tasks.extent import scaled_cost
 from flows.tasks.run import open_run
 from flows.terminal.progress import put_out
 from pipeline.errors import ArchiveError, IncompleteStoreError, SettingsError
@@ -72,14 +71,13 @@ def test_the_survey_does_what_the_plan_said(
 
 
 def test_without_an_archive_the_plan_makes_none(settings: Settings, tmp_path: Path) -> None:
-    """The first capture is to run and has its key; what reads a store waits for it, by name; there is no estimate."""
+    """The first capture is to run and has its key; what reads a store waits for it, by name."""
     planned = _plan(settings, tmp_path / "none")
     assert not list(tmp_path.iterdir())
     assert planned["choose_effects"].state == "to run"
     assert planned["capture_coarse"].state == "to run"
     assert planned["capture_coarse"].why == "nothing stored yet"
     assert planned["capture_coarse"].key is not None
-    assert planned["capture_coarse"].seconds is None
     assert "no such store has a record" in planned["capture_coarse"].basis
     assert {name: planned[name].why for name in WAITS} == {name: f"waits for {on}" for name, on in WAITS.items()}
 
@@ -127,28 +125,9 @@ def test_the_reason_is_what_differs(
 
 
 def test_of_another_scene_nothing_is_stored(settings: Settings, archive: Path, scene_files: Path) -> None:
-    """Its light is new, and the estimate is scaled by exactly the work there is more of."""
+    """Its light is new."""
     planned = _plan(settings, archive, scene="farm", size=(192, 96), labels=None, weights=None)
     assert planned["capture_coarse"].why == "nothing stored yet of this scene"
-    times = 192 * 96 / (128 * 96) * 270 / 3  # pixels and bands
-    record = Archive(archive).refs("rectify")[0]
-    cost = Archive(archive).cost(record)
-    assert cost is not None
-    assert planned["rectify"].seconds == pytest.approx(cost.wall_s * times)
-    assert planned["rectify"].size == round(cost.size * times)
-    assert planned["rectify"].basis == f"{record.uri} times {times:.3g}, by mosaic values"
-    assert planned["draw_map"].size == round(_size(archive, "segment") * 192 / 128)
-    assert planned["evaluate"].size == _size(archive, "evaluate")
-
-
-def test_two_records_tell_what_starting_takes() -> None:
-    """One alone is scaled by the work; on the line of two lies a third, whichever comes first; noise is held back."""
-    assert scaled_cost([10.0], [3.0], 40.0) == 12.0
-    for order in (slice(None), slice(None, None, -1)):
-        assert scaled_cost([10.0, 30.0][order], [3.0, 7.0][order], 100.0) == pytest.approx(1 + 0.2 * 100)
-    assert scaled_cost([10.0, 30.0], [3.0, 12.0], 100.0) == 30.0  # dearer than in proportion: no start below 0
-    assert scaled_cost([30.0, 10.0], [3.0, 2.9], 60.0) == pytest.approx(1.5 + 1.5 * 2)  # hardly dearer: half is start
-    assert scaled_cost([10.0, 30.0], [1.0, 3.5], 0.0) == 0.0
 
 
 def _show(asked: Settings, *, as_json: bool = False) -> None:
@@ -188,19 +167,6 @@ def test_a_plan_loads_neither_torch_nor_figures_nor_maps() -> None:
     assert not heavy & set(python(code).stdout.split())
 
 
-def _size(archive: Path, stage: str) -> int:
-    opened = Archive(archive)
-    return opened.stored_bytes(opened.refs(stage)[0])
-
-
-def test_judging_with_controls_is_not_estimated_by_judging_without(settings: Settings, archive: Path) -> None:
-    """Controls scan the whole field: the record of a survey without them says nothing of that."""
-    row = _plan(settings, archive, controls=True)["evaluate"]
-    assert row.state == "to run"
-    assert row.why == "controls: False before, True now"
-    assert row.seconds is None
-
-
 def test_a_damaged_store_blocks_what_needs_it(settings: Settings, archive: Path, tmp_path: Path) -> None:
     """With the archive's own words; an archive that is a file is refused as a survey refuses it."""
     store = Archive(archive).refs("rectify")[0]
@@ -215,18 +181,16 @@ def test_a_damaged_store_blocks_what_needs_it(settings: Settings, archive: Path,
 
 
 def test_plan_as_json_and_as_a_table(settings: Settings, archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """One object with the sums of what is ahead; the table names every stage and says what is left to make."""
+    """One object; the table names every stage and says what is left to make."""
     asked = replace(settings, out=str(archive), kernel="nearest")
     _show(asked, as_json=True)
     content = json.loads(capsys.readouterr().out)
     ahead = [row for row in content["stages"] if row["state"] in ("to run", "blocked")]
-    assert content["to_make"] == content["estimated"] == len(ahead) == 7
-    assert content["seconds"] == pytest.approx(sum(row["seconds"] for row in ahead))
-    assert content["bytes"] == sum(row["bytes"] for row in ahead)
+    assert content["to_make"] == len(ahead) == 7
     _show(asked)
     shown = capsys.readouterr().out
     assert all(row["stage"] in shown for row in content["stages"])
-    assert "7 stages to make, about" in shown
+    assert "7 stages to make" in shown
     _show(replace(settings, out=str(archive)))
     assert "everything is stored" in capsys.readouterr().out
 
