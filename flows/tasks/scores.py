@@ -23,32 +23,10 @@ class WorstClass(NamedTuple):
 
 
 def score_of(receipt: Mapping[str, Any]) -> dict[str, float | None]:
-    """``miou`` and ``overall_accuracy`` of a run's map, 0..1; None where nothing was judged or it cannot be told.
-
-    Receipts of before hold the mean over the classes that map or truth show. Theirs is worked out anew from the IoU of
-    each class, so that runs of any age may be compared: a class that any of the three maps has right is in the truth,
-    one that neither the truth nor some map shows is not. Where a class is 0 in all maps nobody knows, and there is
-    no score.
-    """
+    """``miou`` and ``overall_accuracy`` of a run's map, 0..1; None where nothing was judged."""
     accuracy = receipt.get("accuracy")
-    if not isinstance(accuracy, Mapping):
-        return {"miou": None, "overall_accuracy": None}
-    miou = known_number(accuracy.get("miou")) if "miou_of_shown_classes" in accuracy else _miou_of_before(accuracy)
-    return {"miou": miou, "overall_accuracy": known_number(accuracy.get("overall_accuracy"))}
-
-
-def _miou_of_before(accuracy: Mapping[str, Any]) -> float | None:
-    maps = [by_class for by_class in map(_by_class, judged_maps(accuracy).values()) if by_class]
-    if not maps:
-        return None
-    known: list[float] = []
-    for name, iou in maps[0].items():
-        each = [by_class.get(name) for by_class in maps]
-        if any(each):
-            known.append(iou or 0.0)
-        elif None not in each:
-            return None  # never right and never absent: the truth may have it or not
-    return sum(known) / len(known) if known else None
+    found = accuracy if isinstance(accuracy, Mapping) else {}
+    return {name: known_number(found.get(name)) for name in ("miou", "overall_accuracy")}
 
 
 def judged_maps(accuracy: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:

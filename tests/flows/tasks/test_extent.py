@@ -8,17 +8,12 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from flows.tasks.extent import Extent, work_done, work_of_map
+from flows.tasks.extent import work_done, work_of_map
 from flows.tasks.run import SurveyRun
 from models.network.sizes import SegmenterConfig, multiply_adds
 from models.policies.policies import score_multiply_adds
-from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
-from pipeline.geometry.scan import CostModel
 
-SMALL = Extent(
-    SegmenterConfig(4, patch=16), SceneGrid(640, 1280, 16, 4), LineCamera(), CostModel(), "x", 30, 160, 200, 4
-)
 CONFIG, BANDS = SegmenterConfig(classes=4), 8
 
 
