@@ -18,7 +18,7 @@ from models.reading.remembered import COME_TRUE, Belief, Remembered, carried, in
 from models.weights.files import Description, load_reader
 from pipeline.errors import BudgetError, NothingToMend, SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
-from pipeline.planning.area_cover import seats_shown
+from pipeline.planning.coverage import seats_shown
 from pipeline.planning.part_looks import PartLook, SeatRows, cheapest_row_seconds, part_look, sweeps_of_runs
 from pipeline.planning.plain_scans import LOSS, MIOU, ScanRecord, exposures_between, scan_words
 from storage.arrays.class_maps import BeliefStore

@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 
 from flows.settings.survey_settings import RECORDED, Settings
 from flows.settings.values import LOOK_PART
-from flows.tasks.beyond_training import beyond_training
 from flows.tasks.capture_plan import CapturePlan, plan_capture
 from flows.tasks.look_choice import LookChoice, choose_look
 from flows.tasks.memory import AUTO, NONE, Prior, find_prior
 from flows.tasks.reading_costs import ReadingCosts
-from flows.tasks.recorded.field import OpenedRecording, open_recorded
+from flows.tasks.recorded_field import OpenedRecording, open_recorded
 from flows.tasks.scan_choice import ScanChoice, choose_plain_scan
 from flows.tasks.scene import (
     FieldSource,
@@ -35,7 +34,7 @@ from flows.tasks.scene import (
     open_scene,
 )
 from flows.tasks.seat_budget import SeatBudget
-from flows.tasks.survey_model import SurveyModel, vgg_file, weights_offered
+from flows.tasks.survey_model import SurveyModel, beyond_training, vgg_file, weights_offered
 from flows.tasks.zones import SurveyZones, open_zones, place_of_field
 from models.evaluation.expected_scores import MapScores
 from models.network.machine import PROCESSOR, choose_device

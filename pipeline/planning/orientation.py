@@ -12,8 +12,7 @@ from pipeline.errors import PoseError, ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, CostModel, Sweep
-from pipeline.planning.area_cover import sweeps_over
-from pipeline.planning.coverage import coarse_sweeps, full_sweeps, with_margin
+from pipeline.planning.coverage import coarse_sweeps, full_sweeps, sweeps_over, with_margin
 from pipeline.planning.fine_pass import FinePlan, plan_fine
 
 Floats = NDArray[np.float64]

@@ -34,8 +34,7 @@ from models.weights.files import Weights, load_reader, load_weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel, Sweep
-from pipeline.planning.area_cover import seats_shown
-from pipeline.planning.coverage import cheapest_full, plain_sweeps
+from pipeline.planning.coverage import cheapest_full, plain_sweeps, seats_shown
 from pipeline.planning.part_looks import LineRun, SeatRows, part_look, sweeps_of_runs
 from pipeline.planning.plain_scans import MIOU, PlainScan, ScanLimits, ScanRecord, choose_scan, plain_scans, scan_words
 from pipeline.simulator.rig_model import Rig

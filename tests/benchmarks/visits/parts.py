@@ -33,8 +33,7 @@ from models.reading.doubts import SeatDoubts
 from models.reading.remembered import COME_TRUE, Belief, Looked, Remembered, carried, first_belief
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
-from pipeline.planning.area_cover import seats_shown
-from pipeline.planning.coverage import cheapest_full, plain_sweeps
+from pipeline.planning.coverage import cheapest_full, plain_sweeps, seats_shown
 from pipeline.planning.part_looks import SeatRows, part_look, sweeps_of_runs
 from pipeline.planning.plain_scans import ScanRecord
 from pipeline.simulator.scenes.farm.farm_scene import farm_scene

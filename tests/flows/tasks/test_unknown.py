@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from flows.publish.receipt_words import sentences
 from flows.settings.load import load_settings
-from flows.tasks.beyond_training import beyond_training
+from flows.tasks.survey_model import beyond_training
 from models.reading.familiar import Familiar, Limits
 from models.weights.files import add_familiar, describe_weights
 from models.weights.parts import TrainedOn

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis
-from pipeline.planning.area_cover import sweeps_over
-from pipeline.planning.coverage import coarse_sweeps, full_sweeps, sweep_outline
+from pipeline.planning.coverage import coarse_sweeps, full_sweeps, sweep_outline, sweeps_over
 from pipeline.planning.strips import covered_seats
 
 GRID, CAMERA = SceneGrid(320, 416, 16, 4), LineCamera(samples=160)

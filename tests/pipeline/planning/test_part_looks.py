@@ -13,8 +13,7 @@ from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, CostModel, exposing
-from pipeline.planning.area_cover import seats_shown
-from pipeline.planning.coverage import plain_sweeps
+from pipeline.planning.coverage import plain_sweeps, seats_shown
 from pipeline.planning.part_looks import SeatRows, cheapest_row_seconds, part_look, sweeps_of_runs
 
 GRID, CAMERA, COST = SceneGrid(320, 416, 16, 4), LineCamera(samples=160), CostModel()
