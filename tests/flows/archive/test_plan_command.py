@@ -78,7 +78,6 @@ def test_without_an_archive_the_plan_makes_none(settings: Settings, tmp_path: Pa
     assert planned["capture_coarse"].state == "to run"
     assert planned["capture_coarse"].why == "nothing stored yet"
     assert planned["capture_coarse"].key is not None
-    assert "no such store has a record" in planned["capture_coarse"].basis
     assert {name: planned[name].why for name in WAITS} == {name: f"waits for {on}" for name, on in WAITS.items()}
 
 
