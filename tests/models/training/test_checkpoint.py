@@ -88,19 +88,6 @@ def test_a_damaged_checkpoint_is_refused(tmp_path: Path, damage: str) -> None:
     assert file.read_bytes() == changed
 
 
-def test_training_beside_a_damaged_checkpoint_ends_with_its_name(tmp_path: Path) -> None:
-    """It does not begin anew in silence, and the file stays for whoever can mend it."""
-    file = tmp_path / "c"
-    with pytest.raises(KeyboardInterrupt):
-        train(CONFIG, [example()], SHIFT, SETTINGS, killed_after(4), checkpoint=file, keep_every_s=0)
-    raw = bytearray(file.read_bytes())
-    raw[-9] ^= 4
-    file.write_bytes(raw)
-    with pytest.raises(WeightsError, match="is not what was written; bring back a copy of it, or delete it to begin"):
-        train(CONFIG, [example()], SHIFT, SETTINGS, checkpoint=file)
-    assert file.read_bytes() == raw
-
-
 def test_a_checkpoint_of_other_shapes_is_not_gone_on_from(tmp_path: Path) -> None:
     """What an earlier version left of the same run, or what cannot be read, starts from the beginning."""
     file, identity = tmp_path / "c", run_identity(CONFIG, [example()], SETTINGS)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from models.network.spectral import SpectralBasis
 from models.training import examples
-from models.training.examples import CropSampler, Example, Observation, measured_normalisation, normalised, observe
+from models.training.examples import CropSampler, Example, Observation, observe
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera, expose, footprint
 from pipeline.geometry.grid import SceneGrid
@@ -78,16 +78,6 @@ def test_scenes_without_labels_teach_nothing():
     )
     with pytest.raises(SceneError, match="none of 2 scenes has a labelled pixel"):
         CropSampler([blank, blank], 8, 2, 32)
-
-
-def test_examples_are_normalised_over_all_scenes():
-    """Both looks go through one normalisation, measured on the fine looks."""
-    seen = [_observed(_scene()), _observed(_scene((32, 32)))]
-    normalisation = measured_normalisation(seen)
-    example = normalised(seen[0], normalisation, np.ones(6, bool))
-    assert example.fine.dtype == np.float16
-    assert np.median(np.abs(example.fine.astype(float))) < 2
-    assert example.coarse == pytest.approx(normalisation.apply(seen[0].coarse, np.ones(6, bool)))
 
 
 def _example(shape: tuple[int, int], name: str = "e", labelled: float = 1.0) -> Example:

@@ -22,7 +22,6 @@ from models.weights.files import (
     load_any_weights,
     load_weights,
     save_weights,
-    with_record,
 )
 from models.weights.sealed_files import SEAL, TENSORS, _seal, hash_of
 from pipeline.errors import WeightsError
@@ -74,34 +73,6 @@ def test_saving_twice_gives_equal_files(tiny: Maker, saved: Path, tmp_path: Path
     save_weights(load_weights(saved), tmp_path / "again.safetensors")
     assert (tmp_path / "again.safetensors").read_bytes() == saved.read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["again.safetensors", "w.safetensors"]
-
-
-def test_parameters_in_another_memory_order_are_kept(tiny: Maker, tmp_path: Path):
-    """Training keeps kernels channels last; the file holds the same numbers."""
-    weights = tiny()
-    weights.segmenter.to(memory_format=torch.channels_last)
-    save_weights(weights, tmp_path / "w.safetensors")
-    loaded = load_weights(tmp_path / "w.safetensors").segmenter.state_dict()
-    assert all(torch.equal(loaded[name], value) for name, value in tiny().segmenter.state_dict().items())
-
-
-def test_unreached_columns_are_the_median_and_dead_pixels_nothing(tiny: Maker):
-    """Without correlation, bands of half the range leave the other half's columns at 0; a dead pixel is NaN in all."""
-    weights = tiny(columns=6)
-    plain = replace(weights, normalisation=replace(weights.normalisation, whitening=np.eye(6, dtype=np.float32)))
-    columns = plain.columns(np.array([[0.3, 0.4, 0.5], [0.3, np.nan, np.inf]]), np.array([400.0, 450.0, 500.0]))
-    assert columns[0, :3].all()
-    assert not columns[0, 3:].any()
-    assert np.isnan(columns[1]).all()
-
-
-def test_records_grow_without_changing_the_rest(tiny: Maker):
-    """Entries are added to a copy; the weights themselves stay."""
-    weights = tiny()
-    noted = with_record(weights, licence="CC0")
-    assert noted.record == {"seed": 0, "licence": "CC0"}
-    assert weights.record == {"seed": 0}
-    assert noted.segmenter is weights.segmenter
 
 
 def test_a_missing_file_says_how_to_make_one(tmp_path: Path):
@@ -172,14 +143,6 @@ def test_a_missing_entry_is_named(saved: Path):
     _rewritten(saved, {**about, "class_names": ["soil"]})
     with pytest.raises(WeightsError, match="names 1 classes, its segmenter has 3"):
         load_weights(saved)
-
-
-def test_a_folder_that_is_none_cannot_be_written_to(tiny: Maker, tmp_path: Path):
-    """The message names the file and says what to do, when the folder is missing or a file itself."""
-    (tmp_path / "file").touch()
-    for folder in ("missing", "file"):
-        with pytest.raises(WeightsError, match=r"cannot write weights to .*; choose another -o"):
-            save_weights(tiny(), tmp_path / folder / "w.safetensors")
 
 
 def test_a_write_that_fails_leaves_the_old_file(tiny: Maker, saved: Path, monkeypatch: pytest.MonkeyPatch):
