@@ -35,7 +35,7 @@ from flows.cli.app import ArchiveName, AsJson, OutFolder, Scheduler, Switch, Wor
 from flows.publish.receipt import Receipt
 from flows.publish.run_folder import extend_with_accuracy, load_receipt
 from flows.publish.survey_command import run_survey, show_published
-from flows.settings.load import parse_settings
+from flows.settings.load import of_this_version, parse_settings
 from flows.settings.survey_settings import OF_THE_MACHINE, Settings
 from flows.tasks.observer import Observer
 from flows.tasks.open_survey import JUDGED, STAGES, TITLES, OpenSurvey, Products, versions
@@ -252,7 +252,7 @@ def _survey(settings: Settings, console: Console) -> Path:
 
 def survey_as_before(settings: Mapping[str, Any], out: str, console: Console) -> None:
     """Survey by the settings of a run's receipt into the archive ``out``, on this machine's own terms."""
-    here = {**settings, "out": out, **dict.fromkeys(OF_THE_MACHINE)}
+    here = {**of_this_version(settings), "out": out, **dict.fromkeys(OF_THE_MACHINE)}
     run_survey(parse_settings(here), console)
 
 

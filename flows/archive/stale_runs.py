@@ -10,7 +10,7 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from flows.publish.receipt import is_pending
-from flows.settings.load import load_settings, parse_settings
+from flows.settings.load import load_settings, of_this_version, parse_settings
 from flows.settings.survey_settings import BUILT_IN_SCENES, OF_THE_MACHINE, RECORDED, Settings
 from flows.tasks.open_survey import STAGES, versions
 from flows.tasks.survey_model import weights_path
@@ -148,7 +148,7 @@ def asked_again(run: Run, out: str | Path, weights: Path | None) -> Settings:
     """
     if not run.settings:
         raise SettingsError(f"the settings of {run.uri} cannot be read ({run.problem}); survey this field by hand")
-    known = run.settings | dict.fromkeys(OF_THE_MACHINE) | {**_scene_of(run)}
+    known = of_this_version(run.settings) | dict.fromkeys(OF_THE_MACHINE) | {**_scene_of(run)}
     return parse_settings({**known, "out": str(out), **({} if weights is None else {"weights": str(weights)})})
 
 

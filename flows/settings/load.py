@@ -296,6 +296,11 @@ def _hint(full: str, known: Mapping[str, Declared], prefix: str) -> str:
     return f"; did you mean '{near[0]}'?" if near else f"; known keys: {', '.join(prefix + key for key in known)}"
 
 
+def of_this_version(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a receipt's settings without what it says beside them."""
+    return {key: value for key, value in stored.items() if key in SURVEY}
+
+
 def anchor_paths(table: dict[str, object], folder: Path) -> dict[str, object]:
     """Relative paths of a file's settings, made to start at the file's folder."""
     named = {*BUILT_IN_SCENES, REMOVED_LAW, RIG_FIELD}
