@@ -44,9 +44,9 @@ nitpick_ignore_regex = [("py:.*", ".*")]
 
 def stage_table() -> str:
     """Markdown: every stage in the order of a survey, from the records that the survey itself runs by."""
-    head = "| stage | on terminals | stored as, version | work grows with |\n|---|---|---|---|\n"
+    head = "| stage | on terminals | stored as, version |\n|---|---|---|\n"
     return head + "".join(
-        f"| `{one.name}` | {one.title} | `stages/{one.product.name}`, {one.product.version} | {one.unit} |\n"
+        f"| `{one.name}` | {one.title} | `stages/{one.product.name}`, {one.product.version} |\n"
         for one in STAGES.values()
     )
 

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from flows.cli.app import AsJson, OutFolder, Switch, removed, stderr
+from flows.cli.app import AsJson, OutFolder, Switch, stderr
 from flows.settings.documents import flag_help
 from flows.settings.load import SURVEY, TABLES, load_settings
-from flows.settings.survey_settings import REPLACED
 from flows.terminal.progress import print_json
 from pipeline.errors import NothingToMend
 from pipeline.lazy import deferred
@@ -27,7 +26,6 @@ else:
     simulate_command = deferred("flows.simulate.command")
     rig_commands = deferred("flows.simulate.rig_commands")
 
-removed.update(REPLACED)
 OF_ZONES = ("area", "no_go", "plots", "plots_name")
 # flags of what a settings file has in a table
 IN_TABLES = {"exposure_ms": "camera.exposure_ms", **{name: f"zones.{name}" for name in OF_ZONES}}

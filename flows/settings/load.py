@@ -15,11 +15,9 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 from pydantic import Field, PlainValidator, TypeAdapter, ValidationError
 
-from flows.settings.recorded_defaults import usual_of_recording
 from flows.settings.survey_settings import (
     BUILT_IN_SCENES,
     OF_A_CAMERA,
-    OF_A_PART,
     OF_A_VIEW,
     OF_CHOOSING,
     OF_RECORDINGS,
@@ -28,7 +26,6 @@ from flows.settings.survey_settings import (
     PLAIN,
     RASTER,
     RECORDED,
-    REPLACED,
     RIG,
     RIG_FIELD,
     SPARING,
@@ -43,6 +40,7 @@ from pipeline.rig.device_settings import MOST_PAIRS
 from pipeline.setting_fields import number_words, span_of
 from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, REMOVED_LAW
 from storage.archive.staging import read_toml
+from storage.readers.recordings import find_recorded_run
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,6 +131,38 @@ TABLES = {
 }
 
 
+OF_THE_PLAN = (*PLAIN, *OF_TWO_PASSES, *SPARING, "scan_exposure_ms", "look")
+OF_THE_RUN = ("camera", "cost", "rig", "pose", "map", "zones", "kernel", "pointing_px", "seed", "weights", "unknown")
+BUILT_IN_WEIGHTS = "farm"
+
+
+def usual_of_recording(table: Mapping[str, object]) -> dict[str, Any]:
+    """Return what the settings beside ``sweeps`` are by default: those of the run that took them, where one is told.
+
+    So `survey --sweeps ARCHIVE/runs/NAME` alone plans as that run did. Cubes of files know nothing of a survey: without
+    a budget or a scan every recorded line is read as it is.
+    Raises SceneError, ArchiveError: there is no such recording, or no run of it.
+    """
+    if table.get("source", RECORDED) != RECORDED:
+        return {}
+    usual: dict[str, Any] = {"source": RECORDED, "scene": RIG_FIELD}
+    asked = {name for name in OF_THE_PLAN if table.get(name) is not None}
+    found = find_recorded_run(str(table["sweeps"]))
+    if found is not None:
+        run, shape = found
+        uniform = any(run.settings.get(name) is not None for name in PLAIN)
+        another_plan = asked if uniform else asked & set(PLAIN)
+        names = OF_THE_RUN if another_plan else (*OF_THE_RUN, *OF_THE_PLAN)
+        usual |= {name: run.settings[name] for name in names if run.settings.get(name) is not None}
+        usual |= {"name": str(run.receipt.get("survey") or run.folder.name)}
+        usual |= {} if shape is None else {"size": shape[::-1]}
+        if run.settings.get("weights") is None and run.settings.get("scene") in BUILT_IN_SCENES:
+            usual["weights"] = BUILT_IN_WEIGHTS
+    elif not asked:
+        usual["scan"] = RECORDED
+    return usual
+
+
 def load_settings(
     path: str | Path | None = None,
     flags: Mapping[str, object] | None = None,
@@ -165,7 +195,7 @@ def load_settings(
     if table.get("source") == SURVEY["source"].item.default:  # as if it were not said
         del table["source"]
     given = _given(table)
-    recorded = of_this_version(usual_of_recording(table)) if "sweeps" in given else {}
+    recorded = usual_of_recording(table) if "sweeps" in given else {}
     for name in TABLES:
         inner = table.get(name)
         if isinstance(inner, Mapping):
@@ -258,9 +288,7 @@ def _parse_table(key: str, value: object, place: str, origin: Mapping[str, str])
 
 
 def _hint(full: str, known: Mapping[str, Declared], prefix: str) -> str:
-    """What was meant by an unknown key: what replaced it, or the nearest of its table, or of another table."""
-    if full in REPLACED:
-        return f"; {REPLACED[full]}"
+    """What was meant by an unknown key: the nearest of its table, or of another table."""
     everywhere = [*SURVEY, *(f"{name}.{key}" for name, keys in TABLES.items() for key in keys)]
     short = full.removeprefix(prefix)
     near = [name for name in everywhere if name.split(".")[-1] == short]
@@ -269,21 +297,8 @@ def _hint(full: str, known: Mapping[str, Declared], prefix: str) -> str:
 
 
 def of_this_version(stored: Mapping[str, Any]) -> dict[str, Any]:
-    """A receipt's settings that there are now, in tables too (SettingsError: two rounds of detail, now no more)."""
-    if stored.get("rounds", 1) != 1:
-        raise SettingsError(
-            f"its survey had {stored['rounds']} rounds of detail, which never paid and were removed: survey the "
-            "field by hand, without 'rounds'; what both share is in the archive; take what is damaged out first"
-        )
-    if stored.get("look", LOOK_WHOLE) == LOOK_WHOLE:  # of a first visit that asked for a part
-        stored = {key: None if key in OF_A_PART else value for key, value in stored.items()}
-    return {
-        key: {name: item for name, item in value.items() if name in TABLES[key]}
-        if key in TABLES and isinstance(value, Mapping)
-        else value
-        for key, value in stored.items()
-        if key in SURVEY
-    }
+    """Return a receipt's settings without what it says beside them."""
+    return {key: value for key, value in stored.items() if key in SURVEY}
 
 
 def anchor_paths(table: dict[str, object], folder: Path) -> dict[str, object]:

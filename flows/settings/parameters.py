@@ -1,61 +1,57 @@
-"""A survey's settings as the parameters of a flow: a field for each declared setting, for Prefect's form and checks."""
+"""A survey's settings as the parameters of a flow: the declared settings, for Prefect's form and checks."""
 
 from __future__ import annotations
 
 from dataclasses import MISSING, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Self, get_args
+from typing import Any, Self
 
-from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, create_model, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, model_validator
 
 from flows.settings.documents import about, shown
 from flows.settings.load import SURVEY, TABLES, Declared, anchor_paths, load_settings
 from flows.settings.survey_settings import AUTO, BUILT_IN_SCENES, Settings
-from pipeline.errors import PipelineError
+from pipeline.errors import PipelineError, SettingsError
 
-OF_LISTS = {"bands": list[int], "wavelengths": list[float], "size": list[int]}  # also as text: 0-3,7
-SECRET = ("password",)  # is read from the settings file alone: a server keeps parameters
+OF_LISTS = {"bands": "integer", "wavelengths": "number", "size": "integer"}  # also as text: 0-3,7
+SECRET = "password"  # is read from the settings file alone: a server keeps parameters
+KINDS = {bool: "boolean", int: "integer", float: "number", str: "string"}
 
 
-def _field(name: str, one: Declared) -> tuple[Any, Any]:
-    """Return type and description of a setting as JSON knows it; None is its default."""
-    plain = one.kind if one.kind in (bool, int, float, str) or one.choices else OF_LISTS.get(name)
-    kind: Any = str | float | int if plain is None else plain | str if name in OF_LISTS else plain
+def _schema(schema: dict[str, Any]) -> None:
+    """Add every declared setting to the schema of the parameters: type, choices, default and line of help."""
+    for name, one in SURVEY.items():
+        schema["properties"][name] = (
+            {
+                "title": name.replace("_", " "),
+                "type": "object",
+                "description": one.item.metadata["description"],
+                "properties": {key: _described(key, inner) for key, inner in TABLES[name].items() if key != SECRET},
+            }
+            if name in TABLES
+            else _described(name, one)
+        )
+
+
+def _described(name: str, one: Declared) -> dict[str, Any]:
     default = one.item.default
     usual = "" if default is None or default is MISSING else f"; {shown(one)} by default"
-    return kind | None, Field(default=None, description=about(one, choices=False) + usual)
+    kind: dict[str, Any] = {"type": KINDS.get(one.kind, "string")}
+    if one.choices:
+        kind = {"enum": list(one.choices)}
+    elif name in OF_LISTS:
+        kind = {"anyOf": [{"type": "array", "items": {"type": OF_LISTS[name]}}, {"type": "string"}]}
+    return {"title": name.replace("_", " "), "description": about(one, choices=False) + usual, **kind}
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", protected_namespaces=())
-
-
-def _model_of(name: str, fields: dict[str, Any], about: str) -> Any:
-    make: Any = create_model  # whose overloads cannot tell fields by name
-    return make(name, __base__=_Strict, __doc__=about, **fields)
-
-
-def _table(name: str) -> Any:
-    """Return the model of a table of settings."""
-    described = SURVEY[name].item.metadata["description"]
-    fields = {key: _field(key, one) for key, one in TABLES[name].items() if key not in SECRET}
-    made = _model_of(f"{name.capitalize()}Table", fields, described)
-    return made | None, Field(default=None, description=described)
-
-
-_Declared: Any = _model_of(
-    "_Declared",
-    {name: _table(name) if name in TABLES else _field(name, SURVEY[name]) for name in SURVEY},
-    "The declared settings.",
-)
-
-
-class SurveySettings(_Declared):  # type: ignore[misc]
-    """All that a survey is asked for; a setting that is None has its default.
+class SurveySettings(BaseModel):
+    """All that a survey is asked for, by the names of the settings file; what is left out has its default.
 
     ``settings_file`` is a survey's TOML file on the machine that runs the flow; the other parameters win over it.
     """
+
+    model_config = ConfigDict(extra="allow", protected_namespaces=(), json_schema_extra=_schema)
 
     settings_file: str | None = Field(default=None, description="A survey's TOML file, on the machine that surveys")
     _settings: Settings | None = PrivateAttr(default=None)
@@ -72,10 +68,12 @@ class SurveySettings(_Declared):  # type: ignore[misc]
     def settings(self) -> Settings:
         """Return the checked settings (SettingsError: the first that cannot be used)."""
         if self._settings is None:
-            given = self.model_dump(exclude_none=True, exclude={"settings_file"})
             flags: dict[str, object] = {}
-            for name, value in given.items():
-                flags |= {f"{name}.{key}": one for key, one in value.items()} if name in TABLES else {name: value}
+            for name, value in (self.model_extra or {}).items():
+                table = value if name in TABLES and isinstance(value, dict) else None
+                flags |= {name: value} if table is None else {f"{name}.{key}": one for key, one in table.items()}
+            if flags.get(f"rig.{SECRET}") is not None:
+                raise SettingsError(f"rig.{SECRET} is no parameter, which a server keeps: write it into settings_file")
             self._settings = load_settings(self.settings_file, flags)
         return self._settings
 
@@ -85,8 +83,7 @@ class SurveySettings(_Declared):  # type: ignore[misc]
         table = anchor_paths(settings.to_dict(), Path.cwd())
         usual = Settings().to_dict() | {"source": AUTO}  # another machine is told which it is
         given = {name: _changed(value, usual.get(name)) for name, value in table.items() if value != usual.get(name)}
-        tables = {name: _model(name).model_construct(**value) for name, value in given.items() if name in TABLES}
-        made: SurveySettings = cls.model_construct(**given | tables)
+        made: SurveySettings = cls.model_construct(**given)
         made._settings = settings
         return made
 
@@ -106,11 +103,6 @@ def _changed(value: Any, usual: Any) -> Any:
     if not isinstance(value, dict) or not isinstance(usual, dict):
         return value
     return {key: one for key, one in value.items() if one != usual.get(key)}
-
-
-def _model(table: str) -> type[BaseModel]:
-    found: type[BaseModel] = get_args(_Declared.model_fields[table].annotation)[0]
-    return found
 
 
 def at_due_time(settings: Settings, due: datetime) -> Settings:

@@ -74,10 +74,6 @@ ALL_OF_IT = "leave it out to keep and read all of the scan"
 INSTEAD = "leave it out for a survey in two passes"
 WORKERS = "one process or thread each; leave it out for one a core"
 EPSG = "the number after EPSG:, such as 32632"
-REPLACED = {  # keys of before
-    "optics.polarisation": 'the mirror\'s coating says it now: [mirror] coating = "aluminium"',
-    "rounds": "there is one round of detail: a second never paid and was removed; leave it out",
-}
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from typing import Annotated
 
 from pydantic import ByteSize, PlainValidator, TypeAdapter, ValidationError
 
-from pipeline.errors import BudgetError, SettingsError
+from pipeline.errors import BudgetError
 from pipeline.planning.part_looks import LineRun
 from pipeline.planning.plain_scans import MIOU
 from pipeline.setting_fields import number_words, numbers_of
@@ -25,7 +25,6 @@ from pipeline.simulator.selection.choice import named_effects
 from storage.archive.staging import is_name
 from storage.parallel.crew import Crew
 
-RENAMED = {"throughput": "vignetting", "read": "read-noise"}  # effects as settings of before called them
 LEAST_MEMORY = 256 * 1024**2
 _BYTES = TypeAdapter(ByteSize)
 # unit of a setting -> other units in which people write it, with the factor that makes it right
@@ -181,8 +180,6 @@ def parse_effects(value: object) -> str:
     if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
         raise ValueError(f"must be auto, all, none, or names of effects with commas; got {value!r}")
     words = [str(name).strip() for name in names if str(name).strip()]
-    for old in [word for word in words if word in RENAMED]:
-        raise SettingsError(f"the effect {old!r} is now called {RENAMED[old]!r}; got {value!r}")
     chosen = named_effects(",".join(words), list(BY_NAME))
     alone = words in (["auto"], ["all"], ["none"])
     return words[0] if alone or chosen is None else ",".join(name for name in BY_NAME if name in chosen)

@@ -13,8 +13,7 @@ from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.errors import SettingsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, Sweep
-from pipeline.planning.area_cover import sweeps_over
-from pipeline.planning.coverage import cheapest_full, coarse_sweeps, plain_sweeps, with_margin
+from pipeline.planning.coverage import cheapest_full, coarse_sweeps, plain_sweeps, sweeps_over, with_margin
 from pipeline.planning.part_looks import sweeps_of_runs
 from pipeline.planning.prices import check_budget
 from pipeline.rectify.registration.overlaps import LEAST_OVERLAP_PX

@@ -24,15 +24,8 @@ from models.policies.vgg_file import VggFile
 from models.reading.familiar import Familiar
 from models.reading.inference import CoarseLook, Glance, look_coarsely, read_glance
 from models.reading.regions import HALO_CELLS, REGION_PX, Region, most_bytes, plan_regions, whole_field
-from models.weights.companion_files import (
-    familiar_key,
-    familiar_path,
-    load_familiar,
-    load_memory,
-    memory_key,
-    memory_path,
-)
-from models.weights.files import Weights, content_key, describe_weights, load_weights
+from models.weights.files import Weights, describe_weights, load_familiar, load_reader, load_weights
+from models.weights.sealed_files import SEAL
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.readings import beyond_range, readings_alone
@@ -46,42 +39,36 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class WeightsFile:
-    """Weights by their path, and the hash that they had when the survey began."""
+    """Weights by their path, and the seal of the file when the survey began; each part is read once a process.
+
+    Reading raises WeightsError where the file has changed since.
+    """
 
     path: Path
-    key: str
+    seal: str
     device: str = PROCESSOR  # where the network computes
 
-    reader_key: str | None = None  # of the reader of memories beside them, where there is one
+    def _check(self) -> None:
+        if describe_weights(self.path).about[SEAL] != self.seal:
+            raise WeightsError(f"the weights {self.path} have changed since the survey began; start it again")
 
     @lru_cache(maxsize=1)  # noqa: B019 - the record is a value
     def load_reader(self) -> MemoryReader | None:
-        """Read what reads memories, once a process; None where the weights have none. WeightsError as `load`."""
-        if self.reader_key is None:
-            return None
-        path = memory_path(self.path)
-        found = load_memory(path, describe_weights(self.path))
-        if memory_key(path) != self.reader_key:
-            raise WeightsError(f"the reader of memories {path} has changed since the survey began; start it again")
-        return found.reader
-
-    familiar_key: str | None = None  # of what is familiar to them, where that is asked
+        """Read the reader of prior maps; None where the weights have none."""
+        self._check()
+        return None if describe_weights(self.path).reader is None else load_reader(self.path)
 
     @lru_cache(maxsize=1)  # noqa: B019 - the record is a value
     def load_familiar(self) -> Familiar:
-        """Read what is familiar to them, once a process. WeightsError as `load`."""
-        found = load_familiar(self.path, describe_weights(self.path))
-        if familiar_key(familiar_path(self.path)) != self.familiar_key:
-            raise WeightsError(f"{familiar_path(self.path)} has changed since the survey began; start it again")
-        return found.familiar
+        """Read what is familiar to them."""
+        self._check()
+        return load_familiar(self.path)
 
     @lru_cache(maxsize=1)  # noqa: B019 - the record is a value
     def load(self) -> Weights:
-        """Read them, once a process. Raises WeightsError where the file has changed since."""
-        weights = load_weights(self.path).on(self.device)
-        if content_key(self.path) != self.key:
-            raise WeightsError(f"the weights {self.path} have changed since the survey began; start it again")
-        return weights
+        """Read the network."""
+        self._check()
+        return load_weights(self.path).on(self.device)
 
 
 @dataclass(frozen=True)
@@ -172,8 +159,7 @@ class FieldWork:
     @staticmethod
     def of(run: SurveyRun) -> FieldWork:
         """Take from a survey what the regions of its field need."""
-        reader, familiar = (None if one is None else one.key for one in (run.reader, run.familiar))
-        file = WeightsFile(weights_path(run.settings).resolve(), run.weights_key, run.device, reader, familiar)
+        file = WeightsFile(weights_path(run.settings).resolve(), run.described.about[SEAL], run.device)
         return FieldWork(file, plan_regions(run.grid, SHARD), run.settings.crew, run.settings.memory, run.vgg)
 
     def score(self, policy: str, mosaic: Path, report: Callable[[float], None]) -> NDArray[np.float64]:

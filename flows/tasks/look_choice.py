@@ -15,11 +15,10 @@ from flows.tasks.capture_plan import lay_out_sweeps
 from flows.tasks.memory import Prior
 from models.reading.doubts import SeatDoubts
 from models.reading.remembered import COME_TRUE, Belief, Remembered, carried, in_classes
-from models.weights.companion_files import ReaderFile, load_memory
-from models.weights.files import Description
+from models.weights.files import Description, load_reader
 from pipeline.errors import BudgetError, NothingToMend, SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
-from pipeline.planning.area_cover import seats_shown
+from pipeline.planning.coverage import seats_shown
 from pipeline.planning.part_looks import PartLook, SeatRows, cheapest_row_seconds, part_look, sweeps_of_runs
 from pipeline.planning.plain_scans import LOSS, MIOU, ScanRecord, exposures_between, scan_words
 from storage.arrays.class_maps import BeliefStore
@@ -81,7 +80,6 @@ def choose_look(
     prior: Prior | None,
     weights: Description,
     path: Path,
-    reader: ReaderFile | None,
     grid: SceneGrid,
     shown: Mask | None = None,
 ) -> tuple[Settings, LookChoice | None, tuple[str, ...]]:
@@ -104,8 +102,8 @@ def choose_look(
             " out, or train weights with --darkest-ms 3, some scenes kept for validation"
         )
     there = grid.valid_share().ravel() > 0 if shown is None else shown
-    strips, classes = _strips(prior, grid, reader, weights), len(weights.class_names)
-    doubts = SeatDoubts.of(strips, grid, classes, come_true=1.0 if reader is None else COME_TRUE)
+    strips, classes = _strips(prior, grid, weights, path), len(weights.class_names)
+    doubts = SeatDoubts.of(strips, grid, classes, come_true=1.0 if weights.reader is None else COME_TRUE)
     wanted = LookWorth(
         ScanRecord.read(content), weights.class_names, doubts, there & _is_due(settings, prior, doubts), there
     )
@@ -171,11 +169,11 @@ def _is_due(settings: Settings, prior: Prior, doubts: SeatDoubts) -> Mask:
 
 
 def _strips(
-    prior: Prior, grid: SceneGrid, reader: ReaderFile | None, weights: Description
+    prior: Prior, grid: SceneGrid, weights: Description, path: Path
 ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
     """What is believed of a field today if nobody looks, and how old that is, some rows of seats at a time."""
     store, high = BeliefStore(prior.belief.path / "belief.zarr"), STRIP_SEATS * grid.patch
-    read = None if reader is None else load_memory(reader.path, weights).reader
+    read = None if weights.reader is None else load_reader(path)
     for top in range(0, grid.height, high):
         belief, age, light = store.read(slice(top, min(top + high, grid.height)))
         before = Belief(in_classes(belief, prior.classes), age, light)

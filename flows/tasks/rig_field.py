@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from flows.settings.survey_settings import Settings
+from flows.settings.survey_settings import RIG, Settings
+from flows.tasks.scene import FieldSource
 from pipeline.geometry.mirror import STRAIGHT
 from pipeline.geometry.scan import Sweep, exposing, sweep_positions
 from pipeline.rig import opening
@@ -17,7 +18,6 @@ from pipeline.rig.capture.capture_runner import RigDevices
 from pipeline.rig.capture.rig_source import RigSource
 from pipeline.rig.device_settings import CameraLimits, check_times
 from pipeline.rig.devices import SYSTEM_CLOCK, Clock
-from pipeline.simulator.effects.effect import Effect
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.source import Source
 from storage.arrays.fetched_files import FetchedFiles
@@ -26,12 +26,11 @@ FETCHED = "camera"  # folder within a capture's spool
 
 
 @dataclass(frozen=True)
-class RigField:
-    """A `FieldSource`. Its effects are its own; what its camera gives is kept beside the lines and goes with them."""
+class RigField(FieldSource):
+    """The rig that the settings name. What its camera gives is kept beside the lines and goes with them."""
 
     rig: RigSource
-    name = "rig"
-    simulates = False
+    name = RIG
 
     def key(self, field: str) -> dict[str, Any]:
         mounting = self.rig.rig.mounting
@@ -39,9 +38,6 @@ class RigField:
 
     def saying(self, say: Callable[[str], None]) -> RigField:
         return RigField(self.rig.saying(say))
-
-    def lit(self, chosen: Mapping[Effect, str], clock: Mapping[str, float]) -> RigField:
-        return self
 
     @contextmanager
     def opened(self, spool: Path) -> Iterator[Source]:

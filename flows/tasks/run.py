@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 
 from flows.settings.survey_settings import RECORDED, Settings
 from flows.settings.values import LOOK_PART
-from flows.tasks.beyond_training import beyond_training
 from flows.tasks.capture_plan import CapturePlan, plan_capture
 from flows.tasks.look_choice import LookChoice, choose_look
 from flows.tasks.memory import AUTO, NONE, Prior, find_prior
 from flows.tasks.reading_costs import ReadingCosts
-from flows.tasks.recorded.field import OpenedRecording, open_recorded
+from flows.tasks.recorded_field import OpenedRecording, open_recorded
 from flows.tasks.scan_choice import ScanChoice, choose_plain_scan
 from flows.tasks.scene import (
     FieldSource,
@@ -35,13 +34,13 @@ from flows.tasks.scene import (
     open_scene,
 )
 from flows.tasks.seat_budget import SeatBudget
-from flows.tasks.survey_model import SurveyModel, vgg_file, weights_offered
+from flows.tasks.survey_model import SurveyModel, beyond_training, vgg_file, weights_offered
 from flows.tasks.zones import SurveyZones, open_zones, place_of_field
 from models.evaluation.expected_scores import MapScores
 from models.network.machine import PROCESSOR, choose_device
 from models.policies.vgg_file import VggFile
-from models.weights.companion_files import FamiliarFile, ReaderFile
 from models.weights.files import Description, Weights
+from models.weights.parts import FamiliarPart, ReaderPart
 from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.errors import NoScanPaidFor, SettingsError
 from pipeline.geometry.camera import LineCamera
@@ -130,7 +129,6 @@ class SurveyRun(CaptureRun):
 
     described: Description  # what the weights say of themselves
     load: Once[Weights]
-    weights_key: str
     grid: SceneGrid
     plan: CapturePlan
     scans: ScanChoice
@@ -140,9 +138,7 @@ class SurveyRun(CaptureRun):
     budget: SeatBudget | None = None  # of seats of a plain scan, where a part of them alone is kept and read
     look: LookChoice | None = None  # the part of a remembered field that is looked at, where one was chosen
     prior: Prior | None = None  # the run whose belief is gone on from
-    reader: ReaderFile | None = None  # the reader of memories beside the weights, where there is one
-    familiar: FamiliarFile | None = None  # what is familiar to the weights, where pixels may be called unknown
-    map_scores: MapScores | None = None  # how what maps expect of themselves came true, where that was measured
+    familiar: FamiliarPart | None = None  # what is familiar to the weights, where pixels may be called unknown
     notes: tuple[str, ...] = ()
     refused: str | None = None  # why this machine would refuse the survey; it is planned nevertheless
 
@@ -150,6 +146,21 @@ class SurveyRun(CaptureRun):
     def weights(self) -> Weights:
         """The weights, read when they are first asked for."""
         return self.load()
+
+    @property
+    def weights_key(self) -> str:
+        """Names what the weights hold."""
+        return self.described.key
+
+    @property
+    def reader(self) -> ReaderPart | None:
+        """The reader of prior maps that the weights have, if any."""
+        return self.described.reader
+
+    @property
+    def map_scores(self) -> MapScores | None:
+        """How what maps expect of themselves came true, where that was measured."""
+        return None if self.described.familiar is None else self.described.familiar.map_scores
 
     @property
     def device(self) -> str:
@@ -238,7 +249,7 @@ def _run_by(
         archive = open_archive(settings.out) if archive is None and is_archive(settings.out) else archive
         found = (None, ()) if archive is None else find_prior(archive, settings, name, grid, described.class_names)
     prior = None if found is None else found[0]
-    settings, look, look_notes = choose_look(settings, prior, described, path, model.reader, grid, zones.shown)
+    settings, look, look_notes = choose_look(settings, prior, described, path, grid, zones.shown)
     plan, scans, raster = CapturePlan.of_map(), ScanChoice(), None
     passes, bands = None if recorded is None else recorded.passes, len(scene.wavelength_nm)
     if pixels is None:
@@ -269,7 +280,6 @@ def _run_by(
         planned=planned,
         described=described,
         load=model.load,
-        weights_key=model.key,
         grid=grid,
         plan=plan,
         recorded=passes,
@@ -279,9 +289,7 @@ def _run_by(
         budget=budget,
         look=look,
         prior=prior,
-        reader=model.reader,
         familiar=familiar,
-        map_scores=None if model.familiar is None else model.familiar.map_scores,
         notes=said,
         refused=refused,
     )

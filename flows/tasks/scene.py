@@ -8,12 +8,12 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.settings.survey_settings import BUILT_IN_SCENES, RASTER, RECORDED, RIG, RIG_FIELD, Settings
+from flows.settings.survey_settings import BUILT_IN_SCENES, RASTER, RECORDED, RIG, RIG_FIELD, SIM, Settings
 from flows.training.data import scene_of_file, unpack_mask
 from models.weights.files import Description
 from pipeline.errors import SceneError, SettingsError
@@ -253,73 +253,50 @@ def judged_labels(scene: RasterScene, weights: Description) -> NDArray[np.uint8]
     return labels
 
 
-class FieldSource(Protocol):
-    """Who looks at the field for a survey: the one seam between what is simulated and what is there."""
+class FieldSource:
+    """Who looks at the field for a survey: the one seam between what is simulated and what is there.
 
-    @property
-    def name(self) -> str:
-        """What the receipt calls it."""
+    As it stands a raster, which no camera looks at: its pixels are read from the file.
+    """
 
-    @property
-    def simulates(self) -> bool:
-        """Whether effects are chosen for it, which then stand in what is stored of its lines."""
+    name = RASTER  # what the receipt calls it
+    simulates = False  # whether effects are chosen for it, which then stand in what is stored of its lines
 
     def key(self, field: str) -> dict[str, Any]:
         """What its light depends on, beside scene, camera, seed, sweeps and effects."""
+        return {}
 
     def saying(self, say: Callable[[str], None]) -> FieldSource:
         """The same, telling somebody what it is at while no line comes."""
+        return self
 
     def lit(self, chosen: Mapping[Effect, str], clock: Mapping[str, float]) -> FieldSource:
         """The same with the effects that were decided, and when sweeps start by name [s]."""
+        return self
 
     def opened(self, spool: Path) -> AbstractContextManager[Source]:
-        """What lines come from, held on to; what it keeps on the way goes beside the lines in ``spool``."""
+        """What lines come from, held on to; what it keeps on the way goes beside the lines in ``spool``.
+
+        Raises SettingsError: it has no lines.
+        """
+        raise SettingsError("a raster is not captured: its pixels are in its file; give --source sim for lines of it")
 
 
 @dataclass(frozen=True)
-class SimulatedField:
+class SimulatedField(FieldSource):
     """The simulated rig before a scene."""
 
     source: SimulatedSource
+    name = SIM
     simulates = True
 
-    @property
-    def name(self) -> str:
-        return self.source.name
-
-    def key(self, field: str) -> dict[str, Any]:
-        return {}
-
-    def saying(self, say: Callable[[str], None]) -> SimulatedField:
-        return self  # lines come all the time
-
     def lit(self, chosen: Mapping[Effect, str], clock: Mapping[str, float]) -> SimulatedField:
+        """The same with these effects."""
         return SimulatedField(replace(self.source, chosen=chosen, clock=clock))
 
     def opened(self, spool: Path) -> AbstractContextManager[Source]:
+        """The simulated source itself."""
         return nullcontext(self.source)
-
-
-@dataclass(frozen=True)
-class TakenAsItIs:
-    """A raster, which no camera looks at: its pixels are read from the file."""
-
-    name = RASTER
-    simulates = False
-
-    def key(self, field: str) -> dict[str, Any]:
-        return {}
-
-    def saying(self, say: Callable[[str], None]) -> TakenAsItIs:
-        return self
-
-    def lit(self, chosen: Mapping[Effect, str], clock: Mapping[str, float]) -> TakenAsItIs:
-        return self
-
-    def opened(self, spool: Path) -> AbstractContextManager[Source]:
-        """Refuse to capture (SettingsError): a raster has no lines."""
-        raise SettingsError("a raster is not captured: its pixels are in its file; give --source sim for lines of it")
 
 
 def field_source(
@@ -327,7 +304,7 @@ def field_source(
 ) -> FieldSource:
     """Give who looks, as the settings say; raises what `flows.tasks.rig_field.rig_field` does."""
     if settings.is_map:
-        return TakenAsItIs()
+        return FieldSource()
     if settings.source != RIG:
         return SimulatedField(simulated)
     return rig_field.rig_field(scene, settings, planned)

@@ -1,8 +1,9 @@
-"""The weights that a survey reads with, and what lies beside them: opened, and refused where it does not fit."""
+"""The weights that a survey reads with: opened, and refused where they do not fit."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from datetime import UTC, date, datetime, timedelta
 from importlib import resources
 from pathlib import Path
 
@@ -13,42 +14,35 @@ from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
 from flows.settings.values import UNKNOWN_AUTO, UNKNOWN_OFF
 from models.network.machine import choose_device
 from models.policies.vgg_file import VggFile
-from models.weights.companion_files import (
-    TRAINED_ON,
-    FamiliarFile,
-    ReaderFile,
-    TrainedOn,
-    describe_familiar,
-    describe_reader,
-    familiar_path,
-    load_familiar,
-    load_memory,
-)
 from models.weights.files import (
     Description,
     Weights,
     check_two_scale,
-    content_key,
     describe_weights,
+    load_familiar,
+    load_reader,
     load_weights,
-    unsealed_note,
 )
+from models.weights.parts import TRAINED_ON, FamiliarPart, TrainedOn
 from pipeline.errors import SettingsError, WeightsError
+from pipeline.geometry.grid import SceneGrid
+from pipeline.ground.map_grid import median_footprint_m
+from pipeline.ground.view import GroundView
 from pipeline.lazy import Once
+from pipeline.simulator.scenes.farm.farm_scene import FARM_PIXEL_M
+from pipeline.simulator.scenes.farm.seasons import sun_over_farm
+from pipeline.simulator.scenes.scene import RasterScene
 
 PLAIN_STEPS = (1, 2)  # pixels from line to line of what the weights for plain scans read
 
 
 @dataclass(frozen=True)
 class SurveyModel:
-    """The weights of a survey, and what lies beside them."""
+    """The weights of a survey."""
 
     path: Path
     described: Description
     load: Once[Weights]
-    key: str
-    reader: ReaderFile | None
-    familiar: FamiliarFile | None
     vgg: VggFile | None
 
     @staticmethod
@@ -60,25 +54,20 @@ class SurveyModel:
         """
         described, load = describe_weights(path), Once(lambda: load_weights(path).on(choose_device(settings.device)))
         check_two_scale(described.config, path)
-        key = content_key(path)
-        reader, familiar = describe_reader(path, described), describe_familiar(path, described, key)
-        model = SurveyModel(path, described, load, key, reader, familiar, vgg_file(settings))
+        model = SurveyModel(path, described, load, vgg_file(settings))
         if not planning:
             load()
-            if reader is not None:
-                load_memory(reader.path, described)
-            if familiar is not None and settings.unknown != UNKNOWN_OFF:
-                load_familiar(path, described)
+            if described.reader is not None:
+                load_reader(path)
+            if described.familiar is not None and settings.unknown != UNKNOWN_OFF:
+                load_familiar(path)
             if model.vgg is not None:
                 model.vgg.saliency(load())  # refuses one that does not go with the weights
         return model
 
     def notes(self, *, planning: bool) -> tuple[str, ...]:
         """What is to be said of these files."""
-        sealing = () if self.described.sealed else (unsealed_note(self.path),)
-        if self.vgg is None or planning:
-            return sealing
-        return (*sealing, f"VGG19 from {self.vgg.path.name}: {self.vgg.report()}")
+        return () if self.vgg is None or planning else (f"VGG19 from {self.vgg.path.name}: {self.vgg.report()}",)
 
     def check_bands(self, wavelength_nm: NDArray[np.floating]) -> None:
         """Refuse weights of which no spectral column is reached by a band (WeightsError)."""
@@ -93,20 +82,19 @@ class SurveyModel:
 
     @property
     def trained_on(self) -> TrainedOn | None:
-        """What the weights were trained on, by their record, or by the file beside them; None where neither tells."""
+        """What the weights were trained on, by their record or what is familiar to them; None where neither tells."""
         if TRAINED_ON in self.described.record:
             return TrainedOn.read(self.described.record[TRAINED_ON])
-        return None if self.familiar is None else self.familiar.trained_on
+        return None if self.described.familiar is None else self.described.familiar.trained_on
 
-    def asked_familiar(self, settings: Settings) -> FamiliarFile | None:
+    def asked_familiar(self, settings: Settings) -> FamiliarPart | None:
         """What is familiar, where pixels may be called unknown; WeightsError where it is asked and nobody knows it."""
-        if settings.unknown not in (UNKNOWN_AUTO, UNKNOWN_OFF) and self.familiar is None:
+        if settings.unknown not in (UNKNOWN_AUTO, UNKNOWN_OFF) and self.described.familiar is None:
             raise WeightsError(
                 f"--unknown {settings.unknown}: nobody measured what is familiar to {self.path.name}; do so with: "
-                f"spectralzoom train DATASET --familiar {self.path} -o {familiar_path(self.path)}, or leave --unknown"
-                " out"
+                f"spectralzoom train DATASET --familiar {self.path} -o {self.path}, or leave --unknown out"
             )
-        return None if settings.unknown == UNKNOWN_OFF else self.familiar
+        return None if settings.unknown == UNKNOWN_OFF else self.described.familiar
 
 
 def weights_path(settings: Settings) -> Path:
@@ -150,3 +138,78 @@ def vgg_file(settings: Settings) -> VggFile | None:
     if settings.vgg is None:
         return None
     return VggFile.found(Path(settings.vgg), trained=settings.policy == "vgg-trained")
+
+
+DAYS, SUN_DEG, DARKER, SCALE, BAND_NM = 10, 3.0, 0.9, 1.5, 25.0  # as much beside its ranges is still within training
+
+
+def beyond_training(
+    settings: Settings, scene: RasterScene, described: Description, trained: TrainedOn | None, path: Path
+) -> tuple[str, ...]:
+    """One note of all that training did not see, or none; ``trained`` is None where nobody knows what it saw."""
+    found = _bands(scene, described, trained)
+    if trained is not None:
+        grid = SceneGrid(*scene.shape, described.config.patch, described.config.factor)
+        found += [*_season(settings, trained), *_light(settings, trained), *_scale(settings, grid, trained)]
+    if not found:
+        return ()
+    return (
+        f"outside of what {path.name} was trained on: {'; '.join(found)}. Expect a poorer map; weights that know this"
+        f" are trained on labelled scenes of it: spectralzoom train DATASET --init {path.name} -o my.safetensors",
+    )
+
+
+def _bands(scene: RasterScene, described: Description, trained: TrainedOn | None) -> list[str]:
+    """Spectral columns without a band, and bands far beyond those of training."""
+    _, reached = described.basis.matrix(scene.wavelength_nm)
+    found = []
+    if not reached.all():
+        found.append(f"the bands reach {reached.sum()} of the weights' {len(reached)} spectral columns")
+    if trained is not None:
+        low, high = trained.wavelength_nm
+        beyond = (scene.wavelength_nm < low - BAND_NM) | (scene.wavelength_nm > high + BAND_NM)
+        if 2 * beyond.sum() > len(beyond):
+            found.append(f"{beyond.sum()} of {len(beyond)} bands, which lie outside of its {low:.0f}-{high:.0f} nm")
+    return found
+
+
+def _season(settings: Settings, trained: TrainedOn) -> list[str]:
+    """The day of the look, and how high the sun stands."""
+    moment, found = settings.moment, []
+    day = moment[0] if moment else datetime.now(UTC).timetuple().tm_yday if settings.source == "rig" else None
+    if day is not None and trained.day is not None:
+        first, last = trained.day
+        if not first - DAYS <= day <= last + DAYS:
+            found.append(f"day {day} of the year ({_month(day)}; it saw {_month(first)} to {_month(last)})")
+    if moment is not None and trained.sun_elevation_deg is not None:
+        height, (low, _) = sun_over_farm(*moment).elevation_deg, trained.sun_elevation_deg
+        if height < low - SUN_DEG:
+            found.append(f"a sun {height:.0f} degrees high (it saw {low:.0f} and more)")
+    return found
+
+
+def _month(day: int) -> str:
+    return f"{date(2025, 1, 1) + timedelta(days=day - 1):%B}"
+
+
+def _light(settings: Settings, trained: TrainedOn) -> list[str]:
+    """Exposures shorter than any that training showed; a raster has none."""
+    if settings.is_map:
+        return []
+    usual, least = settings.camera.exposure_ms, trained.exposure_ms[0]
+    asked = {settings.scan_exposure_ms or usual} if settings.plain else {usual, settings.coarse_exposure_ms or usual}
+    return [f"lines of {min(asked):g} ms (it saw {least:g} ms and more)"] if min(asked) < DARKER * least else []
+
+
+def _scale(settings: Settings, grid: SceneGrid, trained: TrainedOn) -> list[str]:
+    """A pixel that shows much more or much less of the ground."""
+    pixel_m = None
+    if settings.scene in BUILT_IN_SCENES:
+        pixel_m = FARM_PIXEL_M  # as it is drawn, wherever the rig is said to stand
+    elif settings.pose is not None:
+        pixel_m = median_footprint_m(GroundView(settings.pose, settings.camera.ifov_rad), (grid.height, grid.width))
+    if pixel_m is None or trained.ground_pixel_m is None:
+        return []
+    if 1 / SCALE <= pixel_m / trained.ground_pixel_m <= SCALE:
+        return []
+    return [f"pixels of {100 * pixel_m:.3g} cm of the ground (it saw {100 * trained.ground_pixel_m:.3g} cm)"]

@@ -1,8 +1,7 @@
 """What weights say of what they were trained on, and what is familiar to them: measured as training ends, or later.
 
-`spectralzoom train --familiar` measures it for weights that were trained before such was: it looks at the scenes of
-their training again, as their record names them, and writes a file to put beside the weights: they and all that was
-made with them stay what they are.
+`spectralzoom train --familiar` measures it for weights that are there: it looks at the scenes of their training again,
+as their record names them, and adds it to their file. The weights and all that was made with them stay what they are.
 """
 
 from __future__ import annotations
@@ -27,8 +26,8 @@ from models.training.examples import Example
 from models.training.familiar import fit_familiar
 from models.training.looks import REFERENCE_MS, Looks
 from models.training.train import TrainingSettings
-from models.weights.companion_files import MAP_SCORES, FamiliarWeights, TrainedOn, familiar_path, save_familiar
-from models.weights.files import CALIBRATION, Weights, content_key, load_weights
+from models.weights.files import CALIBRATION, Weights, add_familiar, load_weights
+from models.weights.parts import MAP_SCORES, TrainedOn
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
@@ -80,7 +79,7 @@ def measured_calibration(weights: Weights, frames: Sequence[Example], seed: int)
     return judge_confidence(maps, seed) if maps else None
 
 
-def save_beside(
+def measure_and_add(
     weights: Weights,
     path: Path,
     seen: SeenScenes,
@@ -90,9 +89,9 @@ def save_beside(
     *,
     out: Path | None = None,
 ) -> str | None:
-    """Measure what is familiar to weights that lie at ``path``, and write it beside them, or to ``out``.
+    """Measure what is familiar to the weights of the file ``path``, and add it there, or in a copy at ``out``.
 
-    Gives why there is nothing to write, in words; a file of other weights that lay beside these is then removed.
+    Returns why there is nothing to add, in words; None where it was added.
     """
     try:
         familiar = fit_familiar(
@@ -105,9 +104,8 @@ def save_beside(
             report=lambda done: report("measuring what is familiar", done, ""),
         )
     except SceneError as error:
-        familiar_path(path).unlink(missing_ok=True)
         return f"nothing will be called unknown: {error}"
-    save_familiar(FamiliarWeights(familiar, content_key(path), told, record), out or familiar_path(path))
+    add_familiar(path, out or path, familiar, told, record)
     return None
 
 
@@ -144,7 +142,7 @@ def measure_familiar(request: FamiliarRequest, report: Report = lambda what, don
         CALIBRATION: measured_calibration(weights, seen.validation, seen.seed),
         **({} if scans is None else {MAP_SCORES: scans.scores.as_dict()}),
     }
-    why = save_beside(weights, request.weights, seen, told, record, report, out=request.out)
+    why = measure_and_add(weights, request.weights, seen, told, record, report, out=request.out)
     if why is not None:
         raise SettingsError(f"--familiar {request.weights}: {why}")
     return record
@@ -202,10 +200,7 @@ def run_measure_familiar(request: FamiliarRequest, console: Console) -> dict[str
     """Measure with a progress bar on ``console``; give the record kept in the file."""
     with one_after_the_other(console) as report:
         record = measure_familiar(request, report)
-    words = f"what is familiar: {request.out}, of {record['scenes']} scenes"
-    beside = familiar_path(request.weights)
-    if request.out.resolve() != beside.resolve():
-        words += f"; surveys use it when it is called {beside.name} and lies beside the weights"
+    words = f"weights with what is familiar to them: {request.out}, of {record['scenes']} scenes"
     console.print(words, markup=False, soft_wrap=True)
     error = record[CALIBRATION]["expected_error"]
     console.print(f"confidence is off by {100 * error:.2f} points on {record['validation']} scenes", soft_wrap=True)

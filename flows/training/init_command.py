@@ -18,8 +18,7 @@ from rich.markup import escape
 from flows.cli.app import AsJson, Switch, stderr
 from flows.terminal.processes import DONE, writing
 from flows.terminal.progress import StageProgress, put_out
-from flows.training.survey_draft import set_aside, show_survey_draft, write_survey_draft
-from flows.training.sweep_draft import draft_sweeps
+from flows.training.survey_draft import draft_sweeps, set_aside, show_survey_draft, write_survey_draft
 from pipeline.readings import MOST_VALUE
 from storage.archive.whole_files import write_whole
 from storage.readers.label_files import is_store, listed_names

@@ -20,14 +20,14 @@ from flows.terminal.progress import one_after_the_other
 from flows.training.data import Report
 from flows.training.look import observe_finely
 from models.evaluation.metrics import confusion, mean_iou
+from models.network.memory_reader import MemoryReader
 from models.network.spectral import patches_of
 from models.reading.inference import glance_of_columns, segment
 from models.reading.remembered import Belief, Looked, Remembered, first_belief, recall
 from models.training.looks import REFERENCE_MS, ColumnNoise, Looks, drawn_step
 from models.training.memory import MemoryTraining, PastLook, Visit, train_reader
 from models.training.train import Progress
-from models.weights.companion_files import MemoryWeights, save_memory
-from models.weights.files import Weights, content_key, load_weights
+from models.weights.files import Weights, add_reader, load_weights
 from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid, pad_by_reflection
@@ -91,15 +91,14 @@ def train_memory(request: MemoryRequest, report: Report = lambda what, done, fig
         report("training", now.done, f"step {now.step}, loss {now.loss:.3f}")
 
     reader, steps = train_reader(lands, request.settings, weights.config.factor, progress)
-    made = MemoryWeights(reader, content_key(request.weights), weights.class_names)
     record = {
         "command": request.command,
         "lands": [FIRST_SEED + number for number in range(request.lands)],
         "settings": asdict(request.settings),
         "steps": steps,
-        "validation": judge_memory(weights, looks, made, request, report),
+        "validation": judge_memory(weights, looks, reader, request, report),
     }
-    save_memory(MemoryWeights(reader, made.weights_key, made.class_names, record), request.out)
+    add_reader(request.weights, request.out, reader, record)
     return record
 
 
@@ -157,7 +156,7 @@ class _Land:
 
 
 def judge_memory(
-    weights: Weights, looks: Looks, memory: MemoryWeights, request: MemoryRequest, report: Report
+    weights: Weights, looks: Looks, reader: MemoryReader, request: MemoryRequest, report: Report
 ) -> list[dict[str, float]] | None:
     """What maps score some days after a first visit, mIoU in the mean of lands that training did not see.
 
@@ -181,7 +180,7 @@ def judge_memory(
                 "kept": first_belief(before),
                 "look": first_belief(now),
                 "surer": recall(remembered, now, None),
-                "remembered": recall(remembered, now, memory.reader),
+                "remembered": recall(remembered, now, reader),
                 "anew": first_belief(anew),
             }
             rows[days].append({name: _score(belief, later.labels) for name, belief in beliefs.items()})
@@ -203,7 +202,9 @@ def run_remember(request: MemoryRequest, console: Console) -> dict[str, Any]:
     """Train with a progress bar on ``console``; give the record kept in the file."""
     with one_after_the_other(console) as report:
         record = train_memory(request, report)
-    console.print(f"reader of memories: {request.out}, {record['steps']} steps", markup=False, soft_wrap=True)
+    console.print(
+        f"weights with a reader of memories: {request.out}, {record['steps']} steps", markup=False, soft_wrap=True
+    )
     if record["validation"]:
         _print_validation(record["validation"], request.judged, console)
     return record

@@ -15,7 +15,7 @@ from rich.table import Table
 
 from flows.terminal.progress import one_after_the_other
 from flows.training.data import Report, TrainingData, either_mask, open_training_data
-from flows.training.familiarity import SeenScenes, measured_calibration, save_beside, trained_on
+from flows.training.familiarity import SeenScenes, measure_and_add, measured_calibration, trained_on
 from flows.training.figures import judge_scans, validate
 from flows.training.train_scenes import About, TrainRequest, as_read, network_config, observe_all, question_labels
 from models.evaluation.expected_scores import MapScores
@@ -27,8 +27,8 @@ from models.training.examples import Example, measured_normalisation
 from models.training.looks import REFERENCE_MS, Looks
 from models.training.start_weights import Start, StartFile
 from models.training.train import Progress, train
-from models.weights.companion_files import MAP_SCORES, TRAINED_ON
 from models.weights.files import CALIBRATION, AnyWeights, Weights, save_weights, with_record
+from models.weights.parts import MAP_SCORES, TRAINED_ON
 from models.weights.sealed_files import read_checkpoint
 from pipeline.errors import SettingsError, ShapeError
 from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES
@@ -92,7 +92,7 @@ def train_weights(
     checkpoint.unlink(missing_ok=True)
     if isinstance(weights.network, Segmenter):
         own = {"command": request.command, **({} if scores is None else {MAP_SCORES: scores.as_dict()})}
-        why = save_beside(_two_scale(weights), request.out, whole, told, own, report)
+        why = measure_and_add(_two_scale(weights), request.out, whole, told, own, report)
         record = record if why is None else {**record, "familiar": why}
     return record
 
@@ -316,7 +316,5 @@ def print_start(begun: Mapping[str, Any], console: Console) -> None:
     for why, names in skipped.items():
         shown = f"{names[0]} and {len(names) - 1} more" if len(names) > 1 else names[0]
         console.print(f"  skipped {shown}: {why}")
-    if "unsealed" in begun:
-        console.print(f"  note: {begun['unsealed']}", markup=False, soft_wrap=True)
     if begun["licence"]:
         console.print(f"  its licence: {begun['licence']}")

@@ -15,8 +15,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import ShapeError
-
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -53,10 +51,8 @@ def received_attention(
     """Share of all attention that each token receives, (token,), summing to 1: the mean over heads and queries.
 
     ``queries`` and ``keys`` are (head, token, width). At most ``most`` weights are held at once, queries in so many
-    blocks as that needs; the result does not depend on it. Raises ShapeError where the two do not belong together.
+    blocks as that needs; the result does not depend on it.
     """
-    if queries.ndim != 3 or queries.shape != keys.shape or not keys.size:
-        raise ShapeError(f"expected queries and keys (head, token, width) alike, got {queries.shape} and {keys.shape}")
     heads, tokens, width = keys.shape
     rows = max(1, most // tokens)
     received = np.zeros(tokens)

@@ -20,7 +20,7 @@ from models.network.self_attention import attention_of_seats
 from models.network.sizes import SCORER_WIDTH, SegmenterConfig, saliency_multiply_adds, scorer_inputs
 from models.policies.spacing import centre_scores, random_scores, stratified_scores, uniform_scores
 from models.reading.inference import CoarseLook, Glance
-from pipeline.errors import SettingsError, ShapeError
+from pipeline.errors import SettingsError
 from pipeline.geometry.grid import SceneGrid
 
 Pixels = NDArray[np.float64]
@@ -271,8 +271,6 @@ def _mask_scores(seen: Glance, mask: NDArray[np.generic] | None) -> Scores:
     grid = seen.grid
     if mask is None:
         raise SettingsError("the policy 'mask' needs --mask FILE, an image of the scene's size")
-    if mask.shape[:2] != (grid.height, grid.width):
-        raise ShapeError(f"the mask is {mask.shape[:2]} px, the scene is {(grid.height, grid.width)} px")
     flat = mask.reshape(grid.height, grid.width, -1).astype(np.float64).mean(axis=-1)
     full = np.zeros(grid.padded_shape)
     full[: grid.height, : grid.width] = np.where(np.isnan(flat), 0.0, flat)

@@ -17,7 +17,7 @@ from models.network.controls import DenseNetwork, PaperNetwork
 from models.network.layers import cut, joined
 from models.network.segmenter import Segmenter
 from models.network.sizes import PATCHES_AT_ONCE
-from models.reading.inference import CoarseLook, DrawnMap, check_patches, decide, draw_coarse, origin_of
+from models.reading.inference import CoarseLook, DrawnMap, check_seats, decide, draw_coarse, origin_of
 from models.weights.files import AnyWeights
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import SceneGrid, pad_by_reflection
@@ -39,7 +39,7 @@ def draw_with_control(
     network, numbers = weights.network.eval(), np.ascontiguousarray(seats, np.int64)
     if isinstance(network, Segmenter):
         raise ShapeError("these weights are of two scales; draw with models.reading.inference.segment")
-    check_patches(fine, numbers, look.grid, weights.config)
+    check_seats(numbers, look.grid)
     with torch.inference_mode():
         if isinstance(network, PaperNetwork):
             coarse = torch.from_numpy(look.columns).permute(2, 0, 1)[None].contiguous()

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import ShapeError
 from pipeline.geometry.grid import SceneGrid
 
 LEAST_DOUBT, STEPS = 1e-4, 24  # doubts are kept in so many steps by their logarithm
@@ -46,16 +45,13 @@ class SeatDoubts:
     ) -> SeatDoubts:
         """Sort the pixels of a field. ``strips`` are (y, x, class) beliefs and (y, x) ages from the top down [days].
 
-        Every strip but the last is of whole seats high; ``come_true`` is the share of doubts that do. Raises
-        ShapeError: together they are not of the grid.
+        Every strip but the last is of whole seats high; ``come_true`` is the share of doubts that do.
         """
         doubt = np.geomspace(LEAST_DOUBT, 1.0, STEPS)
         rows, columns = grid.seat_shape
         pixels, ages = np.zeros((rows, columns, classes, STEPS), np.float32), np.full((rows, columns), -np.inf)
         top = 0
         for belief, age in strips:
-            if belief.shape[1:] != (grid.width, classes) or top % grid.patch:
-                raise ShapeError(f"a strip of a belief is {belief.shape}, of a field {grid.width} px wide")
             first, seat = top // grid.patch, _seats_of(len(belief), grid)
             here = slice(first, first + math.ceil(len(belief) / grid.patch))
             wrong = come_true * doubt_of(belief)
@@ -66,8 +62,6 @@ class SeatDoubts:
             pixels[here] = counted.reshape(pixels[here].shape)
             np.maximum.at(ages[here].reshape(-1), seat.ravel(), np.where(np.isfinite(age), age, -np.inf).ravel())
             top += len(belief)
-        if top != grid.height:
-            raise ShapeError(f"a belief has {top} rows, its field {grid.height}")
         known = np.where(ages < 0, np.inf, ages).ravel()
         return SeatDoubts(pixels.reshape(-1, classes, STEPS), doubt, known)
 

@@ -14,8 +14,6 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from pipeline.errors import ShapeError
-
 Floats = NDArray[np.float32]
 Exact = NDArray[np.float64]
 PIXELS_AT_ONCE = 1 << 14  # so many lie in the processor's cache with their columns
@@ -53,12 +51,6 @@ class Familiar:
     read: Exact  # (column, column) what the reading leaves in it
     limits: Limits
     bands: int  # of the camera in training; columns of fewer are noisier
-
-    def __post_init__(self) -> None:
-        count, columns = self.centres.shape
-        shapes = (self.covariance.shape, self.shot.shape, self.read.shape)
-        if shapes != ((count, columns, columns), (count, columns, columns), (columns, columns)):
-            raise ShapeError(f"{count} components of {columns} columns have covariances of {shapes}")
 
     def lit(self, light: float, readings: float = 1.0) -> LitFamiliar:
         """The components as a look shows them whose pixels are means of so many readings of an exposure ``light``."""
@@ -100,12 +92,7 @@ class LitFamiliar:
     whitening: Floats  # (component, column, column) from there; lengths of products with it are the distance
 
     def distance(self, columns: NDArray[np.floating]) -> Floats:
-        """Squared distance of pixels (..., column) from the nearest component a column, (...); NaN without columns.
-
-        Raises ShapeError: another number of columns.
-        """
-        if columns.shape[-1:] != self.centres.shape[1:]:
-            raise ShapeError(f"expected {self.centres.shape[1]} columns a pixel, got {columns.shape}")
+        """Squared distance of pixels (..., column) from the nearest component a column, (...); NaN without columns."""
         flat = columns.reshape(-1, columns.shape[-1])
         found = np.empty(len(flat), np.float32)
         for first in range(0, len(flat), PIXELS_AT_ONCE):

@@ -99,8 +99,7 @@ def glance(
     """Read the coarse mosaic alone.
 
     ``coarse`` (y, x, band) are scene values of the coarse pass, of shape ``grid.coarse_shape``; NaN where nothing was
-    captured. What is no reading by the weights' `most_value` counts as NaN. Raises ShapeError where the mosaic does not
-    fit the grid, or the grid the weights.
+    captured. What is no reading by the weights' `most_value` counts as NaN.
     """
     return read_glance(weights, look_coarsely(weights, [coarse], wavelength_nm, grid))
 
@@ -116,29 +115,19 @@ def look_coarsely(
     """Bring the coarse mosaic to the spectral columns of the weights, some rows at a time.
 
     ``strips`` are (y, x, band) parts of the mosaic from the top down, together of the shape ``grid.coarse_shape``;
-    ``origin`` is the row and column of the seat of a larger field in which the grid begins. Raises ShapeError where
-    the mosaic does not fit the grid, or the grid the weights.
+    ``origin`` is the row and column of the seat of a larger field in which the grid begins.
     """
     config = weights.config
-    if (grid.patch, grid.factor) != (config.patch, config.factor):
-        raise ShapeError(
-            f"the weights read patches of {config.patch} px at a factor of {config.factor},"
-            f" the grid has {grid.patch} px and {grid.factor}"
-        )
     rows, width = grid.coarse_shape
     columns, filled = np.empty((rows, width, config.columns), np.float32), 0
     strange: NDArray[np.bool_] | None = None
     for strip in strips:
         last = filled + len(strip)
-        if strip.shape[1] != width or last > rows:
-            raise ShapeError(f"the coarse mosaic is {(last, strip.shape[1])}, the scene grid expects {(rows, width)}")
         columns[filled:last] = weights.columns(strip, wavelength_nm)
         if (wild := beyond_range(strip, weights.normalisation.most_value)) is not None:
             strange = np.zeros((rows, width), np.bool_) if strange is None else strange
             strange[filled:last] = wild.any(axis=-1)
         filled = last
-    if filled != rows:
-        raise ShapeError(f"the coarse mosaic is {(filled, width)}, the scene grid expects {(rows, width)}")
     y, x = grid.padded_shape
     columns = np.ascontiguousarray(pad_by_reflection(columns, (y // grid.factor, x // grid.factor)), np.float32)
     dead = dead_pixels(columns)
@@ -212,7 +201,7 @@ def segment(
     of convolutions and matrix products; norms, softmax and the decision are float32. With ``every_class`` the map holds
     the log-probabilities of all classes too.
 
-    Raises ShapeError for a seat given twice or outside the grid, or patches of another shape.
+    Raises ShapeError for a seat given twice or outside the grid.
     """
     return segment_batch(weights, [seen], [patches], [seats], precision=precision, every_class=every_class)[0]
 
@@ -230,7 +219,7 @@ def segment_batch(
     scenes = []
     for look, own, given in zip(seen, patches, seats, strict=True):
         numbers = np.asarray(given, np.int64)
-        check_patches(own, numbers, look.grid, weights.config)
+        check_seats(numbers, look.grid)
         scenes.append((look, *captured(own, numbers)))
     with torch.inference_mode(), _computing_in(precision, weights):
         counts = [_patches_in(look) + len(numbers) for look, _, numbers in scenes]
@@ -292,16 +281,6 @@ def check_seats(seats: NDArray[np.int64], grid: SceneGrid) -> None:
     distinct, times = np.unique(seats, return_counts=True)
     if repeated := distinct[times > 1].tolist():
         raise ShapeError(f"seat {repeated[0]} is given more than once; give each seat one patch")
-
-
-def check_patches(
-    patches: NDArray[np.floating], seats: NDArray[np.int64], grid: SceneGrid, config: SegmenterConfig
-) -> None:
-    """Refuse seats as `check_seats`, and patches that are not (seat, p, p, column) (ShapeError)."""
-    check_seats(seats, grid)
-    expected = (len(seats), grid.patch, grid.patch, config.columns)
-    if patches.shape != expected:
-        raise ShapeError(f"expected patches of shape {expected} (seat, y, x, column), got {patches.shape}")
 
 
 def _patches_in(look: CoarseLook) -> int:

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.network.sizes import SegmenterConfig, level_widths
-from pipeline.errors import ShapeError
 from pipeline.geometry.grid import SceneGrid
 
 REGION_PX = 2560  # a side, at most
@@ -136,13 +135,7 @@ def plan_regions(
     ``shard``: (y, x) of what is written at once [px]: regions hold whole ones, and whole coarse patches. ``most_px``:
     (y, x) of the largest region, as far as one shard and one coarse patch allow. ``halo``: Coarse patches that are read
     around a region where the field goes on.
-
-    Raises ShapeError where a size or the halo is negative.
     """
-    if halo < 0 or min(*shard, *most_px) < 1:
-        raise ShapeError(
-            f"regions need sizes of at least 1 px and a halo of at least 0, got {shard}, {most_px}, {halo}"
-        )
     cell = field.patch * field.factor
     margin = halo * cell
     down, across = (

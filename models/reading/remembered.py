@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import ShapeError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.lazy import deferred
 
@@ -91,15 +90,9 @@ def recall(memory: Remembered, looked: Looked, reader: MemoryReader | None) -> B
     """Bring a memory to today by what was seen.
 
     A pixel of which the memory knows nothing takes today's look, and one that nothing can be said of today keeps its
-    memory. Raises ShapeError: both are not of one field, or the reader is for other classes or columns.
+    memory.
     """
-    before, today = memory.belief.log_probability, looked.log_probability
-    if before.shape != today.shape:
-        raise ShapeError(
-            f"the memory is {before.shape} (y, x, class), today's look {today.shape}; both are of one field"
-        )
-    if reader is not None:
-        _check_sizes(reader, looked)
+    today = looked.log_probability
     y = len(today)
     kept, ages, light = np.empty_like(today), *np.empty((2, *looked.seen.shape), np.float32)
     s = 1 if reader is None else reader.sizes.factor
@@ -116,10 +109,7 @@ CARRIED_AS_BY = (0.05, 2)  # the light and step of a look that sees nothing, for
 
 
 def carried(memory: Remembered, reader: MemoryReader | None) -> Belief:
-    """Bring a memory to today without a look: what is believed where nobody goes, and how surely.
-
-    Raises ShapeError: the reader is for other classes.
-    """
+    """Bring a memory to today without a look: what is believed where nobody goes, and how surely."""
     shape = memory.belief.log_probability.shape
     s, columns = (1, 1) if reader is None else (reader.sizes.factor, reader.sizes.columns)
     unseen, coarse = np.zeros(shape[:2], np.bool_), (-(-shape[0] // s), -(-shape[1] // s), columns)
@@ -206,16 +196,6 @@ def _the_surer(before: Floats, today: Floats, seen: NDArray[np.bool_], age: Floa
     surer = (today.max(axis=-1) > math.log(SURE)) | (today.max(axis=-1) > old.max(axis=-1) + math.log(2))
     found: Floats = np.where((against & surer)[..., None], today, np.where(against[..., None], old, together))
     return found
-
-
-def _check_sizes(reader: MemoryReader, looked: Looked) -> None:
-    """Refuse a reader for other classes or columns (ShapeError)."""
-    sizes, came = (
-        (reader.sizes.classes, reader.sizes.columns),
-        (looked.log_probability.shape[-1], looked.coarse.shape[-1]),
-    )
-    if sizes != came:
-        raise ShapeError(f"the reader of memories is for {sizes} classes and columns, got {came}")
 
 
 def _read(

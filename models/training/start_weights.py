@@ -33,7 +33,7 @@ from models.training.pretrained import (
     rgb_response,
     wavelength_response,
 )
-from models.weights.files import FORMAT, NORMALISATION, Description, describe_weights, read_tensors, unsealed_note
+from models.weights.files import FORMAT, NORMALISATION, Description, describe_weights, read_tensors
 from models.weights.state_files import read_heads, read_notes, read_state
 from pipeline.errors import SettingsError, WeightsError
 
@@ -239,7 +239,6 @@ class StartFile:
             "resized": dict(report.resized),
             "skipped": skipped,
             "licence": self._licence(),
-            **({} if self.described is None or self.described.sealed else {"unsealed": unsealed_note(self.path)}),
         }
         return Start(taken, report, record)
 

@@ -1,4 +1,8 @@
-"""Weights on disk: one sealed file with the tensors, the spectral basis, the classes and how they were made."""
+"""Weights on disk: one sealed file with the tensors, the spectral basis, the classes and how they were made.
+
+The file may also hold what is familiar to the weights and their reader of prior maps: each adds a description and
+tensors of its own, and leaves the key of the weights as it was.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +18,15 @@ from safetensors import safe_open
 
 from models.network.sizes import SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis, check_basis, project
+from models.reading.familiar import Familiar, Limits
+from models.weights.parts import FAMILIAR, READER, FamiliarPart, ReaderPart, TrainedOn
 from models.weights.sealed_files import (
     DAMAGED,
-    KEY_DIGITS,
+    TENSORS,
     broken_seal,
     changed_tensor,
-    hash_without_seal,
+    hash_of,
+    key_of,
     own_tensors,
     read_about,
     write_sealed,
@@ -32,15 +39,19 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-    from models.network import controls
+    from models.network import controls, memory_reader
     from models.network.controls import Network
+    from models.network.memory_reader import MemoryReader
     from models.network.segmenter import Segmenter
 else:
     torch = deferred("torch")
     controls = deferred("models.network.controls")
+    memory_reader = deferred("models.network.memory_reader")
 
 NORMALISATION = ("centre", "spread", "whitening")
-FORMAT, UNSEALED = "spectralzoom-weights/2", "spectralzoom-weights/1"  # the earlier one has no hashes
+FORMAT = "spectralzoom-weights/3"
+OF_COMPONENTS = ("centres", "covariance", "shot", "read")
+OF_LIMITS = ("rates", "light", "fine", "coarse")
 SPREAD = "normalisation.spread"
 CALIBRATION = "calibration"  # of a record: how sure of themselves maps may be, and the temperature, where one is needed
 KINDS = {"F32": "torch.float32", "U8": "torch.uint8"}  # by safetensors' names
@@ -55,12 +66,10 @@ class Description:
     basis: SpectralBasis
     class_names: tuple[str, ...]
     record: dict[str, Any]
+    key: str = ""  # names what the weights hold
+    familiar: FamiliarPart | None = None
+    reader: ReaderPart | None = None
     about: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)  # all of it, hashes too
-
-    @property
-    def sealed(self) -> bool:
-        """Whether the file tells the hash of every tensor."""
-        return self.about.get("format") == FORMAT
 
 
 @dataclass(frozen=True)
@@ -126,33 +135,112 @@ def save_weights(weights: AnyWeights, path: Path) -> None:
         tensors[f"normalisation.{name}"] = torch.from_numpy(getattr(weights.normalisation, name).copy())
     tensors["class_colours"] = torch.from_numpy(weights.class_colours.copy())
     about = {
-        "format": FORMAT,
         "config": weights.config.as_dict(),
         "basis": {"low_nm": weights.basis.low_nm, "high_nm": weights.basis.high_nm, "columns": weights.basis.columns},
         "class_names": list(weights.class_names),
         "record": weights.record,
     }
+    keys = {"weights": _key(about, tensors)}
+    _write(path, {**about, "format": FORMAT, "keys": keys}, tensors)
+
+
+def _key(about: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> str:
+    return key_of(about, {name: hash_of(tensor) for name, tensor in tensors.items()})
+
+
+def _write(path: Path, about: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
     try:
         write_sealed(path, about, tensors)
     except OSError as error:
         raise WeightsError(f"cannot write weights to {path}: {error.strerror}; choose another -o") from error
 
 
-def content_key(path: Path) -> str:
-    """Name weights by what they hold, 20 hexadecimal digits: the same with hashes and without.
+def add_familiar(
+    weights: Path, out: Path, familiar: Familiar, trained_on: TrainedOn, record: Mapping[str, Any]
+) -> None:
+    """Write the weights of a file with what is familiar to them to ``out``, which may be the same file.
 
-    It is the beginning of the SHA-256 of the file as it was before files had hashes, so that sealing weights makes
-    nothing anew that was made with them. Raises WeightsError where the file cannot be read.
+    Raises WeightsError: the weights cannot be read, or ``out`` not be written.
     """
+    limits = familiar.limits
+    arrays = {name: getattr(familiar, name) for name in OF_COMPONENTS}
+    arrays |= {name: getattr(limits, name) for name in OF_LIMITS}
+    tensors = {name: torch.from_numpy(np.ascontiguousarray(one, np.float32)) for name, one in arrays.items()}
+    told = {"bands": familiar.bands, "steps": list(limits.steps), "trained_on": trained_on.as_dict()}
+    _add_part(weights, out, FAMILIAR, {**told, "record": dict(record)}, tensors)
+
+
+def add_reader(weights: Path, out: Path, reader: MemoryReader, record: Mapping[str, Any]) -> None:
+    """Write the weights of a file with their reader of prior maps to ``out``. Raises as `add_familiar`."""
+    about = {"sizes": reader.sizes.as_dict(), "record": dict(record)}
+    _add_part(weights, out, READER, about, dict(reader.state_dict()))
+
+
+def _add_part(source: Path, out: Path, part: str, about: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
+    described = describe_weights(source)
+    with _opened(source, "pt") as file:
+        whole = own_tensors(file)
+    if wrong := changed_tensor(described.about[TENSORS], whole):
+        raise WeightsError(f"{source} is damaged: {wrong}; copy or train the file again")
+    kept = {name: tensor for name, tensor in whole.items() if not name.startswith(f"{part}.")}
+    added = {f"{part}.{name}": tensor for name, tensor in tensors.items()}
+    keys = {**described.about["keys"], part: _key(about, tensors)}
+    _write(out, {**described.about, "keys": keys, part: about}, kept | added)
+
+
+def load_familiar(weights: Path) -> Familiar:
+    """Read what is familiar to weights. WeightsError: their file has no such part, or it is damaged."""
+    described = describe_weights(weights)
+    if described.familiar is None:
+        raise WeightsError(
+            f"{weights} does not say what is familiar to it; measure it with: spectralzoom train DATASET"
+            f" --familiar {weights} -o {weights}"
+        )
+    tensors, about = _read_part(weights, described, FAMILIAR, spreads=("light", "rates")), described.familiar
     try:
-        return hash_without_seal(path, {"format": UNSEALED})[:KEY_DIGITS]
-    except (*DAMAGED, KeyError, TypeError, ValueError) as error:
-        raise _unreadable(path, error) from error
+        arrays = {name: tensors[name].double().numpy() for name in (*OF_COMPONENTS, *OF_LIMITS)}
+        limits = Limits(arrays["rates"], arrays["light"], about.steps, arrays["fine"], arrays["coarse"])
+        found = Familiar(**{name: arrays[name] for name in OF_COMPONENTS}, limits=limits, bands=about.bands)
+        found.lit(float(limits.light[0]))  # refuses a covariance that is none
+    except (KeyError, ValueError) as error:
+        raise WeightsError(f"{weights} is damaged: what is familiar: {error}; copy or measure it again") from error
+    return found
 
 
-def unsealed_note(path: Path) -> str:
-    """What to say of weights without hashes."""
-    return f"{path.name} was made before weights had hashes: damage to its numbers cannot be told; train them anew"
+def load_reader(weights: Path) -> MemoryReader:
+    """Read the reader of prior maps of weights. WeightsError: their file has none, or it is damaged."""
+    described = describe_weights(weights)
+    if described.reader is None:
+        raise WeightsError(
+            f"{weights} has no reader of prior maps; train one with: spectralzoom train DATASET --remember {weights}"
+            f" -o {weights}"
+        )
+    tensors = _read_part(weights, described, READER)
+    with torch.device("meta"):
+        reader = memory_reader.MemoryReader(described.reader.sizes)
+    try:
+        reader.load_state_dict(tensors, assign=True)
+    except RuntimeError as error:
+        why = str(error).splitlines()[-1].strip()
+        raise WeightsError(f"{weights} is damaged: its reader of prior maps: {why}; train it again") from error
+    return reader.eval()
+
+
+def _read_part(path: Path, described: Description, part: str, spreads: Sequence[str] = ()) -> dict[str, Tensor]:
+    """Tensors of a part by their own names. Raises WeightsError where one is not what was written, or unusable."""
+    start = f"{part}."
+    with _opened(path, "pt") as file:
+        tensors = own_tensors(file, start)
+    told = {name: value for name, value in described.about[TENSORS].items() if name.startswith(start)}
+    own = {name.removeprefix(start): tensor for name, tensor in tensors.items()}
+    if wrong := changed_tensor(told, tensors) or unusable(own, spreads):
+        raise WeightsError(f"{path} is damaged: {wrong}; copy or train the file again")
+    return own
+
+
+def content_key(path: Path) -> str:
+    """Name weights by what they hold, 20 hexadecimal digits, whatever parts lie beside them. Raises WeightsError."""
+    return describe_weights(path).key
 
 
 def load_weights(path: Path) -> Weights:
@@ -202,7 +290,7 @@ def _network(config: SegmenterConfig, device: str) -> Network:
 
 
 def read_tensors(path: Path, described: Description) -> dict[str, Tensor]:
-    """Read every tensor of a file of weights, after its header was held against what the description asks for.
+    """Read the network's tensors of a file, after its header was held against what the description asks for.
 
     Raises WeightsError as ``load_weights``.
     """
@@ -211,10 +299,12 @@ def read_tensors(path: Path, described: Description) -> dict[str, Tensor]:
         claimed = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
         if wrong := misfit(described.config, claimed):
             raise WeightsError(f"{path}: {wrong}; train it again")
-        tensors = own_tensors(file)
-    if wrong := changed_tensor(described.about, tensors) if described.sealed else "":
+        parts = (f"{FAMILIAR}.", f"{READER}.")
+        tensors = {name: tensor for name, tensor in own_tensors(file).items() if not name.startswith(parts)}
+    told = {name: value for name, value in described.about[TENSORS].items() if not name.startswith(parts)}
+    if wrong := changed_tensor(told, tensors):
         raise WeightsError(f"{path} is damaged: {wrong}; copy or train the file again")
-    if wrong := unusable(tensors):
+    if wrong := unusable(tensors, (SPREAD,)):
         raise WeightsError(f"{path}: {wrong}; copy or train the file again")
     return tensors
 
@@ -229,19 +319,23 @@ def describe_weights(path: Path) -> Description:
         raise WeightsError(f"no weights at {path}; train some with: spectralzoom train DATASET -o {path.name}")
     with _opened(path, "np") as file:
         about = read_about(file)
-    if about.get("format") not in (FORMAT, UNSEALED):
+    if about.get("format") != FORMAT:
         raise WeightsError(f"{path} holds {about.get('format', 'no format mark')}, expected {FORMAT}; train it again")
-    if wrong := broken_seal(about) if about["format"] == FORMAT else "":
+    if wrong := broken_seal(about):
         raise WeightsError(f"{path} is damaged: {wrong}; copy or train the file again")
     try:
         config, basis = SegmenterConfig(**about["config"]), SpectralBasis(**about["basis"])
         names, record = tuple(map(str, about["class_names"])), dict(about["record"])
         check_basis(basis, config.columns)
+        keys = about["keys"]
+        familiar = FamiliarPart.read(keys[FAMILIAR], about[FAMILIAR]) if FAMILIAR in about else None
+        reader = ReaderPart.read(keys[READER], about[READER], config) if READER in about else None
+        key = str(keys["weights"])
     except (KeyError, TypeError, ValueError) as error:
         raise WeightsError(f"{path}: its description is damaged ({error}); copy or train the file again") from error
     if len(names) != config.classes:
         raise WeightsError(f"{path} names {len(names)} classes, its segmenter has {config.classes}")
-    return Description(config, basis, names, record, about)
+    return Description(config, basis, names, record, key, familiar, reader, about)
 
 
 @contextmanager
@@ -283,7 +377,7 @@ def misfit(config: SegmenterConfig, claimed: Mapping[str, Any]) -> str:
     return ""
 
 
-def unusable(tensors: Mapping[str, Tensor], spreads: Sequence[str] = (SPREAD,)) -> str:
+def unusable(tensors: Mapping[str, Tensor], spreads: Sequence[str]) -> str:
     """Which tensor holds numbers that nothing can be computed with, in words; nothing where none does.
 
     Those called as ``spreads`` are divided by.

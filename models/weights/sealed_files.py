@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,19 +33,15 @@ ABOUT = "about"  # the text's name in the file
 TENSORS, SEAL = "tensors", "seal"  # entries of the description: hashes of the tensors by name, and its own
 # what reading a description may raise over bytes that are not what they should be
 DAMAGED = (SafetensorError, OSError, UnicodeDecodeError, json.JSONDecodeError, RecursionError)
-CHECKPOINT, UNSEALED_CHECKPOINT = "spectralzoom-checkpoint/2", "spectralzoom-checkpoint/1"  # the earlier has no hashes
+CHECKPOINT = "spectralzoom-checkpoint/2"
 Checkpoint = tuple[dict[str, Any], "dict[str, Tensor]"]
-
-
-def beside(weights: Path, suffix: str) -> Path:
-    """Where a file that goes with some weights lies: beside them, by their name."""
-    return weights.with_name(weights.name.removesuffix(".safetensors") + suffix)
 
 
 def write_sealed(path: Path, about: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
     """Write the file by a temporary name and a rename, so that it is whole or absent. Raises OSError."""
     whole = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    hashed = {**about, TENSORS: {name: hash_of(tensor) for name, tensor in whole.items()}}
+    plain = {name: value for name, value in about.items() if name not in (TENSORS, SEAL)}
+    hashed = {**plain, TENSORS: {name: hash_of(tensor) for name, tensor in whole.items()}}
     text = json.dumps({**hashed, SEAL: _seal(hashed)}, sort_keys=True)
     temporary = path.with_name(path.name + ".part")
     try:
@@ -63,41 +59,12 @@ def read_about(file: Any) -> dict[str, Any]:
     return about if isinstance(about, dict) else {}
 
 
-def own_tensors(file: Any) -> dict[str, Tensor]:
-    """Every tensor of a file that `safetensors.safe_open` opened, by name, in memory of its own.
+def own_tensors(file: Any, start: str = "") -> dict[str, Tensor]:
+    """Tensors of a file that `safetensors.safe_open` opened whose names begin so, by name, in memory of their own.
 
     What safetensors gives lies in the mapped file, and would change with it where that is written over.
     """
-    return {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118 - not a mapping
-
-
-@contextmanager
-def open_sealed(
-    path: Path, framework: str, form: str, refused: Callable[[Path, str], WeightsError]
-) -> Iterator[tuple[Any, dict[str, Any]]]:
-    """Open a file of one format, with what it says of itself, as it was written.
-
-    ``framework`` as of `safetensors.safe_open`. Raises what ``refused`` makes of the path and of what is wrong: bytes
-    that are damaged, another format, a broken seal.
-    """
-    try:
-        with safe_open(path, framework=framework) as file:
-            about = read_about(file)
-            if about.get("format") != form:
-                raise refused(path, f"it holds {about.get('format', 'no format mark')}, expected {form}")
-            if wrong := broken_seal(about):
-                raise refused(path, wrong)
-            yield file, about
-    except DAMAGED as error:
-        raise refused(path, str(error)[:120]) from error
-
-
-def key_of_sealed(path: Path, form: str, refused: Callable[[Path, str], WeightsError]) -> str:
-    """Name a file of one format by what it holds, 20 hexadecimal digits; ``refused`` as of `open_sealed`."""
-    try:
-        return hash_without_seal(path, {"format": form})[:KEY_DIGITS]
-    except (*DAMAGED, KeyError, TypeError, ValueError) as error:
-        raise refused(path, str(error)[:120]) from error
+    return {name: file.get_tensor(name).clone() for name in file.keys() if name.startswith(start)}  # noqa: SIM118
 
 
 def broken_seal(about: Mapping[str, Any]) -> str:
@@ -108,9 +75,8 @@ def broken_seal(about: Mapping[str, Any]) -> str:
     return "" if told == _seal(about) else "its description is not what was written"
 
 
-def changed_tensor(about: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> str:
-    """Which tensor is not the one that was written, in words; nothing where all are."""
-    told: Mapping[str, str] = about[TENSORS]
+def changed_tensor(told: Mapping[str, str], tensors: Mapping[str, Tensor]) -> str:
+    """Which tensor is not the one that was written, by their hashes, in words; nothing where all are."""
     if other := sorted(set(told) ^ set(tensors)):
         return f"tensor {other[0]} is {'missing' if other[0] in told else 'none of those that were written'}"
     changed = next((name for name, tensor in tensors.items() if hash_of(tensor) != told[name]), None)
@@ -130,23 +96,9 @@ def _seal(about: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 
 
-def hash_without_seal(path: Path, spared: Mapping[str, Any]) -> str:
-    """SHA-256 of the bytes that a file would have without its hashes: sealing a file does not change it.
-
-    ``spared`` are entries that the description had before, such as its format. Raises one of `DAMAGED`, KeyError or
-    ValueError for what is no such file.
-    """
-    raw = path.read_bytes()
-    size = int.from_bytes(raw[:8], "little")
-    header = json.loads(raw[8 : 8 + size])
-    about = {**json.loads(header["__metadata__"][ABOUT]), **spared}
-    plain = {name: value for name, value in about.items() if name not in (TENSORS, SEAL)}
-    header["__metadata__"] = {ABOUT: json.dumps(plain, sort_keys=True)}
-    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
-    text += b" " * (-len(text) % 8)  # safetensors: tensors begin at a multiple of 8
-    digest = hashlib.sha256(len(text).to_bytes(8, "little") + text)
-    digest.update(memoryview(raw)[8 + size :])
-    return digest.hexdigest()
+def key_of(about: Mapping[str, Any], hashes: Mapping[str, str]) -> str:
+    """Name a description and its tensors by what they hold, 20 hexadecimal digits."""
+    return hashlib.sha256(json.dumps([about, hashes], sort_keys=True).encode()).hexdigest()[:KEY_DIGITS]
 
 
 def save_checkpoint(path: Path, identity: str, about: dict[str, Any], tensors: dict[str, Tensor]) -> None:
@@ -179,13 +131,11 @@ def read_checkpoint(path: Path) -> Checkpoint | None:
         with safe_open(path, framework="pt") as file:
             about = read_about(file)
             kind = about.get("format")
-            if kind == UNSEALED_CHECKPOINT:
-                wrong = "an earlier version wrote it, without hashes to check it by"
-            elif kind != CHECKPOINT:
+            if kind != CHECKPOINT:
                 wrong = f"it holds {kind or 'no format mark'}, expected {CHECKPOINT}"
             elif not (wrong := broken_seal(about)):
                 tensors = own_tensors(file)
-                wrong = changed_tensor(about, tensors)
+                wrong = changed_tensor(about[TENSORS], tensors)
     except DAMAGED as error:
         raise _refused(path, str(error)[:120]) from error
     if wrong:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import PoseError, ShapeError
+from pipeline.errors import PoseError
 from pipeline.ground.georeference import pixel_rows_m2, pixel_side_m
 from pipeline.ground.map_grid import SAMPLES, GroundGrid, least_mapped_sink, median_footprint_m
 from pipeline.ground.view import ROWS_AT_ONCE, GroundView, pixel_places
@@ -157,11 +157,8 @@ class FieldPlace(Protocol):
 def areas_by_number(place: FieldPlace, numbers: NDArray[np.integer], count: int) -> Floats | None:
     """Sum the ground under a field's pixels by their (y, x) numbers, (count,) [m2]; None where nobody knows it.
 
-    Pixels with a number below 0 or from ``count`` on are left out, and those that show no ground. Raises ShapeError:
-    there is not one number a pixel.
+    Pixels with a number below 0 or from ``count`` on are left out, and those that show no ground.
     """
-    if numbers.shape != place.shape:
-        raise ShapeError(f"expected the numbers of a field of {place.shape} px (y, x), got {numbers.shape}")
     areas = np.zeros(count)
     for first in range(0, len(numbers), ROWS_AT_ONCE):
         rows = slice(first, min(first + ROWS_AT_ONCE, len(numbers)))

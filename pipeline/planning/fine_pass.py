@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import BudgetError, PoseError, ShapeError
+from pipeline.errors import BudgetError, PoseError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, CostModel, Sweep
@@ -209,10 +209,7 @@ def _worth(grid: SceneGrid, scores: NDArray[np.floating], most: float) -> tuple[
     0 for what is not worth buying; finite for +inf, above all others together and above ``most``, which is the score
     that the whole budget has to show.
     """
-    rows, columns = grid.seat_shape
     given = np.asarray(scores, np.float64)
-    if given.shape != (rows * columns,):
-        raise ShapeError(f"expected {rows * columns} scores, one a seat of {rows} x {columns}, got shape {given.shape}")
     worth = np.zeros_like(given)
     valid = grid.valid_seats()
     worth[valid] = np.where(given[valid] > 0, given[valid], 0.0)

@@ -21,7 +21,7 @@ from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel, Sweep, exposing, scene_to_sweep
-from pipeline.planning.area_cover import lines_showing, some_lines
+from pipeline.planning.coverage import lines_showing, some_lines
 
 LEAST_PRICE, MOST_PRICE = 1e-9, 1e6  # of a second, in shares of all worth: at one all pays, at the other nothing
 HALVINGS = 48  # of the logarithm of what lies between them

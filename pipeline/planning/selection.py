@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import BudgetError, ShapeError
+from pipeline.errors import BudgetError
 
 GOLDEN = (5**0.5 - 1) / 2
 
@@ -65,8 +65,4 @@ def frame_seats(score: Scores, share: float, valid: NDArray[np.bool_] | None = N
 
 def _allowed(score: Scores, valid: NDArray[np.bool_] | None) -> Seats:
     """Numbers of the seats that may be chosen, ascending."""
-    shape = np.shape(score)
-    masked = shape if valid is None else np.shape(valid)
-    if len(shape) != 1 or masked != shape:
-        raise ShapeError(f"expected (seat,) scores and a mask of their shape, got {shape} and {masked}")
-    return np.arange(shape[0]) if valid is None else np.flatnonzero(valid)
+    return np.arange(len(score)) if valid is None else np.flatnonzero(valid)

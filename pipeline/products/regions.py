@@ -3,9 +3,8 @@
 A region is a set of pixels of one class that hang together by their sides. What has no class (255) is no region: it
 is never given to a class, nor takes anything from one, unless a class is grown over it on request.
 
-Outlines go along the sides of pixels. Wherever three regions meet, all three have a vertex there, which
-``rasterio.features.shapes`` leaves out of straight sides: that is what makes the outlines a coverage in the words of
-shapely, whose simplification draws a border once for both its regions.
+Outlines go along the sides of pixels. Wherever three regions meet, all three have a vertex there: that is what makes
+the outlines a coverage in the words of shapely, whose simplification draws a border once for both its regions.
 """
 
 from __future__ import annotations
@@ -17,23 +16,23 @@ import numpy as np
 from affine import Affine
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.sparse import coo_array, csr_array
-from scipy.sparse.csgraph import connected_components, depth_first_order
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.lazy import deferred
 
 if TYPE_CHECKING:
+    import rasterio.features as features
     import shapely
     import skimage.measure as skimage_measure
 else:
+    features = deferred("rasterio.features")
     shapely = deferred("shapely")
     skimage_measure = deferred("skimage.measure")
 
 MOST_AREA_ERROR = 0.01  # that simplified borders may change a class's area by, as a share of it
 SMALL = (1, 32, 128, 512, 2048)  # px: regions smaller than so many squares of the tolerance keep their outlines
-OUTSIDE = -1
-EAST, SOUTH, WEST, NORTH = range(4)
 Classes = NDArray[np.uint8]
 
 
@@ -90,98 +89,11 @@ def class_polygons(classes: Classes, tolerance_px: float = 1.0) -> Coverage:
 
 def outline_regions(classes: Classes) -> Coverage:
     """Outline the regions of a class map (y, x) along the sides of their pixels, those without a class too."""
-    padded = np.pad(number_regions(classes), 1, constant_values=OUTSIDE)
-    width = padded.shape[1]
-    sides = _sides(padded)
-    order, ring_starts = _in_rings(_next_sides(padded.ravel(), sides, width), len(sides))
-    pixel, heading = np.divmod(sides[order], 4)
-    corner = pixel + np.array([0, 1, width + 1, width])[heading]  # where a side begins: its pixel lies on the right
-    before = _previous(np.arange(len(order)), ring_starts)
-    kept = (heading != heading[before]) | _junctions(padded)[corner]
-    ring = np.repeat(np.arange(len(ring_starts)), np.diff([*ring_starts, len(order)]))
-    y, x = np.divmod(corner[kept], width)
-    points = np.stack([x - 1.0, y - 1.0], axis=-1)
-    inner = pixel[ring_starts]  # one of each ring's region
-    return _assembled(points, ring[kept], padded.ravel()[inner], np.pad(classes, 1).ravel()[inner])
-
-
-def _assembled(
-    points: NDArray[np.float64], ring: NDArray[np.intp], region: NDArray[np.int32], of_ring: Classes
-) -> Coverage:
-    """Polygons of (point, 2) rings, (point,) number of the ring, and (ring,) region with its class."""
-    rings = shapely.linearrings(points, indices=ring)
-    starts = np.flatnonzero(np.diff(ring, prepend=-1))
-    after = _next(np.arange(len(ring)), starts)
-    turned = points[:, 0] * points[after, 1] - points[after, 0] * points[:, 1]
-    is_hole = np.add.reduceat(turned, starts) < 0  # shells go clockwise as seen, which is positive with y down
-    order = np.lexsort((is_hole, region))
-    _, first, number = np.unique(region[order], return_index=True, return_inverse=True)
-    return Coverage(of_ring[order[first]], shapely.polygons(rings[order], indices=number))
-
-
-def _sides(padded: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Sides of pixels where a region ends, ascending: 4 times the pixel's number and 0 to 3 from the top clockwise."""
-    inner = padded[1:-1, 1:-1]
-    numbers = np.arange(padded.size, dtype=np.int64).reshape(padded.shape)[1:-1, 1:-1]
-    found = []
-    for heading, across in (
-        (EAST, padded[:-2, 1:-1]),
-        (SOUTH, padded[1:-1, 2:]),
-        (WEST, padded[2:, 1:-1]),
-        (NORTH, padded[1:-1, :-2]),
-    ):
-        found.append(4 * numbers[(inner != OUTSIDE) & (inner != across)] + heading)
-    return np.sort(np.concatenate(found))
-
-
-def _next_sides(flat: NDArray[np.int32], sides: NDArray[np.int64], width: int) -> NDArray[np.int32]:
-    """Place of the side that follows each in its ring.
-
-    Where a region's pixels meet in a corner alone the ring turns left, so that no ring touches itself.
-    """
-    pixel, heading = np.divmod(sides, 4)
-    step = np.array([1, width, -1, -width])
-    ahead = pixel + step[heading]
-    left = ahead + step[heading - 1]
-    turns_left, goes_on = flat[left] == flat[pixel], flat[ahead] == flat[pixel]
-    code = np.where(goes_on, 4 * ahead + heading, 4 * pixel + (heading + 1) % 4)
-    code = np.where(turns_left, 4 * left + (heading - 1) % 4, code)
-    found: NDArray[np.int32] = np.searchsorted(sides, code).astype(np.int32)
-    return found
-
-
-def _in_rings(after: NDArray[np.int32], count: int) -> tuple[NDArray[np.int32], NDArray[np.intp]]:
-    """Sides ring by ring, each in order, and where in that list rings begin."""
-    rows = np.arange(count + 1)
-    ring = connected_components(csr_array((np.ones(count, np.int8), after, rows), shape=(count, count)))[1]
-    heads = np.unique(ring, return_index=True)[1].astype(np.int32)
-    # from one more node, which leads to the first side of each ring, the search in depth goes ring by ring
-    targets, starts = np.concatenate([after, heads]), np.append(rows, count + len(heads))
-    graph = csr_array((np.ones(len(targets), np.int8), targets, starts), shape=(count + 1, count + 1))
-    order = depth_first_order(graph, count, return_predecessors=False)[1:]
-    return order, np.flatnonzero(np.diff(ring[order], prepend=-1))
-
-
-def _previous(places: NDArray[np.intp], starts: NDArray[np.intp]) -> NDArray[np.intp]:
-    before = places - 1
-    before[starts] = np.append(starts[1:], len(places)) - 1
-    return before
-
-
-def _next(places: NDArray[np.intp], starts: NDArray[np.intp]) -> NDArray[np.intp]:
-    after = places + 1
-    after[np.append(starts[1:], len(places)) - 1] = starts
-    return after
-
-
-def _junctions(padded: NDArray[np.int32]) -> NDArray[np.bool_]:
-    """Whether three sides or more meet in the upper left corner of each pixel of the padded map, flat."""
-    meeting = np.zeros(padded.shape, np.uint8)
-    above, left = padded[:-1, :-1] != padded[:-1, 1:], padded[:-1, :-1] != padded[1:, :-1]
-    below, right = padded[1:, :-1] != padded[1:, 1:], padded[:-1, 1:] != padded[1:, 1:]
-    meeting[1:, 1:] = above.astype(np.uint8) + left + below + right
-    found: NDArray[np.bool_] = meeting.ravel() >= 3
-    return found
+    numbers, graph = find_regions(classes)
+    found = sorted(features.shapes(numbers, connectivity=4), key=lambda one: one[1])
+    stepped = shapely.segmentize([shapely.geometry.shape(one) for one, _ in found], 1.0)
+    corners = shapely.transform(stepped, np.rint)  # a vertex at every corner of a pixel
+    return Coverage(graph.classes, shapely.coverage_simplify(corners, 0.0))  # without those on straight sides
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.rectify.calibrate import calibrate
 from pipeline.rectify.kernels import Kernel
@@ -146,18 +145,7 @@ def mosaic(parts: Sequence[MosaicPart]) -> tuple[NDArray[np.float32], NDArray[np
     array that went in). What a part holds where its weight is 0 does not matter.
 
     (n, band) float32, NaN where no sweep reached, and (n,) how many sweeps did.
-
-    Raises ShapeError: no part, or parts of different sizes.
     """
-    if not parts:
-        raise ShapeError("a mosaic needs at least one sweep, got none")
-    for number, part in enumerate(parts):
-        points = (parts[0].values.shape[0],)
-        if part.values.shape != parts[0].values.shape or part.weight.shape != points or part.edge_px.shape != points:
-            raise ShapeError(
-                f"part {number} has values {part.values.shape}, weight {part.weight.shape} and edge distance "
-                f"{part.edge_px.shape}; expected those of {parts[0].values.shape}: resample all at the same points"
-            )
     reached = [part.weight > 0 for part in parts]
     coverage: NDArray[np.intp] = np.sum(reached, axis=0, dtype=np.intp)
     for part, here in zip(parts, reached, strict=True):

@@ -31,8 +31,7 @@ from flows.training.look import chosen_effects
 from models.evaluation.expected_scores import MapScores, expected_counts
 from models.evaluation.metrics import confusion, mean_iou
 from models.reading.inference import segment
-from models.weights.companion_files import MAP_SCORES, load_familiar
-from models.weights.files import Description, Weights, load_weights
+from models.weights.files import Weights, describe_weights, load_weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel
@@ -158,9 +157,10 @@ def _figure(judged: Judged) -> str:
 @cache
 def scores(step: int) -> MapScores:
     """How what maps by the shipped weights for such lines expect of themselves came true."""
-    weights = shipped(step)
-    described = Description(weights.config, weights.basis, weights.class_names, weights.record)
-    return MapScores.read(load_familiar(_path(step), described).record[MAP_SCORES])
+    familiar = describe_weights(_path(step)).familiar
+    assert familiar is not None
+    assert familiar.map_scores is not None
+    return familiar.map_scores
 
 
 @cache

@@ -21,8 +21,7 @@ from models.reading.inference import Glance
 from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.geometry.grid import seat_pixels
 from pipeline.geometry.scan import Sweep, exposing
-from pipeline.planning.area_cover import seats_shown
-from pipeline.planning.coverage import field_px
+from pipeline.planning.coverage import field_px, seats_shown
 from pipeline.planning.fine_pass import FinePlan, plan_fine
 from pipeline.planning.plain_scans import scan_words
 from storage.archive.keys import StageRef, array_digest

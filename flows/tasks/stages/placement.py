@@ -14,7 +14,6 @@ from flows.tasks.run import SurveyRun
 from flows.tasks.stage import Product, Wanted, stage
 from flows.tasks.stages.attention import load_plan
 from flows.tasks.stages.capture import captured
-from pipeline.errors import ShapeError
 from pipeline.geometry.grid import seat_pixels
 from pipeline.rectify.mosaic import LineCache
 from pipeline.rectify.placed import PixelGrid, Placed, TieTable
@@ -145,10 +144,10 @@ CACHE_SHARE = 8  # raw lines kept for the next patches may take this part of the
 
 
 @stage("locate", "lookup", LOOKUP)
-def locate(run: SurveyRun, raw: StageRef, *registration: StageRef) -> Wanted:
+def locate(run: SurveyRun, raw: StageRef, registration: StageRef | None = None) -> Wanted:
     """Look up where each coarse pixel was seen: a table that every survey along the same path shares."""
     grid = PixelGrid.of_scene(run.grid, 1 if run.plan.plain else run.grid.factor)
-    sweeps = sighted(run, raw, _only(registration))
+    sweeps = sighted(run, raw, registration)
     camera = {name: getattr(run.camera, name) for name in ("samples", "pitch_um", "focal_length_mm")}
     params = {
         "camera": camera,
@@ -177,7 +176,7 @@ def locate(run: SurveyRun, raw: StageRef, *registration: StageRef) -> Wanted:
 
 
 @stage("rectify", "mosaic", MOSAIC)
-def rectify(run: SurveyRun, raw: StageRef, lookup: StageRef, *registration: StageRef) -> Wanted:
+def rectify(run: SurveyRun, raw: StageRef, lookup: StageRef, registration: StageRef | None = None) -> Wanted:
     """Bring the coarse sweeps onto the scene grid and blend them into one mosaic, tile by tile."""
 
     def build(path: Path) -> None:
@@ -189,7 +188,7 @@ def rectify(run: SurveyRun, raw: StageRef, lookup: StageRef, *registration: Stag
             grid,
             run.settings.kernel,
             lookup=lookup.path / "lookup.zarr",
-            registration=record_of(_only(registration)),
+            registration=record_of(registration),
             finer=PixelGrid.of_scene(run.grid, 1) if run.plan.plain else None,
         )
         writer = MosaicWriter(
@@ -211,11 +210,11 @@ def rectify(run: SurveyRun, raw: StageRef, lookup: StageRef, *registration: Stag
         write_table(path / "lines.json", {one.cube.sweep.name: one.facts() for one in recipe.sweeps()})
 
     params = {"grid": asdict(run.grid), "kernel": run.settings.kernel, **run.place_key}
-    return Wanted(build, params, [raw, lookup, *registration])
+    return Wanted(build, params, [raw, lookup, *_there(registration)])
 
 
 @stage("cut_patches", "fine patches", PATCHES)
-def cut_patches(run: SurveyRun, attention: StageRef, raw: StageRef, *registration: StageRef) -> Wanted:
+def cut_patches(run: SurveyRun, attention: StageRef, raw: StageRef, registration: StageRef | None = None) -> Wanted:
     """Bring every chosen seat onto the scene grid, one patch a seat; NaN where nothing was seen, or is no scene.
 
     ``raw`` are the fine sweeps, or those of a plain scan.
@@ -237,10 +236,10 @@ def cut_patches(run: SurveyRun, attention: StageRef, raw: StageRef, *registratio
             grid=run.angular_grid(),
         )
         if run.plan.plain and len(ordered):
-            _cut_everything(run, sighted(run, raw, _only(registration)), writer, ordered)
+            _cut_everything(run, sighted(run, raw, registration), writer, ordered)
             return
         cache = LineCache(run.settings.memory // CACHE_SHARE)
-        sweeps = [one.placed(run.camera) for one in sighted(run, raw, _only(registration))]
+        sweeps = [one.placed(run.camera) for one in sighted(run, raw, registration)]
         for first in range(0, len(ordered), SEATS_AT_ONCE):
             seats = ordered[first : first + SEATS_AT_ONCE]
             seen = read_seats(sweeps, run.camera, run.grid, seats, run.settings.kernel, cache=cache)
@@ -248,7 +247,7 @@ def cut_patches(run: SurveyRun, attention: StageRef, raw: StageRef, *registratio
             run.report((first + len(seats)) / len(ordered))
 
     params = {"grid": asdict(run.grid), "kernel": run.settings.kernel, **run.place_key}
-    return Wanted(build, params, [attention, raw, *registration])
+    return Wanted(build, params, [attention, raw, *_there(registration)])
 
 
 def _on_scene(
@@ -288,10 +287,8 @@ def seen_shares(run: SurveyRun, patches: StageRef) -> NDArray[np.float64]:
     return np.divide(seen, there, out=np.ones_like(seen), where=there > 0)
 
 
-def _only(registration: Sequence[StageRef]) -> StageRef | None:
-    if len(registration) > 1:
-        raise ShapeError(f"expected one registration or none, got {len(registration)}")
-    return registration[0] if registration else None
+def _there(registration: StageRef | None) -> list[StageRef]:
+    return [] if registration is None else [registration]
 
 
 def line_facts(mosaic: StageRef) -> dict[str, dict[str, Any]]:

@@ -13,11 +13,11 @@ from flows.tasks.survey_model import shipped_weights
 from flows.tradeoff.stages import plain_look
 from flows.training.look import chosen_effects
 from models.evaluation.metrics import confusion, mean_iou
+from models.network.memory_reader import MemoryReader
 from models.reading.inference import segment
 from models.reading.remembered import Belief, Looked, Remembered, first_belief, recall
 from models.training.looks import REFERENCE_MS
-from models.weights.companion_files import MemoryWeights, load_memory, memory_path
-from models.weights.files import Weights, describe_weights, load_weights
+from models.weights.files import Weights, load_reader, load_weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import CostModel
@@ -61,8 +61,8 @@ def shipped() -> Weights:
 
 
 @cache
-def shipped_memory() -> MemoryWeights:
-    return load_memory(memory_path(WEIGHTS), describe_weights(WEIGHTS))
+def shipped_memory() -> MemoryReader:
+    return load_reader(WEIGHTS)
 
 
 def look_at_farm(seed: int, day: int, hour: float, how: tuple[int, float], noise: int = 0) -> Seen:
@@ -91,7 +91,7 @@ def later(
 ) -> Belief:
     """What is believed after a later look, whose coarse pixels are ``comparable`` to those of before."""
     memory = Remembered(belief, before.looked.coarse if comparable else None, days)
-    return recall(memory, now.looked, shipped_memory().reader if reader else None)
+    return recall(memory, now.looked, shipped_memory() if reader else None)
 
 
 def mean_figure(values: Sequence[float]) -> str:

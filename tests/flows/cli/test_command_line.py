@@ -76,11 +76,6 @@ def test_every_flag_says_what_it_is(verb: str) -> None:
     [
         (["survy"], 'Unknown command "survy". Did you mean "survey"?; see spectralzoom --help'),
         (["survey", "--budgt", "1"], "Unknown option: --budgt. Did you mean --budget?; see spectralzoom survey --help"),
-        (
-            ["plan", "--rounds=2"],
-            "Unknown option: --rounds; there is one round of detail: a second never paid and was "
-            "removed; leave it out; see spectralzoom plan --help",
-        ),
     ],
 )
 def test_a_wrong_word_is_one_line(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,8 +14,8 @@ from flows.publish.findings import changed_hectares, older_hectares
 from flows.publish.receipt_table import finding_rows
 from models.evaluation.expected_scores import MapScores, expected_counts, expected_score
 from models.reading.familiar import Familiar, Limits
-from models.weights.companion_files import MAP_SCORES, FamiliarWeights, TrainedOn, familiar_path, save_familiar
-from models.weights.files import content_key, describe_weights
+from models.weights.files import add_familiar, describe_weights
+from models.weights.parts import MAP_SCORES, TrainedOn
 from pipeline.errors import WeightsError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.field_places import NoPlace
@@ -69,7 +69,7 @@ def _judged(weights: Path, folder: Path, content: dict[str, Any], limit: float =
     one, table = np.eye(3), np.full((1, 1, 2), limit)
     limits = Limits(np.array([0.001, 0.05]), np.ones(1), (1,), table, table[0])
     familiar = Familiar(np.zeros((1, 3)), one[None], 1e-9 * one[None], 1e-9 * one, limits, 3)
-    save_familiar(FamiliarWeights(familiar, content_key(path), SEEN, {MAP_SCORES: content}), familiar_path(path))
+    add_familiar(path, path, familiar, SEEN, {MAP_SCORES: content})
     return path
 
 
@@ -112,6 +112,6 @@ def test_nothing_is_told_of_a_field_that_the_weights_do_not_know(survey_png: Sur
 def test_a_table_that_is_none_is_refused_with_its_file(survey_png: Survey, weights: Path, tmp_path: Path):
     """The file is named, and what to do."""
     path = _judged(weights, tmp_path, SCORES.as_dict() | {"error": [[0.1]]})
-    with pytest.raises(WeightsError, match=r"judged\.familiar.*--familiar"):
+    with pytest.raises(WeightsError, match=r"judged\.safetensors: its description is damaged"):
         survey_png(tmp_path / "a", weights=str(path), effects="none", budget=None, scan_step="1")
     assert MAP_SCORES not in describe_weights(path).record

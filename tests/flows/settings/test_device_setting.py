@@ -54,10 +54,3 @@ def test_a_map_of_another_device_is_another_store() -> None:
         for name in ("cpu", "cuda")
     ]
     assert keys == [{"weights": "w"}, {"weights": "w", "device": "cuda"}]
-
-
-def test_auto_tells_what_it_came_to(survey_png: Survey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A receipt names the device that computed."""
-    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    published = survey_png(tmp_path, device="auto")
-    assert published.receipt["settings"]["device"] == "cpu"

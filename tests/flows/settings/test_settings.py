@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flows.settings.documents import example_toml, settings_table
-from flows.settings.load import SURVEY, TABLES, load_settings, of_this_version, parse_settings
+from flows.settings.load import SURVEY, TABLES, load_settings, parse_settings
 from flows.settings.survey_settings import MapChoice, Settings
 from flows.settings.values import Tolerance
 from pipeline.errors import BudgetError, SettingsError
@@ -173,8 +173,6 @@ def test_memory_reads_units(text, count):
         ({"workers": 0}, "a whole number from 1 to 1024, got 0; one process or thread each"),
         ({"scheduler": ""}, "^'scheduler' must be text that is not empty"),
         ({"scheduler": 3}, "^'scheduler' must be text that is not empty"),
-        ({"rounds": 1}, r"unknown setting 'rounds'; there is one round of detail: .* was removed; leave it out$"),
-        ({"rounds": 2}, r"unknown setting 'rounds'; there is one round of detail: .* was removed; leave it out$"),
         ({"threshold": -1}, "threshold' must be a number from 0 to 1e\\+09 nat per second, got -1"),
         ({"threshold": 1, "policy": "sobel"}, "policy 'sobel' scores in a unit of its own: leave --threshold out"),
         ({"seed": -1}, "whole number from 0"),
@@ -184,8 +182,6 @@ def test_memory_reads_units(text, count):
         ({"mask": "m.png"}, "policy 'mask' only"),
         ({"effects": "smear,glare"}, r"'effects': unknown effect 'glare'"),
         ({"effects": "smear,turbulance"}, "did you mean 'turbulence'"),
-        ({"effects": "slit,throughput"}, "the effect 'throughput' is now called 'vignetting'"),
-        ({"effects": ["read"]}, "the effect 'read' is now called 'read-noise'"),
         ({"effects": "auto,slit"}, "'auto' stands alone, got 'auto,slit'"),
         ({"effects": []}, "no effect is named"),
         ({"tol": -0.1}, "'tol' must be 0 or more, in sigmas of the noise such as 0.1, or in DN .* got -0.1"),
@@ -199,10 +195,6 @@ def test_memory_reads_units(text, count):
         (
             {"mirror": {"coating": "brass"}},
             "'mirror.coating' must be one of aluminium, gold, silver, ideal; got 'brass'",
-        ),
-        (
-            {"optics": {"polarisation": 0.02}},
-            r"unknown .*'optics\.polarisation'; the mirror's coating .* \[mirror\] coat",
         ),
         ({"detector": {"noiseless": "maybe"}}, "true or false"),
         ({"detector": {"temperature_deg_c": 60}}, "from -80 to 50 deg C, got 60"),
@@ -274,17 +266,6 @@ def test_a_rig_is_read_from_its_tables(toml):
     assert rig.camera == found.camera
 
 
-def test_receipts_of_before_are_read():
-    """Keys that there are no longer are left out of a receipt's settings, in its tables too; the others stay."""
-    now = Settings(seed=3, optics=Optics(smile_nm=1.0)).to_dict()
-    before = now | {"patch": 16, "rounds": 1, "rig": {**now["rig"], "old": 1}}
-    before["optics"] = {**now["optics"], "polarisation": 0.02}
-    assert of_this_version(before) == now
-    assert parse_settings(of_this_version(before)) == Settings(seed=3, optics=Optics(smile_nm=1.0))
-    with pytest.raises(SettingsError, match=r"its survey had 2 rounds of detail, .* survey the field by hand"):
-        of_this_version(before | {"rounds": 2})
-
-
 @pytest.mark.parametrize(
     ("given", "wanted"),
     [
@@ -345,10 +326,3 @@ def test_receipt_settings_read_back_the_same(budget, seed, bands, memory, exposu
     )
     assert parse_settings(settings.to_dict()) == settings
     assert parse_settings(json.loads(to_json(settings.to_dict()))) == settings
-
-
-def test_a_receipt_of_a_whole_look_has_nothing_of_looks_at_parts() -> None:
-    """As first visits once told it, which had asked for a part: they can be surveyed again."""
-    stored = {"look": "whole", "refresh": 14.0, "doubt": 0.02, "seconds": 5.0}
-    assert of_this_version(stored) == {"look": "whole", "refresh": None, "doubt": None, "seconds": 5.0}
-    assert of_this_version({**stored, "look": "0:0-9"})["refresh"] == 14.0

@@ -23,8 +23,7 @@ from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
 from flows.settings.load import load_settings
 from models.network.memory_reader import MemoryReader
 from models.network.sizes import MemorySizes
-from models.weights.companion_files import MemoryWeights, memory_path, save_memory
-from models.weights.files import load_weights
+from models.weights.files import add_reader, load_weights
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
 from storage.archive.archive import Archive
@@ -98,13 +97,6 @@ def test_a_later_look_goes_on_from_the_one_before(twice: tuple[Path, Any, Any]) 
     assert belief.changed.shape == (12, 16)
     there = (belief.changed_from.values != 255).reshape(12, 8, 16, 8).mean(axis=(1, 3), dtype=np.float32)
     np.testing.assert_array_equal(belief.changed.values, there)
-
-
-def test_two_looks_know_more_than_one(twice: tuple[Path, Any, Any], survey_png: Survey, tmp_path: Path) -> None:
-    """Without a reader, on a field that stays: no surer look is thrown away, the map is as good as without a memory."""
-    _, _, later = twice
-    alone = survey_png(tmp_path / "alone", **PLAIN, visit=LATER)
-    assert later.receipt["accuracy"]["miou"] >= alone.receipt["accuracy"]["miou"] - 0.005
 
 
 def test_by_hand_nothing_is_remembered_unless_asked(visited: Path, survey_png: Survey) -> None:
@@ -225,24 +217,21 @@ def test_a_plan_knows_what_is_remembered(visited: Path, scene_files: Path, weigh
     assert sorted(visited.rglob("*")) == before
 
 
-def test_a_reader_beside_the_weights_is_used(visited: Path, survey_png: Survey, weights: Path, tmp_path: Path) -> None:
+def test_a_reader_in_the_weights_is_used(visited: Path, survey_png: Survey, weights: Path, tmp_path: Path) -> None:
     """Its key stands in the receipt and its multiply-adds count; one for others ends the survey before it begins."""
     own = Path(shutil.copy(weights, tmp_path / "own.safetensors"))
     config = load_weights(own).config
     reader = MemoryReader(MemorySizes(config.classes, config.columns, config.factor, 8, 4))
     torch.nn.init.normal_(reader.leave.weight, std=0.2)
-    save_memory(MemoryWeights(reader, "any", load_weights(own).class_names, {}), memory_path(own))
+    add_reader(own, own, reader, {})
     flags = {**PLAIN, "visit": "2026-06-07T10:00:00Z", "prior": "latest", "weights": str(own)}
     published = survey_png(visited, **flags)
     assert len(published.receipt["memory"]["reader"]) == 20
     first = survey_png(tmp_path / "alone", **{**flags, "prior": "none"})
     decode = [one.receipt["savings"]["multiply_adds"]["decode"] for one in (published, first)]
     assert decode[0] - decode[1] == reader.sizes.multiply_adds(96 * 128)
-    save_memory(
-        MemoryWeights(MemoryReader(MemorySizes(3, 7, 4)), "any", ("class_0", "class_1", "class_2"), {}),
-        memory_path(own),
-    )
-    with pytest.raises(WeightsError, match=r"own\.memory\.safetensors reads memories of 3 classes, 7 columns"):
+    add_reader(own, own, MemoryReader(MemorySizes(3, 7, 4)), {})
+    with pytest.raises(WeightsError, match=r"own\.safetensors.* reader of prior maps is for another network"):
         survey_png(visited, **flags)
 
 
@@ -329,17 +318,6 @@ def test_a_thousand_visits_cost_as_much_as_sixty(visited: Path, twice: Any, monk
     assert {name.rpartition("-")[2] for name in read} == {"north"}
 
 
-def test_a_look_is_no_memory_of_itself(visited: Path, twice: Any, survey_png: Survey) -> None:
-    """Asked for again, a visit goes on from the one before it and finds its own map; so does the first."""
-    again = survey_png(visited, **PLAIN, visit=LATER, prior="latest")
-    assert again.receipt["memory"]["run"] == twice[1].folder.name
-    first = survey_png(visited, **PLAIN, visit=FIRST, prior="latest")
-    assert "memory" not in first.receipt
-    for published in (again, first):
-        (row,) = (stage for stage in published.receipt["stages"] if stage["name"] == "draw_map")
-        assert row["state"] == "cached"
-
-
 def test_two_visits_at_once_are_both_kept(visited: Path, twice: Any, survey_png: Survey) -> None:
     """Neither waits for the other or goes on from it half made: both are published, and rest on finished runs."""
     at = ["2026-06-09T10:00:00Z", "2026-06-09T11:00:00Z"]
@@ -349,23 +327,3 @@ def test_two_visits_at_once_are_both_kept(visited: Path, twice: Any, survey_png:
     assert both[0].receipt["memory"]["run"] == twice[2].folder.name
     assert both[1].receipt["memory"]["run"] in {twice[2].folder.name, both[0].folder.name}
     assert not problems(visited)
-
-
-def test_weights_of_another_factor_go_on_from_what_is_believed(
-    visited: Path, survey_png: Survey, make_weights: WeightsMaker
-) -> None:
-    """Both coarse looks are laid on each other in the larger pixels; what they show is not compared any further."""
-    flags = {"weights": str(make_weights(factor=2)), "visit": "2026-06-07T10:00:00Z", "prior": "latest"}
-    words, published = words_of(visited, survey_png, **flags)
-    assert "3 days earlier" in words
-    assert published.receipt["memory"]["shift_px"] == [0, 0]
-    assert published.receipt["memory"]["put_aside"] is None
-    assert not problems(visited)
-
-
-def test_a_coarse_look_in_no_pixels_of_ours_is_no_memory(visited: Path) -> None:
-    """Pixels wider than a patch cannot be laid beside today's: said, with both sizes."""
-    settings = load_settings(None, {"prior": "latest", "visit": "2026-06-20T10:00:00Z"})
-    found, notes = memory.find_prior(Archive.open(visited), settings, "north", SceneGrid(96, 128, 2, 2), CLASSES)
-    assert found is None
-    assert "cannot be used: its coarse look has 32 x 24 px, these weights read 64 x 48" in notes[0]

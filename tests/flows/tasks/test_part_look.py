@@ -20,7 +20,7 @@ from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
 from flows.settings.load import load_settings
 from flows.tasks.look_choice import LookWorth
 from models.reading.doubts import SeatDoubts
-from pipeline.errors import BudgetError, NothingToMend, PipelineError, SettingsError, WeightsError
+from pipeline.errors import BudgetError, NothingToMend, PipelineError, SettingsError
 from pipeline.geometry.grid import SceneGrid
 from pipeline.planning.plain_scans import ScanRecord
 from storage.archive.records import read_run
@@ -175,12 +175,6 @@ def test_of_what_is_sure_enough_nothing_is_looked_at(
     assert survey_png(visited, **{**flags, "doubt": "0.1%"}).receipt["settings"]["doubt"] == 0.001
 
 
-def test_what_is_too_old_is_looked_at_however_sure_it_is(visited: Path, survey_png: Survey, recorded: Path) -> None:
-    """What is due comes before what is doubted."""
-    part = survey_png(visited, **PART, visit=LAST, weights=str(recorded), doubt="50%", refresh="4d")
-    assert part.receipt["look"]["due"] > 0
-
-
 def test_nothing_is_worth_more_than_what_is_due() -> None:
     """A seat that is due counts more than all that the others gain; without gains the oldest counts most."""
     grid = SceneGrid(4, 16, 4, 1)
@@ -236,16 +230,3 @@ def test_what_cannot_be_looked_at_is_refused_in_a_sentence(
     with pytest.raises(error, match=told):
         survey_png(visits[0], **{**PART, "visit": LAST, "weights": str(recorded), **flags})
     assert sorted(visits[0].rglob("*")) == before
-
-
-def test_weights_without_a_record_look_at_all(visited: Path, survey_png: Survey, weights: Path) -> None:
-    """No part can be chosen by them, which is said."""
-    with pytest.raises(WeightsError, match="have no record of plain scans, by which a part of a field is chosen"):
-        survey_png(visited, **PART, visit=LAST, weights=str(weights))
-
-
-@pytest.mark.parametrize(("text", "days"), [("14d", 14.0), ("36h", 1.5), ("2w", 14.0), (7, 7.0)])
-def test_times_are_read_in_days(text: Any, days: float) -> None:
-    """With a unit or as a number of days."""
-    given = {"scene": "farm", "look": "part", "seconds": "9", "refresh": text}
-    assert load_settings(None, given).refresh == days

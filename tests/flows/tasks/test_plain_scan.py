@@ -12,7 +12,7 @@ import xarray as xr
 from rich.console import Console
 
 from flows.archive.plan_command import plan_content
-from flows.archive.reprocess_command import ReprocessRequest, run_judge, run_reprocess
+from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
 from flows.settings.load import load_settings
 from pipeline.errors import BudgetError, SettingsError, WeightsError
 from storage.arrays.tile_work import block_means
@@ -99,16 +99,6 @@ def test_what_is_read_in_part_is_not_promised_what_reading_everything_scores(
     page = (published.folder / "report.html").read_text(encoding="utf-8")
     assert "this one, read whole: " in page
     assert "this one: " not in page
-
-
-def test_controls_say_nothing_of_a_scan(tmp_path: Path, survey_png: Survey) -> None:
-    """Asked for, no other placement is judged beside it, and what is judged is not judged again."""
-    published = survey_png(tmp_path, budget=None, scan_step="4", controls=True)
-    assert published.receipt["accuracy"]["controls"] == {}
-    assert published.receipt["accuracy"]["miou"] is not None
-    before = sorted(path.name for path in tmp_path.glob("stages/evaluate/*"))
-    run_judge(tmp_path, "latest", QUIET)
-    assert sorted(path.name for path in tmp_path.glob("stages/evaluate/*")) == before
 
 
 def test_a_survey_in_two_passes_stands_beside_the_best_plain_scan(

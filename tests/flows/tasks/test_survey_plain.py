@@ -34,7 +34,6 @@ from storage.arrays.class_maps import ClassMap, load_class_map
 from storage.remote.opening import verify_archive
 from tests.conftest import CLASSES, RGB_NM, patchy_scene, random_weights
 from tests.flows.conftest import FEW_BANDS, Page
-from tests.remembered_work import with_effects
 
 STAGES = [
     "choose_effects",
@@ -157,18 +156,6 @@ def test_savings_are_those_of_the_stored_cubes(name: str, request: pytest.Fixtur
     assert done.receipt["savings"]["capture_s"]["done"] == pytest.approx(seconds)
 
 
-@pytest.mark.usefixtures("choosing_anew")
-def test_same_seed_gives_the_same_receipt(picture: Done, survey_png: Any, tmp_path: Path) -> None:
-    """In another archive, but for times and memory; another seed gives other light along the same path."""
-    again = survey_png(tmp_path / "again").receipt
-    with with_effects():
-        other = survey_png(tmp_path / "other", seed="1").receipt
-    assert comparable(again) == comparable(picture.receipt)
-    assert comparable(other) != comparable(picture.receipt)
-    keys = [{stage["name"]: stage["key"] for stage in receipt["stages"]} for receipt in (again, other)]
-    assert {name for name in STAGES if keys[0][name] == keys[1][name]} == {"locate"}
-
-
 def test_second_run_is_read_from_the_archive(survey_png: Any, surveyed_png: Any, tmp_path: Path) -> None:
     """The same command again runs no stage, gives the same products, and publishes a run of its own."""
     first, second = surveyed_png(tmp_path).receipt, survey_png(tmp_path).receipt
@@ -256,19 +243,6 @@ def test_products_are_where_the_receipt_says_and_open_from_disk(farm: Done) -> N
         assert min(image.size) >= 600
 
 
-def test_another_policy_looks_at_other_places(picture: Done, survey_png: Any, tmp_path: Path) -> None:
-    """The coarse pass is read from the archive; the seats follow the mask."""
-    mask = np.zeros((96, 128), np.uint8)
-    mask[:16] = 200  # the first two rows of seats
-    Image.fromarray(mask).save(tmp_path / "mask.png")
-    given = {"policy": "mask", "mask": str(tmp_path / "mask.png"), "budget": "0.7"}
-    done = Done(survey_png(picture.archive, **given), picture.archive)
-    states = {stage["name"]: stage["state"] for stage in done.receipt["stages"]}
-    assert (states["capture_coarse"], states["attend"]) == ("cached", "ran")
-    rank = done.open("attention")["rank"].values
-    assert (rank[0] >= 0).all() or (rank[1] >= 0).all()
-
-
 GAP = np.s_[20:31, 40:60]  # of 64 x 96 px
 
 
@@ -338,16 +312,3 @@ def test_readings_that_the_weights_cannot_take_are_counted(survey_png: Any, tmp_
     assert pixels["map_without_a_class"] == 0
     store = scene.parent / "a" / Path(found.receipt["products"]["class_map"]).parent
     assert json.loads((store / "strange.json").read_text())["coarse_px"] == 64 * 96 // 16
-
-
-@pytest.mark.usefixtures("no_effects")
-def test_scores_of_any_size_make_a_survey(survey_png: Any, tmp_path: Path) -> None:
-    """A mask of 1e307 buys what a mask of 1 does, without a warning."""
-    scene = _scene(tmp_path / "s", None)
-    mask = np.random.default_rng(0).uniform(0, 1, (64, 96))
-    bought = []
-    for power in (0, 1020):
-        np.save(tmp_path / "mask.npy", np.ldexp(mask, power))
-        found = _survey(survey_png, scene, policy="mask", mask=str(tmp_path / "mask.npy"), budget="0.9")
-        bought.append((found.receipt["savings"]["lines"]["done"], found.receipt["plan"]["score_share"]))
-    assert bought[0] == pytest.approx(bought[1])

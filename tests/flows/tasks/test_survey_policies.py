@@ -12,7 +12,6 @@ import pytest
 import torch
 from rich.console import Console
 
-from flows.publish.receipt import check_receipt
 from flows.publish.receipt_table import finding_rows
 from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
@@ -53,15 +52,6 @@ def _flags(archive: Path, policy: str, **more: str) -> dict[str, Any]:
 def _mosaic(archive: Path) -> Path:
     (path,) = archive.glob("stages/rectify/*/mosaic.zarr")
     return path
-
-
-@pytest.mark.parametrize("policy", ["gain", "saliency", "uniform"])
-def test_a_policy_surveys(archive: Path, policy: str) -> None:
-    """By the glance, by the image, by neither: a whole receipt under its own name, and what its scores cost."""
-    receipt: Any = check_receipt(run_survey(load_settings(None, _flags(archive, policy)), Console(quiet=True)).receipt)
-    assert receipt["settings"]["policy"] == policy
-    assert receipt["accuracy"]["miou"] > 0
-    assert (receipt["savings"]["multiply_adds"]["score"] > 0) == (policy != "uniform")
 
 
 @pytest.mark.parametrize("policy", FREE)
@@ -164,28 +154,6 @@ def vgg_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("vgg") / "vgg19.pth"
     torch.save(state, path)
     return path
-
-
-def _states(published: Any) -> dict[str, str]:
-    return {stage["name"]: stage["state"] for stage in published.receipt["stages"]}
-
-
-def test_a_survey_by_saliency(vgg_file: Path, survey_png: Any, tmp_path: Path) -> None:
-    """It scores every seat, counts its own cost, and looks again only when the file of VGG19 is another."""
-    flags = {"policy": "vgg-static", "vgg": str(vgg_file)}
-    first = survey_png(tmp_path / "archive", **flags)
-    weights = describe_weights(Path(first.receipt["settings"]["weights"]))
-    config, step = weights.config, weights.config.patch * weights.config.factor
-    coarse = (-(-96 // step) * config.patch, -(-128 // step) * config.patch)
-    columns = config.columns
-    assert first.receipt["savings"]["multiply_adds"]["score"] == saliency_multiply_adds(coarse, columns)
-    assert _states(first)["attend"] == "ran"
-    assert set(_states(survey_png(tmp_path / "archive", **flags)).values()) <= {"cached", "skipped"}
-    state = torch.load(vgg_file, weights_only=True)
-    state["features.0.bias"] += 1
-    torch.save(state, tmp_path / "other.pth")
-    other = survey_png(tmp_path / "archive", policy="vgg-static", vgg=str(tmp_path / "other.pth"))
-    assert (_states(other)["capture_coarse"], _states(other)["attend"]) == ("cached", "ran")
 
 
 @pytest.fixture(scope="module")

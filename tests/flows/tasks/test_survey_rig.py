@@ -424,19 +424,6 @@ def test_another_device_is_not_moved(command_line: CommandLine, tmp_path: Path, 
     assert not any("=" in act.request.line for act in rig.mirror.acts)
 
 
-def test_default_engine_says_it_once_as_well(
-    command_line: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    """Through Prefect, which tries again, a port that is not there is one message too, and no traceback."""
-    monkeypatch.setattr(flows.tasks.prefect_tasks, "RETRY_DELAY_S", 0.0)
-    file = tmp_path / "rig.toml"
-    file.write_text('source = "rig"\nscene = "farm"\nsize = "96x96"\nbands = [40, 90]\n[rig]\nport = "/dev/ttyNONE"\n')
-    ended = command_line("survey", file, "--out", tmp_path / "archive")
-    assert (ended.code, ended.err.count("/dev/ttyNONE")) == (1, 1)
-    assert ended.err.splitlines()[-1].startswith("error: there is no port /dev/ttyNONE")
-    assert not re.findall(r"Traceback|ERROR|Task run", ended.err)
-
-
 def test_port_in_use_and_camera_unreachable(command_line: CommandLine, tmp_path: Path):
     """Another program holds the mirror's port; it lets go, and then nobody answers for the camera. Nothing moves."""
     scene, _ = open_scene(small_settings(tmp_path))

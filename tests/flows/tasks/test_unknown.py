@@ -19,14 +19,12 @@ from hypothesis import strategies as st
 
 from flows.publish.receipt_table import finding_rows
 from flows.settings.load import load_settings
-from flows.settings.values import parse_unknown
-from flows.tasks.beyond_training import beyond_training
+from flows.tasks.survey_model import beyond_training
 from models.reading.familiar import Familiar, Limits
-from models.weights.companion_files import FamiliarWeights, TrainedOn, familiar_path, save_familiar
-from models.weights.files import content_key, describe_weights
-from pipeline.errors import SettingsError, WeightsError
+from models.weights.files import add_familiar, describe_weights
+from models.weights.parts import TrainedOn
+from pipeline.errors import WeightsError
 from pipeline.geometry.grid import UNLABELLED
-from storage.arrays.class_maps import ClassNames, with_unknown
 from tests.conftest import CLASSES, RGB_NM, Survey
 
 SEEN = TrainedOn(3, (460.0, 640.0), (3.0, 100.0), 2, CLASSES, (96, 300), (24.0, 60.0), 0.12)
@@ -43,7 +41,7 @@ def judging(weights: Path, tmp_path_factory: pytest.TempPathFactory) -> Maker:
         one, table = np.eye(3), np.full((1, 1, 2), limit)
         limits = Limits(np.array([0.001, 0.05]), np.ones(1), (1,), table, table[0])
         familiar = Familiar(np.zeros((1, 3)), one[None], 1e-9 * one[None], 1e-9 * one, limits, 3)
-        save_familiar(FamiliarWeights(familiar, content_key(path), SEEN), familiar_path(path))
+        add_familiar(path, path, familiar, SEEN, {})
         return path
 
     return make
@@ -159,27 +157,6 @@ def test_a_rate_needs_weights_that_were_measured(survey_png: Survey, weights: Pa
     with pytest.raises(WeightsError, match=r"--unknown 1%: nobody measured .* --familiar"):
         survey_png(tmp_path / "out", weights=str(weights), unknown="1%")
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(("given", "wanted"), [("AUTO", "auto"), (" off", "off"), ("0.50 %", "0.5%")])
-def test_words_of_the_setting(given: str, wanted: str) -> None:
-    """One word for one meaning."""
-    assert parse_unknown(given) == wanted
-
-
-@pytest.mark.parametrize("given", ["0.5", "12%", "0%", "maybe", "nan%", True])
-def test_other_words_are_refused(given: object) -> None:
-    """A rate has its sign, and is one that limits are known for."""
-    with pytest.raises(ValueError, match=r"must be auto, off, or the share .*0\.05% to 5%, such as 0\.5%"):
-        parse_unknown(given)
-    with pytest.raises(SettingsError, match="unknown"):
-        load_settings(None, {"unknown": given})
-
-
-def test_a_class_that_is_called_unknown_already_keeps_its_name() -> None:
-    """The one behind it has another."""
-    legend = ClassNames(("unknown", "crop"), np.zeros((2, 3), np.uint8))
-    assert with_unknown(legend).names == ("unknown", "crop", "unknown_spectrum")
 
 
 def _notes(weights: Path, nm: tuple[float, ...] = RGB_NM, **flags: Any) -> tuple[str, ...]:

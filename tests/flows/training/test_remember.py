@@ -6,19 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from rich.console import Console
 
 import flows.training.remember as remember
 from flows.tasks.survey_model import shipped_weights
 from flows.training.remember import MemoryRequest, _moments, run_remember, train_memory
 from models.evaluation.metrics import confusion, mean_iou
-from models.network.memory_reader import MemoryReader
 from models.network.sizes import MemorySizes
 from models.reading.remembered import Looked, Remembered, first_belief, recall
 from models.training.memory import MemoryTraining, PastLook, Visit, train_reader
-from models.weights.companion_files import load_memory, memory_path
-from models.weights.files import content_key, describe_weights
+from models.weights.files import content_key, describe_weights, load_reader
 from pipeline.errors import SettingsError
 
 QUICK = MemoryTraining(minutes=0.5, steps=2, batch=2, crop=64, visits=2)
@@ -70,12 +67,13 @@ def test_the_command_trains_judges_and_says_how(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(remember, "VISITS", 2)
     monkeypatch.setattr(remember, "JUDGED_AFTER", (3,))
     monkeypatch.setattr(remember, "STEPS", {4: 0.7, 1: 0.3})  # of which weights with coarse pixels of 2 px read one
-    out, weights = tmp_path / "farm.memory.safetensors", shipped_weights(plain=plain)
+    out, weights = tmp_path / "farm.safetensors", shipped_weights(plain=plain)
     request = MemoryRequest("farm", weights, out, 1, 1, (128, 192), QUICK, "spectralzoom train")
     record = run_remember(request, Console(quiet=True))
-    found = load_memory(out, describe_weights(weights))
-    assert found.weights_key == content_key(weights)
-    assert found.reader.sizes.factor == (2 if plain else 4)
+    found = describe_weights(out).reader
+    assert found is not None
+    assert content_key(out) == content_key(weights)
+    assert load_reader(out).sizes.factor == (2 if plain else 4)
     assert dict(found.record) == record
     assert (record["lands"], record["steps"], record["command"]) == ([200_000], 2, "spectralzoom train")
     assert [row["days"] for row in record["validation"]] == [3.0]
@@ -110,9 +108,7 @@ def test_weights_of_other_classes_are_refused(tmp_path: Path, weights: Path) -> 
 def test_the_shipped_weights_have_a_reader(plain: bool, factor: int) -> None:
     """It fits them, was trained for them, and tells the lands that it has seen."""
     weights = shipped_weights(plain=plain)
-    found = load_memory(memory_path(weights), describe_weights(weights))
-    assert found.weights_key == content_key(weights)
+    found = describe_weights(weights).reader
+    assert found is not None
     assert min(found.record["lands"]) >= 200_000
-    assert found.reader.sizes == MemorySizes(11, 24, factor)
-    assert isinstance(found.reader, MemoryReader)
-    assert all(torch.isfinite(tensor).all() for tensor in found.reader.state_dict().values())
+    assert found.sizes == load_reader(weights).sizes == MemorySizes(11, 24, factor)

@@ -28,8 +28,8 @@ from models.evaluation.expected_scores import MapScores
 from models.network.sizes import PRESETS, Preset
 from models.training.start_weights import StartFile
 from models.training.train import TrainingSettings
-from models.weights.companion_files import MAP_SCORES, TrainedOn, familiar_path, load_familiar
-from models.weights.files import describe_weights, load_any_weights, load_weights
+from models.weights.files import describe_weights, load_any_weights, load_familiar, load_weights
+from models.weights.parts import TrainedOn
 from pipeline.errors import SceneError, SettingsError, WeightsError
 from tests.flows.small_fields import write_field
 
@@ -69,6 +69,13 @@ def test_the_record_tells_what_was_trained_on(folder: Path, out: Path, tmp_path:
     assert load_weights(tmp_path / "w.safetensors").record["split"] == split
 
 
+def _map_scores(weights: Path) -> MapScores:
+    familiar = describe_weights(weights).familiar
+    assert familiar is not None
+    assert familiar.map_scores is not None
+    return familiar.map_scores
+
+
 def test_new_weights_say_what_they_saw_and_know_what_is_familiar(tmp_path: Path):
     """By scenes kept for validation; measured again by the command, the same; without such scenes nothing of it."""
     names = tuple(f"{number:03}" for number in range(1, 5))
@@ -77,19 +84,19 @@ def test_new_weights_say_what_they_saw_and_know_what_is_familiar(tmp_path: Path)
     told = TrainedOn.read(load_weights(out).record["trained_on"])
     assert (told.scenes, told.exposure_ms, told.day) == (3, (100.0, 100.0), None)
     assert 0 <= record["calibration"]["expected_error"] <= 1
-    known = load_familiar(out, describe_weights(out))
-    assert known.trained_on == told
+    known, part = load_familiar(out), describe_weights(out).familiar
+    assert part is not None
+    assert part.trained_on == told
     again = tmp_path / "again.safetensors"
     measure_familiar(FamiliarRequest(str(field), out, again))
-    again.replace(familiar_path(out))
-    measured = load_familiar(out, describe_weights(out)).familiar
-    np.testing.assert_allclose(measured.centres, known.familiar.centres, atol=1e-5)
-    np.testing.assert_allclose(measured.limits.fine, known.familiar.limits.fine, rtol=1e-4)
+    measured = load_familiar(again)
+    np.testing.assert_allclose(measured.centres, known.centres, atol=1e-5)
+    np.testing.assert_allclose(measured.limits.fine, known.limits.fine, rtol=1e-4)
     other = write_field(tmp_path / "other", (32, 32), ("007", "008", "009"))
     with pytest.raises(SettingsError, match="give the data set of their training"):
         measure_familiar(FamiliarRequest(str(other), out, again))
     assert "no scene was kept" in train_weights(_request(field, out, validation=0))["familiar"]
-    assert not familiar_path(out).exists()
+    assert describe_weights(out).familiar is None
     with pytest.raises(SettingsError, match="no scene was kept for validation"):
         measure_familiar(FamiliarRequest(str(field), out, again))
 
@@ -341,13 +348,11 @@ def test_weights_for_short_exposures_have_a_record_of_plain_scans(folder: Path, 
     tables = [scans["miou"], *scans["per_class_iou"].values()]
     assert all(np.shape(table) == (2, 5) and np.min(table) >= 0 and np.max(table) <= 1 for table in tables)
     assert np.shape(scans["spread"]) == (2, 5)
-    told = load_familiar(out, describe_weights(out)).record[MAP_SCORES]
-    scores = MapScores.read(told)
+    scores = _map_scores(out)
     assert (scores.steps, scores.exposures_ms, scores.scenes) == ((1, 2), (6.0, 12.0, 25.0, 50.0, 100.0), 2)
     assert np.abs(scores.bias).max() > 0.01
-    measure_familiar(FamiliarRequest(str(folder), out, familiar_path(out)))
-    again = MapScores.read(load_familiar(out, describe_weights(out)).record[MAP_SCORES])
-    np.testing.assert_allclose(again.bias, scores.bias, atol=0.05)
+    measure_familiar(FamiliarRequest(str(folder), out, out))
+    np.testing.assert_allclose(_map_scores(out).bias, scores.bias, atol=0.05)
     assert "scans" not in train_weights(_request(folder, out, validation=2))
     assert "scans" not in train_weights(_request(folder, out, validation=0, settings=settings))
     dense = _request(folder, out, validation=2, settings=settings, preset="dense")

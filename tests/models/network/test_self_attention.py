@@ -18,7 +18,7 @@ from models.network.self_attention import (
     token_image,
 )
 from models.policies.policies import score_seats
-from models.reading.inference import CoarseLook, Glance, glance_of_columns, read_glance
+from models.reading.inference import Glance, glance_of_columns
 from models.weights.files import Weights
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import SceneGrid
@@ -47,38 +47,6 @@ def test_shares_add_up_to_one(heads: int, tokens: int, width: int):
         assert share.shape == (tokens,)
         assert share.sum() == pytest.approx(1.0, abs=1e-6)
         assert (share >= 0).all()
-
-
-def test_tokens_in_another_order_receive_the_same():
-    """Permuting tokens permutes their shares."""
-    queries, keys, order = noise(3, 2, 30, 8), noise(4, 2, 30, 8), np.random.default_rng(5).permutation(30)
-    moved = received_attention(queries[:, order], keys[:, order])
-    assert moved == pytest.approx(received_attention(queries, keys)[order], abs=1e-7)
-
-
-@pytest.mark.parametrize("most", [1, 31, 100, 10**6])
-def test_blocks_change_nothing(most: int):
-    """However many weights are held at once, the shares are the same."""
-    queries, keys = noise(6, 2, 31, 8), noise(7, 2, 31, 8)
-    exact = np.einsum("hqc,hkc->hqk", queries.astype(float), keys.astype(float)) / np.sqrt(8)
-    weight = np.exp(exact) / np.exp(exact).sum(axis=-1, keepdims=True)
-    assert received_attention(queries, keys, most=most) == pytest.approx(weight.mean(axis=(0, 1)), abs=1e-6)
-
-
-def test_alike_tokens_receive_alike():
-    """Where no token differs each gets the same share; one that answers all questions gets nearly everything."""
-    alike = np.ones((2, 9, 4), np.float32)
-    assert received_attention(alike, alike) == pytest.approx(np.full(9, 1 / 9))
-    keys = alike.copy()
-    keys[:, 4] = 50.0
-    assert received_attention(alike, keys)[4] == pytest.approx(1.0)
-
-
-@pytest.mark.parametrize("shapes", [((2, 3, 4), (2, 4, 4)), ((3, 4), (3, 4)), ((2, 0, 4), (2, 0, 4))])
-def test_queries_and_keys_that_do_not_belong_together_are_refused(shapes: tuple[tuple[int, ...], tuple[int, ...]]):
-    """The message shows both shapes."""
-    with pytest.raises(ShapeError, match="expected queries and keys"):
-        received_attention(*(np.ones(shape, np.float32) for shape in shapes))
 
 
 def test_it_is_what_the_last_layer_computes(tiny: Maker):
@@ -136,14 +104,6 @@ def test_tokens_are_laid_out_patch_by_patch():
     ]
 
 
-@pytest.mark.parametrize(("side", "factor"), [(1, 1), (1, 2), (1, 4), (2, 1), (2, 2), (2, 4), (4, 2)])
-def test_seats_of_level_attention_are_level(side: int, factor: int):
-    """Tokens that receive alike give every seat 1, whatever a token and a seat are to each other."""
-    tokens = 2 * 3 * side**2
-    read = TokenReading(np.ones((2, tokens, 4), np.float32), np.ones((2, tokens, 4), np.float32), side)
-    assert attention_of_seats(read, (2 * factor, 3 * factor), factor) == pytest.approx(1.0, abs=1e-6)
-
-
 @pytest.mark.parametrize(("side", "factor"), [(1, 4), (2, 4), (2, 2), (2, 1)])
 def test_seats_over_the_token_that_is_read_come_first(side: int, factor: int):
     """The greatest seat lies on the token that everything reads, and the seats share out what tokens receive."""
@@ -169,13 +129,3 @@ def test_the_policy_scores_seats_by_their_share(tiny: Maker, patch: int):
     assert scores == pytest.approx(received * seen.grid.valid_share())
     assert received.mean() == pytest.approx(1.0, rel=1e-5)
     assert np.ptp(received) > 1e-4
-
-
-def test_two_readings_score_alike(tiny: Maker):
-    """Reading a look again changes no score, and places of a larger field tell in it."""
-    weights = tiny()
-    seen = seen_by(weights)
-    again = read_glance(weights, CoarseLook(seen.grid, seen.columns))
-    assert (score_seats("self-attention", again) == score_seats("self-attention", seen)).all()
-    moved = read_glance(weights, CoarseLook(seen.grid, seen.columns, origin=(5, 3)))
-    assert np.abs(score_seats("self-attention", moved) - score_seats("self-attention", seen)).max() > 1e-6

@@ -14,15 +14,13 @@ from models.policies.policies import (
     NETWORK_POLICIES,
     POLICIES,
     fine_grained,
-    grey_image,
     pixel_entropy,
     score_seats,
     spectral_residual,
 )
 from models.reading.inference import Glance
-from pipeline.errors import SettingsError, ShapeError
+from pipeline.errors import SettingsError
 from pipeline.geometry.grid import SceneGrid
-from pipeline.planning.selection import select_seats
 
 Measure = Callable[[NDArray[np.floating]], NDArray[np.float64]]
 both = pytest.mark.parametrize("measure", [fine_grained, spectral_residual])
@@ -83,15 +81,6 @@ def test_a_mask_is_averaged_over_each_seat():
     assert score_seats("mask", _glance(), mask=colour) == pytest.approx(expected)
 
 
-def test_a_mask_may_hold_numbers_that_are_not_finite():
-    """NaN counts as nothing; infinite worth stays infinite."""
-    mask = np.ones((32, 48))
-    mask[0, 0], mask[0, 20], mask[0, 40] = np.nan, np.inf, -np.inf
-    scores = score_seats("mask", _glance(), mask=mask)
-    assert scores[[0, 2, 5]].tolist() == [63 / 64, np.inf, -np.inf]
-    assert (np.delete(scores, [0, 2, 5]) == 1).all()
-
-
 @pytest.mark.parametrize("policy", [policy for policy in POLICIES if policy not in NETWORK_POLICIES])
 @pytest.mark.parametrize("size", [(37, 53), (1, 1), (8, 8), (33, 16), (1, 40)])
 def test_seats_off_the_scene_are_worth_nothing(policy: str, size: tuple[int, int]):
@@ -119,18 +108,6 @@ def test_margin_is_how_little_the_likeliest_is_ahead():
     assert score_seats("margin", seen).reshape(4, 6).tolist() == expected.tolist()
 
 
-def test_margin_of_one_class_and_of_none():
-    """With a single class nothing is unsure; a probability that is not a number is passed on, to be chosen last."""
-    seen = _glance()
-    alone = Glance(seen.grid, seen.columns, np.ones_like(seen.probability[..., :1]))
-    assert not score_seats("margin", alone).any()
-    seen.probability[0, 0, 1] = np.nan
-    scores = score_seats("margin", seen)
-    assert np.isnan(scores[0])
-    assert (scores[1:] == 1).all()
-    assert 0 not in select_seats(scores, 23).seats
-
-
 @pytest.mark.parametrize("policy", ["saliency", "spectral-residual"])
 def test_saliency_looks_at_what_differs(policy: str):
     """One odd seat on a noisy ground scores highest, and what lies off the scene changes nothing."""
@@ -153,40 +130,8 @@ def test_a_border_seat_is_worth_its_share(policy: str, factor: int):
     assert scores == pytest.approx(level * seen.grid.valid_share().ravel(), abs=1e-6)
 
 
-def test_what_lies_off_the_scene_does_not_count():
-    """Unsure pixels beyond the border change no score."""
-    seen, other = _glance(18, 20), _glance(18, 20)
-    other.probability[9:], other.probability[:, 10:] = [1, 0, 0, 0], [1, 0, 0, 0]
-    assert (score_seats("entropy", seen) == score_seats("entropy", other)).all()
-
-
-def test_policies_and_masks_that_do_not_fit_are_refused():
-    """The messages name the policies there are, the flag that is missing, and both sizes."""
-    with pytest.raises(SettingsError, match="unknown policy 'best'; choose one of gain, entropy, margin, sobel"):
-        score_seats("best", _glance())
-    unread = Glance(_glance().grid, np.zeros((8, 8, 2), np.float32), np.zeros((8, 8, 3), np.float32))
-    for policy in ("gain", "self-attention"):
-        with pytest.raises(SettingsError, match=f"'{policy}' asks the weights, and nothing was read"):
-            score_seats(policy, unread)
-    with pytest.raises(SettingsError, match="needs --mask"):
-        score_seats("mask", _glance())
-    with pytest.raises(ShapeError, match=r"mask is \(32, 47\) px, the scene is \(32, 48\)"):
-        score_seats("mask", _glance(), mask=np.ones((32, 47)))
-
-
 def _noise(shape: tuple[int, ...] = (40, 56, 5), seed: int = 0) -> NDArray[np.float64]:
     return np.random.default_rng(seed).random(shape)
-
-
-@both
-def test_an_odd_patch_stands_out(measure: Measure):
-    """The one bright patch holds the greatest saliency, and the ground at the median less than half of that."""
-    image = 0.01 * _noise((64, 80, 1))
-    image[30:34, 50:54] += 1
-    found = measure(image)
-    assert found.shape == (64, 80)
-    assert found[30:34, 50:54].max() == found.max()
-    assert np.median(found) < found.max() / 2
 
 
 @both
@@ -205,22 +150,6 @@ def test_brightness_does_not_count(measure: Measure):
 
 
 @both
-@pytest.mark.parametrize("level", [0.0, 0.3, -2e6])
-def test_an_image_without_contrast_is_flat(measure: Measure, level: float):
-    """Bands alike everywhere, but for rounding, give 0 everywhere, whatever their level."""
-    image = np.full((20, 30, 3), level) * (1 + 1e-9 * _noise((20, 30, 3)))
-    assert not measure(image).any()
-
-
-@both
-def test_a_band_without_contrast_adds_nothing(measure: Measure):
-    """Neither a plain band nor one in which nothing is finite changes the result."""
-    image = _noise()
-    more = np.concatenate([image, np.full((40, 56, 1), 7.0), np.full((40, 56, 1), np.nan)], axis=-1)
-    assert (measure(more) == measure(image)).all()
-
-
-@both
 def test_what_is_not_finite_takes_the_median(measure: Measure):
     """NaN and infinities do not spread: the result is that of their band's median in their place."""
     image, filled = _noise((41, 57, 1)), _noise((41, 57, 1))
@@ -229,43 +158,6 @@ def test_what_is_not_finite_takes_the_median(measure: Measure):
     found = measure(image)
     assert np.isfinite(found).all()
     np.testing.assert_allclose(found, measure(filled), atol=0.02)
-
-
-@both
-@pytest.mark.parametrize("shape", [(1, 1), (1, 2), (2, 1), (1, 37), (53, 1), (2, 2), (3, 5), (31, 7)])
-def test_any_size_will_do(measure: Measure, shape: tuple[int, int]):
-    """From one pixel on there is a finite number from 0 to 1 for each, the same every time."""
-    image = _noise((*shape, 2))
-    found = measure(image)
-    assert found.shape == shape
-    assert np.isfinite(found).all()
-    assert 0 <= found.min() <= found.max() <= 1
-    assert (measure(image) == found).all()
-
-
-@both
-def test_a_regular_pattern_leaves_no_nan(measure: Measure):
-    """A chessboard, of which most of the spectrum is exactly nothing, gives finite numbers."""
-    board = (np.indices((32, 32)).sum(axis=0) % 2)[..., None].astype(float)
-    assert np.isfinite(measure(board)).all()
-
-
-def test_grey_is_the_mean_of_bands_in_their_own_ranges():
-    """By hand: 0 and 1 stand for a band's ends, however wide it is; what is alike in all bands stays in its order."""
-    ramp = np.linspace(0, 1, 12).reshape(3, 4)
-    grey = grey_image(np.stack([ramp, 50 + 1000 * ramp], axis=-1))
-    assert grey == pytest.approx(ramp, abs=0.002)
-    assert grey_image(np.stack([ramp, -ramp], axis=-1)[:, :, :0]) is None
-
-
-def test_something_small_on_a_plain_ground_is_seen():
-    """Less than a thousandth of the pixels, the rest alike: the range is that of all values, not of percentiles."""
-    image = np.zeros((100, 100, 1))
-    image[40, 60] = 1e-3
-    grey = grey_image(image)
-    assert grey is not None
-    assert grey[40, 60] == 1
-    assert grey.sum() == 1
 
 
 def test_opencv_without_contrib_is_said(monkeypatch: pytest.MonkeyPatch):

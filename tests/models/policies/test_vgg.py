@@ -14,16 +14,14 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from models.network import sizes
-from models.network.sizes import AROUND_PX, BLOCK_PX, VggSizes, saliency_multiply_adds, stretches
+from models.network.sizes import VggSizes, saliency_multiply_adds
 from models.policies.policies import score_seats
 from models.policies.vgg import (
     PHOTO_MEAN,
     PHOTO_STD,
-    HalvingMaximum,
     VggFeatures,
     VggSaliency,
     channels_of,
-    close_ring,
     colours_of,
     common_names,
     input_gradient,
@@ -130,25 +128,6 @@ def test_blocks_join(monkeypatch: pytest.MonkeyPatch):
     assert (parts > 0).mean() > 0.9
 
 
-@pytest.mark.parametrize(("count", "size"), [(1, 48), (5, 48), (40, 80), (100, 144)])
-def test_a_ring_has_no_step(count: int, size: int):
-    """The lengthened axis keeps its pixels and closes with steps no larger than those it has, up to the fading."""
-    ramp = np.linspace(0, 1, count, dtype=np.float32)[:, None]
-    ring = close_ring(ramp, size)
-    assert ring.shape == (size, 1)
-    assert (ring[:count] == ramp).all()
-    steps = np.abs(np.diff(np.concatenate([ring, ring[:1]]), axis=0))
-    assert steps.max() <= 2 / max(count - 1, 1) + 2 / (size - count + 1)
-
-
-def test_the_gradient_is_at_hand_inside_inference_mode(saliency: VggSaliency):
-    """A caller that reads the glance without gradients gets the same saliency."""
-    seen = look(drawn(6, 16, 16, 4))
-    with torch.inference_mode():
-        inside = saliency(seen)
-    assert (inside == saliency(seen)).all()
-
-
 def trained(channels: int, wavelength_nm: tuple[float, ...] | None = None) -> VggFeatures:
     """A narrow network that reads some channels, as one that learned from data of one's own."""
     with torch.random.fork_rng(devices=[]):
@@ -178,14 +157,6 @@ def test_which_channels_a_trained_network_reads(tiny: Maker):
     assert own == pytest.approx((scene - normal.centre) / normal.spread, abs=1e-4)
     named = channels_of(weights, trained(3, (450.0, 550.0, 650.0)))  # the other way round than red, green, blue
     assert named == pytest.approx(colours_of(weights)[:, ::-1], abs=1e-6)
-
-
-def test_channels_that_the_weights_do_not_have_are_refused(tiny: Maker):
-    """The message says what came, what would do, and how wavelengths are named."""
-    with pytest.raises(WeightsError, match=r"reads 5 channels without saying which.* have 4 .* tensor 'wavelength_nm'"):
-        channels_of(tiny(), trained(5))
-    with pytest.raises(WeightsError, match=r"a channel .* is at 1650 nm, the segmenter's weights are for 400-1000 nm"):
-        channels_of(tiny(), trained(2, (500.0, 1650.0)))
 
 
 def test_a_network_that_is_missing_is_asked_for(tmp_path, tiny: Maker):
@@ -242,38 +213,6 @@ def test_a_trained_vgg_may_read_other_channels(tmp_path):
     assert report.skipped == {}
 
 
-@pytest.mark.parametrize("named", [torch.ones(4), torch.tensor([0.5] * 5), torch.full((5,), np.nan), torch.tensor(3.0)])
-def test_wavelengths_that_do_not_belong_to_the_channels_are_refused(tmp_path, named: Tensor):
-    """Another number of them, micrometres, or none at all: the message names file and tensor."""
-    state = VggFeatures(replace(NARROW, channels=5)).state_dict()
-    torch.save(state | {"wavelength_nm": named}, tmp_path / "v.pth")
-    with pytest.raises(WeightsError, match=r"v\.pth, tensor 'wavelength_nm': .*wavelength"):
-        load_vgg(tmp_path / "v.pth", NARROW, trained=True)
-
-
-@pytest.mark.parametrize("channels", [1, 4])
-def test_a_mixing_convolution_of_other_channels_is_no_vgg19(tmp_path, channels: int):
-    """The normalised variant begins with three colours; anything else there is refused, whoever trained it."""
-    state = {"0.weight": torch.ones(3, channels, 1, 1), "0.bias": torch.ones(3)}
-    for number, place in enumerate(NARROW.places):
-        layer = VggFeatures(NARROW).features[place]
-        state |= {f"{3 * number + 2}.weight": layer.weight, f"{3 * number + 2}.bias": layer.bias}
-    torch.save(state, tmp_path / "v.pth")
-    with pytest.raises(WeightsError, match=r"v\.pth (is no VGG19|lacks \d+ of 32)"):
-        load_vgg(tmp_path / "v.pth", NARROW, trained=True)
-
-
-def test_names_and_sizes_are_those_of_vgg19():
-    """Sixteen convolutions stand where torchvision has them; 20 024 384 numbers in all."""
-    sizes = VggSizes()
-    assert sizes.places == [0, 2, 5, 7, 10, 12, 14, 16, 19, 21, 23, 25, 28, 30, 32, 34]
-    with torch.device("meta"):
-        state = VggFeatures().state_dict()
-    assert set(state) == {f"features.{n}.{part}" for n in sizes.places for part in ("weight", "bias")}
-    assert sum(value.numel() for value in state.values()) == 20_024_384
-    assert state["features.28.weight"].shape == (512, 512, 3, 3)
-
-
 def test_it_computes_what_the_layers_say():
     """Away from borders the stack is convolutions, activations and 2 x 2 maxima, computed one after the other."""
     network, picture = narrow(), noise(1, 1, 3, 48, 32)
@@ -298,33 +237,6 @@ def test_the_gradient_is_that_of_finite_differences():
         assert float(gradient[0, channel, y, x]) == pytest.approx(float(difference), rel=1e-5, abs=1e-7)
 
 
-def test_equal_pixels_share_the_gradient():
-    """A flat 2 x 2 window gives each pixel a quarter; otherwise the largest takes all."""
-    flat = torch.zeros(1, 1, 2, 2, requires_grad=True)
-    HalvingMaximum()(flat).sum().backward()
-    assert flat.grad is not None
-    assert flat.grad.tolist() == [[[[0.25, 0.25], [0.25, 0.25]]]]
-    x = noise(0, 2, 3, 6, 4)
-    assert torch.equal(HalvingMaximum()(x), F.max_pool2d(x, 2))
-
-
-@pytest.mark.parametrize("level", [-1.0, 0.0, 0.7])
-def test_a_flat_picture_has_a_flat_gradient(level: float):
-    """Neither borders nor the lattice of maxima show where there is nothing to see."""
-    gradient = input_gradient(narrow(5), torch.full((1, 3, 48, 32), level))
-    spread = (gradient - gradient.mean(dim=(2, 3), keepdim=True)).abs().amax()
-    assert float(spread) <= 1e-4 * float(gradient.abs().amax())
-    assert float(gradient.abs().amax()) > 0
-
-
-@pytest.mark.parametrize("shift", [(16, 0), (0, -32), (32, 16)])
-def test_a_moved_picture_has_a_moved_gradient(shift: tuple[int, int]):
-    """On the ring a shift by places of the last level moves the gradient and changes nothing else."""
-    network, picture = narrow(2), noise(4, 1, 3, 64, 48)
-    moved = input_gradient(network, picture.roll(shift, (2, 3)))
-    torch.testing.assert_close(moved, input_gradient(network, picture).roll(shift, (2, 3)), rtol=1e-4, atol=1e-5)
-
-
 @pytest.mark.parametrize("channels", [1, 3, 24])
 def test_multiply_adds_are_those_torch_counts(channels: int):
     """The closed form counts forward and input gradient, blocks with their surroundings and closing included."""
@@ -336,19 +248,6 @@ def test_multiply_adds_are_those_torch_counts(channels: int):
             network(picture).sum().backward()
     assert counter.get_total_flops() / 2 == 2 * sizes.forward_multiply_adds * 64 * 80
     assert saliency_multiply_adds((32, 48), 7, channels) == counter.get_total_flops() / 2 + channels * 7 * 32 * 48
-
-
-@pytest.mark.parametrize("size", [1, 31, BLOCK_PX, BLOCK_PX + 1, 3 * BLOCK_PX - 5])
-def test_blocks_keep_every_pixel_once(size: int):
-    """Kept stretches follow each other from end to end, each with its surroundings, whose ends can be joined."""
-    parts = list(stretches(size))
-    assert max(part.kept_last - part.kept_first for part in parts) < BLOCK_PX + 16
-    assert [n for part in parts for n in range(part.kept_first, part.kept_last)] == list(range(size))
-    for part in parts:
-        assert part.first == max(0, part.kept_first - AROUND_PX)
-        assert part.last == min(size, part.kept_last + AROUND_PX)
-        assert part.closed(16) % 16 == 0
-        assert part.closed(16) >= part.last - part.first + AROUND_PX
 
 
 def normalised_variant(network: VggFeatures) -> tuple[dict[str, Tensor], Tensor, Tensor]:
@@ -376,26 +275,3 @@ def test_the_normalised_variant_is_joined():
     picture = noise(9, 1, 3, 32, 32)
     colours = picture * torch.tensor(PHOTO_STD)[:, None, None] + torch.tensor(PHOTO_MEAN)[:, None, None]
     torch.testing.assert_close(joined(picture), inner(F.conv2d(colours, mix, shift)), rtol=1e-3, atol=1e-4)
-
-
-def test_other_layouts_keep_or_get_their_names():
-    """The stack saved without its parent gets it; names of another network come back as they are."""
-    network = narrow()
-    bare = {name.removeprefix("features."): value for name, value in network.state_dict().items()}
-    assert list(common_names(bare, NARROW)) == list(network.state_dict())
-    other = {"blocks.0.weight": torch.zeros(2)}
-    assert common_names(other, NARROW) is other
-    assert common_names({"0.weight": torch.zeros(2)}, NARROW).keys() == {"0.weight"}
-
-
-@pytest.mark.parametrize("policy", ["vgg-static", "vgg-trained"])
-def test_detail_is_found(tiny: Maker, policy: str):
-    """A textured part of a flat scene scores above the parts without any, also in channels that colours do not show."""
-    weights, network = tiny(), trained(4) if policy == "vgg-trained" else narrow()
-    columns = np.zeros((64, 96, 4), np.float32)
-    columns[16:32, 64:80] = drawn(2, 16, 16, 4)
-    mixed = channels_of(weights, network) if policy == "vgg-trained" else colours_of(weights)
-    scores = score_seats(policy, look(columns), network=VggSaliency(network, mixed)).reshape(16, 24)
-    assert np.median(scores[4:8, 16:20]) > 2 * np.median(scores[:, :8])
-    with pytest.raises(SettingsError, match=f"'{policy}' needs --vgg FILE"):
-        score_seats(policy, look(columns))

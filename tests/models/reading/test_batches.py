@@ -7,8 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
 from models.network.layers import encode_packed
 from models.reading import inference
@@ -95,12 +93,6 @@ def test_a_kept_reading_counts_for_its_own_precision_place_and_weights_only(
     assert again == [0, 1, 1, 1, 1]
 
 
-def test_no_scenes_give_no_maps(tiny: Maker):
-    """Empty in, empty out."""
-    assert segment_batch(tiny(), [], [], []) == []
-    assert glance_batch(tiny(), []) == []
-
-
 def test_a_scene_that_cannot_be_is_refused_before_any_is_read(tiny: Maker, monkeypatch: pytest.MonkeyPatch):
     """A bad seat in the last scene stops the batch."""
     weights = tiny()
@@ -122,27 +114,3 @@ def test_packed_tokens_are_encoded_as_each_scene_alone(tiny: Maker):
             assert (own - alone[0]).abs().max() <= 1e-5
             assert (memory[-1][1] - kept[-1][1]).abs().max() <= 1e-5
             assert (after - encoder(tokens[None], kept)[0][0]).abs().max() <= 1e-5
-
-
-@given(st.lists(st.integers(0, 40), max_size=20), st.integers(1, 50))
-def test_packs_hold_every_scene_once_in_order(counts: list[int], most: int):
-    """No pack is empty, and none of several scenes has more patches than allowed."""
-    found = packs(counts, most)
-    assert [number for part in found for number in range(len(counts))[part]] == list(range(len(counts)))
-    for part in found:
-        assert part.stop > part.start
-        assert part.stop - part.start == 1 or sum(counts[part]) <= most
-
-
-@pytest.mark.parametrize("sizes", [{}, {"patch": 32, "factor": 4}, {"patch": 16, "factor": 4, "layers": 2}])
-def test_half_precision_stays_near(tiny: Maker, sizes: dict):
-    """Confidence within 2e-2 and 99.5 % of the classes; what is given out is float32 either way."""
-    weights = tiny(**sizes)
-    looks, patches, seats = _scenes(weights)
-    exact = segment_batch(weights, looks, patches, seats)
-    rough = segment_batch(weights, looks, patches, seats, precision="bfloat16")
-    assert {one.confidence.dtype for one in rough} == {np.dtype(np.float32)}
-    assert max(np.abs(a.confidence - b.confidence).max() for a, b in zip(exact, rough, strict=True)) <= 2e-2
-    same = np.concatenate([(a.classes == b.classes).ravel() for a, b in zip(exact, rough, strict=True)])
-    assert same.mean() >= 0.995
-    assert read_glance(weights, looks[0], precision="bfloat16").probability.dtype == np.float32

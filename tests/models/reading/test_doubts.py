@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from models.reading.doubts import SeatDoubts, doubt_of
-from pipeline.errors import ShapeError
 from pipeline.geometry.grid import SceneGrid
 
 GRID = SceneGrid(8, 12, 4, 1)
@@ -42,14 +41,6 @@ def test_a_look_is_worth_what_it_mends_of_each_class() -> None:
     assert worth[0] == pytest.approx(2 * worth[1])
 
 
-def test_of_doubts_a_share_comes_true() -> None:
-    """Where half do, half as many pixels are expected to be wrong, and a look mends less."""
-    strips = [(believed(0.6), np.zeros((8, 12)))]
-    whole, half = (SeatDoubts.of(strips, GRID, 3, come_true=share) for share in (1.0, 0.5))
-    assert half.expected_wrong() == pytest.approx(0.5 * whole.expected_wrong(), rel=whole.doubt[1] / whole.doubt[0] - 1)
-    assert 0 < half.worth(np.full(3, 0.1)).sum() < whole.worth(np.full(3, 0.1)).sum()
-
-
 def test_a_look_that_sees_worse_than_is_remembered_is_worth_nothing() -> None:
     """However much of the field it shows."""
     doubts = SeatDoubts.of([(believed(0.95), np.zeros((8, 12)))], GRID, 3)
@@ -69,11 +60,3 @@ def test_strips_say_what_the_whole_says(high: int, seed: int) -> None:
     assert np.array_equal(whole.age_days, parts.age_days)
     assert whole.pixels.sum() == 8 * 12
     assert 0 < whole.expected_wrong() <= 2 / 3 * whole.doubt[1] / whole.doubt[0]
-
-
-def test_a_belief_of_another_field_is_refused() -> None:
-    """Too few rows, or another width."""
-    with pytest.raises(ShapeError, match="4 rows, its field 8"):
-        SeatDoubts.of([(believed(0.9, shape=(4, 12)), np.zeros((4, 12)))], GRID, 3)
-    with pytest.raises(ShapeError, match="12 px wide"):
-        SeatDoubts.of([(believed(0.9, shape=(8, 9)), np.zeros((8, 9)))], GRID, 3)

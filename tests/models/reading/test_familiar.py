@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from models.reading.familiar import Familiar, Limits
-from pipeline.errors import ShapeError
 
 COLUMNS = 5
 
@@ -65,20 +64,6 @@ def test_the_distance_is_that_of_mahalanobis(seed: int, light: float, readings: 
     np.testing.assert_allclose(familiar.lit(light, readings).distance(pixels), wanted, rtol=2e-3, atol=1e-4)
 
 
-@settings(max_examples=10, deadline=None)
-@given(st.integers(0, 1000))
-def test_the_order_of_pixels_makes_no_difference(seed: int) -> None:
-    """Nor does the shape that they come in, nor how many come at once."""
-    lit = some_familiar().lit(0.5)
-    rng = np.random.default_rng(seed)
-    pixels = rng.normal(0, 60, (40, COLUMNS)).astype(np.float32)
-    order = rng.permutation(40)
-    plain = lit.distance(pixels)
-    np.testing.assert_allclose(lit.distance(pixels[order]), plain[order], rtol=1e-4)
-    np.testing.assert_allclose(lit.distance(pixels.reshape(5, 8, COLUMNS)).ravel(), plain, rtol=1e-4)
-    np.testing.assert_allclose(np.concatenate([lit.distance(pixels[:7]), lit.distance(pixels[7:])]), plain, rtol=1e-4)
-
-
 @pytest.mark.parametrize("light", [1.0, 0.1])
 def test_gaussian_spectra_lie_beyond_a_limit_as_often_as_chi_squared_says(light: float) -> None:
     """In the light that they are seen in: 1 % of them beyond what one in a hundred goes beyond."""
@@ -114,11 +99,3 @@ def test_limits_lie_between_those_that_were_measured() -> None:
     assert limits.at(0.5, 0.001, 2) == 6
     assert limits.at(0.1, 5.0, 8) == 5
     assert limits.at(0.001, 1.0, None) == 30
-
-
-def test_other_columns_are_refused() -> None:
-    """Of pixels, and of the components themselves."""
-    with pytest.raises(ShapeError, match="expected 5 columns"):
-        some_familiar().lit(1.0).distance(np.zeros((3, 4)))
-    with pytest.raises(ShapeError, match="covariances"):
-        some_familiar(read=np.eye(4))

@@ -9,10 +9,8 @@ import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812 - its usual name
 
-from models.network import segmenter
 from models.reading.inference import Glance, glance, look_coarsely, read_glance, segment
 from models.weights.files import Weights
-from pipeline.errors import ShapeError
 from pipeline.geometry.grid import SceneGrid
 from tests.models.conftest import Maker
 
@@ -48,14 +46,6 @@ def test_maps_have_the_size_of_the_scene(tiny: Maker, size: tuple[int, int], fac
         assert 1 / 3 - 1e-6 <= drawn.confidence.min() <= drawn.confidence.max() <= 1
 
 
-def test_a_glance_is_a_probability_of_each_class(tiny: Maker):
-    """Probabilities of every pixel of the padded coarse grid sum to 1."""
-    seen, _ = _look(tiny(), 37, 53)
-    assert seen.probability.shape == (24, 32, 3)
-    assert seen.columns.shape == (24, 32, 4)
-    assert seen.probability.sum(axis=-1) == pytest.approx(1, abs=1e-6)
-
-
 def test_without_a_seat_the_map_is_the_glance_brought_up(tiny: Maker):
     """Strips of rows join without a seam: the map is that of the whole image brought up at once."""
     weights = tiny(factor=4)
@@ -81,45 +71,6 @@ def test_patches_lie_at_their_seats(tiny: Maker):
     assert sorted(np.argsort(changed, axis=None)[-2:].tolist()) == [3, 12]
 
 
-def test_chunks_of_patches_make_no_difference(tiny: Maker, monkeypatch: pytest.MonkeyPatch):
-    """Patches go through in chunks for the caches; their size does not show."""
-    weights = tiny()
-    seen, fine = _look(weights, 32, 32)
-    whole = segment(weights, seen, fine, np.arange(16))
-    monkeypatch.setattr(segmenter, "PATCHES_AT_ONCE", 3)
-    pieces = segment(weights, seen, fine, np.arange(16))
-    assert np.abs(whole.confidence - pieces.confidence).max() <= 1e-5
-
-
-def test_pixels_without_a_value_count_as_their_patch(tiny: Maker):
-    """A dead coarse pixel reads as the mean of its patch's living ones, and leaves every other pixel as it is."""
-    weights, grid = tiny(), SceneGrid(30, 30, 8, 2)
-    values = np.random.default_rng(0).uniform(0.1, 0.5, (15, 15, 9))
-    clean = glance(weights, values, NM, grid)
-    values[3, 4], values[5, 5, 1:], values[9, 9] = np.nan, np.inf, np.nan
-    seen = glance(weights, values, NM, grid)
-    bad = np.zeros((15, 15), bool)
-    bad[[3, 5, 9], [4, 5, 9]] = True
-    expected = clean.columns[:8, :8][~bad[:8, :8]].mean(axis=0)
-    assert seen.columns[[3, 5], [4, 5]] == pytest.approx(np.stack([expected, expected]), abs=1e-5)
-    assert (seen.columns[:15, :15][~bad] == clean.columns[:15, :15][~bad]).all()
-    assert np.isfinite(seen.probability).all()
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_bad_pixels_of_a_patch_do_not_spread(tiny: Maker, bad: float):
-    """A patch with a dead pixel reads as with its mean there, one all dead as if it had not been captured."""
-    weights = tiny()
-    seen, fine = _look(weights, 32, 32)
-    broken = fine.copy()
-    broken[1, 2, 3, 0], broken[1, 2, 3, 1:], broken[2] = bad, 0, bad
-    fine[1, 2, 3] = np.delete(fine[1].reshape(64, -1), 2 * 8 + 3, axis=0).mean(axis=0)
-    clean = segment(weights, seen, fine[[0, 1, 3]], np.array([0, 1, 3]))
-    drawn = segment(weights, seen, broken[:4], np.arange(4))
-    assert (drawn.classes == clean.classes).all()
-    assert drawn.confidence == pytest.approx(clean.confidence, abs=1e-5)
-
-
 def test_other_bands_than_those_of_training_are_read(tiny: Maker):
     """Bands in any number and order go in; twice as many of the same light give nearly the same glance."""
     weights, grid = tiny(), SceneGrid(16, 16, 8, 2)
@@ -131,36 +82,6 @@ def test_other_bands_than_those_of_training_are_read(tiny: Maker):
     assert np.abs(few - many).max() < 0.01
 
 
-@pytest.mark.parametrize(
-    ("seats", "words"),
-    [([3, 5, 3], "seat 3 is given more than once"), ([2, 16], "seat 16 is none of the 16"), ([-1], "seat -1 is none")],
-)
-def test_seats_that_cannot_be_are_refused(tiny: Maker, seats: list[int], words: str):
-    """A seat given twice or lying off the grid is named."""
-    weights = tiny()
-    seen, fine = _look(weights, 32, 32)
-    with pytest.raises(ShapeError, match=words):
-        segment(weights, seen, fine[: len(seats)], np.array(seats))
-
-
-@pytest.mark.parametrize("shape", [(1, 8, 8, 4), (2, 8, 4, 4), (2, 8, 8, 5), (2, 8, 8)])
-def test_patches_of_another_shape_are_refused(tiny: Maker, shape: tuple[int, ...]):
-    """The message says the shape that two seats need."""
-    weights = tiny()
-    seen, _ = _look(weights, 32, 32)
-    with pytest.raises(ShapeError, match=r"expected patches of shape \(2, 8, 8, 4\)"):
-        segment(weights, seen, np.zeros(shape, np.float32), np.array([0, 1]))
-
-
-def test_mosaics_and_grids_that_do_not_fit_are_refused(tiny: Maker):
-    """The coarse mosaic must have the grid's size, the grid the weights' patches and factor."""
-    weights = tiny()
-    with pytest.raises(ShapeError, match=r"mosaic is \(9, 8\), the scene grid expects \(8, 8\)"):
-        glance(weights, np.zeros((9, 8, 9)), NM, SceneGrid(16, 16, 8, 2))
-    with pytest.raises(ShapeError, match="patches of 8 px at a factor of 2, the grid has 16 px and 4"):
-        glance(weights, np.zeros((4, 4, 9)), NM, SceneGrid(16, 16, 16, 4))
-
-
 @pytest.mark.parametrize("bands", [NM, NM[:3]])
 def test_a_look_in_strips_is_the_look_at_once(tiny: Maker, bands: np.ndarray):
     """Rows of the mosaic that come some at a time give the very same columns, with bands for all of them or not."""
@@ -170,14 +91,6 @@ def test_a_look_in_strips_is_the_look_at_once(tiny: Maker, bands: np.ndarray):
     parts = look_coarsely(weights, np.split(coarse, [1, 9]), bands, grid)
     assert (parts.columns == whole.columns).all()
     assert (read_glance(weights, parts).probability == whole.probability).all()
-
-
-@pytest.mark.parametrize("rows", [[7], [8, 1], []])
-def test_strips_that_do_not_make_the_mosaic_are_refused(tiny: Maker, rows: list[int]):
-    """Too few rows and too many are told with those expected."""
-    weights = tiny()
-    with pytest.raises(ShapeError, match=r"the scene grid expects \(8, 8\)"):
-        look_coarsely(weights, (np.zeros((count, 8, 9)) for count in rows), NM, SceneGrid(16, 16, 8, 2))
 
 
 @pytest.mark.parametrize("positions", ["2d", "paper"])

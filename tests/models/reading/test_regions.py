@@ -7,33 +7,10 @@ import pytest
 
 from models.network.sizes import SegmenterConfig
 from models.reading.regions import REGION_PX, Box, plan_regions, region_bytes, whole_field
-from pipeline.errors import ShapeError
 from pipeline.geometry.grid import SceneGrid
 
 SHARD = (64, 640)
 FIELDS = [(700, 1300, 16, 4), (2561, 90, 32, 4), (1000, 2000, 8, 4), (130, 1921, 32, 2), (64, 641, 16, 1)]
-
-
-@pytest.mark.parametrize("size", [(1, 1), (1024, 1280), (REGION_PX, REGION_PX), (REGION_PX - 3, 70)])
-@pytest.mark.parametrize("patch", [16, 32])
-def test_a_field_up_to_the_limit_is_one_region(size: tuple[int, int], patch: int):
-    """It is read whole, without a halo, at the origin of its own places."""
-    grid = SceneGrid(*size, patch, 4)
-    regions = plan_regions(grid, SHARD)
-    assert regions == [whole_field(grid)]
-    assert regions[0].grid == grid
-    assert regions[0].origin == (0, 0)
-    assert regions[0].coarse.shape == grid.coarse_shape
-    assert regions[0].kept_seats.shape == grid.seat_shape
-
-
-@pytest.mark.parametrize("side", [REGION_PX + 1, 4000, 10240])
-def test_a_larger_field_is_cut_evenly_below_the_limit(side: int):
-    """No region is above the limit, none below half of it."""
-    shapes = np.array([region.kept.shape for region in plan_regions(SceneGrid(side, side, 16, 4), SHARD)])
-    assert shapes.max() <= REGION_PX
-    assert shapes.min() >= REGION_PX // 4
-    assert len(shapes) == (-(-side // REGION_PX)) ** 2
 
 
 @pytest.mark.parametrize("field", FIELDS)
@@ -101,10 +78,3 @@ def test_memory_is_that_of_a_region_not_of_the_field():
     deep = SegmenterConfig(classes=3, layers=2 * config.layers)  # keys and values of 100 coarse patches and 500 fine
     more = region_bytes(deep, whole, 500, 270) - region_bytes(config, whole, 500, 270)
     assert more == 600 * 2 * 4 * config.layers * config.dim
-
-
-@pytest.mark.parametrize(("most", "halo"), [((0, 640), 1), ((64, 640), -1)])
-def test_regions_that_cannot_be_are_refused(most: tuple[int, int], halo: int):
-    """A region without pixels or a negative halo is named."""
-    with pytest.raises(ShapeError, match="at least 1 px and a halo of at least 0"):
-        plan_regions(SceneGrid(640, 640, 16, 4), SHARD, most_px=most, halo=halo)

@@ -29,7 +29,6 @@ from models.reading.remembered import (
     in_classes,
     recall,
 )
-from pipeline.errors import ShapeError
 
 CLASSES, COLUMNS, FACTOR = 3, 4, 4
 SHAPE = (24, 20)
@@ -212,15 +211,6 @@ def test_a_fresh_reader_weighs_both_witnesses_by_its_gates() -> None:
     np.testing.assert_allclose(np.exp(found), np.maximum(expected, math.exp(FAINTEST)), atol=1e-5)
 
 
-def test_other_sizes_are_refused() -> None:
-    """A memory of another field, or a reader for other classes, in a sentence."""
-    rng = np.random.default_rng(3)
-    with pytest.raises(ShapeError, match="both are of one field"):
-        recall(a_memory(rng, (8, 8)), a_look(rng), None)
-    with pytest.raises(ShapeError, match="classes and columns"):
-        recall(a_memory(rng), a_look(rng), MemoryReader(MemorySizes(CLASSES + 1, COLUMNS, FACTOR)))
-
-
 @given(seed=seeds, order=st.permutations(range(CLASSES)))
 def test_classes_find_their_numbers(seed: int, order: list[int]) -> None:
     """Brought to another order and back probabilities are the same, and NaN stays."""
@@ -230,12 +220,6 @@ def test_classes_find_their_numbers(seed: int, order: list[int]) -> None:
     np.testing.assert_allclose(there[1:], told[1:][..., order], atol=1e-6)
     np.testing.assert_allclose(in_classes(there, np.argsort(order).tolist()), told, atol=1e-5)
     assert np.isnan(there[0, 0]).all()
-
-
-def test_a_class_that_the_memory_lacks_is_as_likely_as_any() -> None:
-    """Of three classes one is new: a third, and what the others were goes into the rest."""
-    told = np.log(np.array([[[0.75, 0.25]]], np.float32))
-    np.testing.assert_allclose(np.exp(in_classes(told, [0, -1, 1]))[0, 0], [0.5625, 0.25, 0.1875], atol=1e-6)
 
 
 def test_another_field_is_known_by_its_agreement() -> None:
@@ -291,17 +275,6 @@ def test_a_field_under_snow_is_no_field_that_is_remembered() -> None:
     found = compare(memory, snow, recall(memory, snow, None), np.s_[:, :])
     assert found.agreement == 0
     assert found.is_of_another_field
-
-
-def test_parts_of_a_field_add_up() -> None:
-    """Comparisons of two halves are together that of the whole."""
-    rng = np.random.default_rng(12)
-    memory, look = a_memory(rng), a_look(rng)
-    after = recall(memory, look, None)
-    halves = [compare(memory, look, after, part) for part in (np.s_[:10, :], np.s_[10:, :])]
-    whole, added = compare(memory, look, after, np.s_[:, :]), halves[0] + halves[1]
-    np.testing.assert_array_equal(added.looked, whole.looked)
-    np.testing.assert_array_equal(added.changed, whole.changed)
 
 
 def test_a_seat_counts_its_pixels_of_another_class() -> None:

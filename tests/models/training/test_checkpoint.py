@@ -66,16 +66,6 @@ def test_another_run_starts_from_the_beginning(tmp_path: Path) -> None:
         assert steps[0] == 1
 
 
-def test_time_spent_counts_after_a_restart(tmp_path: Path) -> None:
-    """The minutes of a run are those of all its processes together."""
-    file, identity = tmp_path / "c", run_identity(CONFIG, [example()], SETTINGS)
-    about, tensors = left_behind(file, identity)
-    about["course"]["seconds"] = 60 * SETTINGS.minutes
-    save_checkpoint(file, identity, about, tensors)
-    _, summary = train(CONFIG, [example()], SHIFT, SETTINGS, checkpoint=file)
-    assert summary["steps"] == 3
-
-
 @pytest.mark.parametrize("damage", ["cut", "tensor", "description", "other", "empty", "earlier"])
 def test_a_damaged_checkpoint_is_refused(tmp_path: Path, damage: str) -> None:
     """Neither gone on from nor written over: one message says where it lies, and that deleting it begins anew."""
@@ -96,25 +86,6 @@ def test_a_damaged_checkpoint_is_refused(tmp_path: Path, damage: str) -> None:
         with pytest.raises(WeightsError, match=r"the state of training in .*/c cannot .*; bring back .* or del"):
             load_checkpoint(file, identity)
     assert file.read_bytes() == changed
-
-
-def test_training_beside_a_damaged_checkpoint_ends_with_its_name(tmp_path: Path) -> None:
-    """It does not begin anew in silence, and the file stays for whoever can mend it."""
-    file = tmp_path / "c"
-    with pytest.raises(KeyboardInterrupt):
-        train(CONFIG, [example()], SHIFT, SETTINGS, killed_after(4), checkpoint=file, keep_every_s=0)
-    raw = bytearray(file.read_bytes())
-    raw[-9] ^= 4
-    file.write_bytes(raw)
-    with pytest.raises(WeightsError, match="is not what was written; bring back a copy of it, or delete it to begin"):
-        train(CONFIG, [example()], SHIFT, SETTINGS, checkpoint=file)
-    assert file.read_bytes() == raw
-
-
-def test_a_checkpoint_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
-    """The message says where."""
-    with pytest.raises(WeightsError, match="cannot keep the state of training"):
-        save_checkpoint(tmp_path / "none" / "c", "x", {}, {"a": torch.ones(1)})
 
 
 def test_a_checkpoint_of_other_shapes_is_not_gone_on_from(tmp_path: Path) -> None:

@@ -59,12 +59,6 @@ def test_columns_that_repeat_each_other_have_a_covariance() -> None:
     np.testing.assert_allclose(centres[:, 2], 1)
 
 
-def test_too_few_spectra_are_refused() -> None:
-    """With how many there are and how many it takes."""
-    with pytest.raises(SceneError, match=r"150 labelled pixels are too few.*200"):
-        components(np.zeros((150, 3), np.float32), np.zeros(150, np.uint8), 0)
-
-
 def judged(sharpness: float, seed: int = 0) -> JudgedMap:
     """Maps whose labels are drawn from the probabilities, told ``sharpness`` times as sure as they are."""
     rng = np.random.default_rng(seed)
@@ -81,8 +75,3 @@ def test_a_map_too_sure_of_itself_gets_the_temperature_that_it_lacks() -> None:
     assert told["temperature"] == pytest.approx(2.5, rel=0.1)
     assert told["expected_error"] < 0.02 < told["expected_error_before"]
     assert fitted_temperature([judged(0.5, 1)], 0) == pytest.approx(0.5, rel=0.1)
-
-
-def test_a_map_that_is_right_about_itself_is_left_alone() -> None:
-    """No temperature, and the error as it is."""
-    assert set(judge_confidence([judged(1.0)], seed=0)) == {"scenes", "expected_error"}

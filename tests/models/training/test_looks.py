@@ -45,13 +45,6 @@ def test_more_light_and_more_samples_are_less_noise(light: float, samples: int) 
     assert (np.diag(noise.covariance(spectrum, 2 * light, samples)) < one / 2).all()
 
 
-def test_dark_pixels_have_the_readings_noise_alone() -> None:
-    """Values below 0, which noise itself makes, add nothing to it."""
-    noise = _noise()
-    found = noise.variance(np.full((2, 12), -0.1), 0.5)
-    np.testing.assert_array_equal(found, np.tile(np.diag(noise.read) / 0.25, (2, 1)))
-
-
 def test_whitening_leaves_alone_what_noise_hides() -> None:
     """A direction whose variance noise exceeds is made smaller, by what noise adds; others stay as they are."""
     rng = np.random.default_rng(1)
@@ -103,16 +96,6 @@ def test_a_scan_in_full_light_shows_the_scene_as_wide_as_its_lines(step: int) ->
     inner = slice(2 * step, -2 * step)
     np.testing.assert_allclose(fine[inner], plain[inner], atol=2e-3)
     np.testing.assert_allclose(means, plain.reshape(16, 4, 2, 4, 12).mean(axis=(1, 3)), atol=2e-3)
-
-
-def test_looks_drawn_have_the_shapes_of_the_crop_and_follow_their_seed() -> None:
-    """Every draw fits the network's crop; the same generator draws the same look."""
-    looks, normalisation = _looks()
-    fine, coarse = _flat(normalisation, 0.3, (32, 32)), _flat(normalisation, 0.3, (8, 8))
-    for seed in range(20):
-        one, other = (looks.draw(fine, coarse, _noise(), 4, np.random.default_rng(seed)) for _ in range(2))
-        assert [part.shape for part in one] == [fine.shape, coarse.shape]
-        assert all(np.array_equal(a, b) and np.isfinite(a).all() for a, b in zip(one, other, strict=True))
 
 
 def test_a_coarse_pass_is_read_as_often_as_it_has_samples() -> None:

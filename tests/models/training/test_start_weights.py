@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import save_file
 from torch import Tensor
 
 from models.network.segmenter import Segmenter
@@ -212,13 +211,6 @@ def test_files_of_no_known_kind_are_refused(tmp_path: Path):
         StartFile(saved(tmp_path / "nan.pth", broken)).begin(CONFIG, BASIS, PLAIN, NAMES)
 
 
-def test_transformers_are_read_from_safetensors(tmp_path: Path):
-    """With the licence that stands beside the tensors."""
-    save_file(transformer(1), tmp_path / "v.safetensors", {"format": "pt", "license": "cc-by-4.0"})
-    start = StartFile(tmp_path / "v.safetensors").begin(CONFIG, BASIS, PLAIN, NAMES)
-    assert (start.record["matched"], start.record["licence"]) == (14, "cc-by-4.0")
-
-
 def _kept(weights: Weights, path: Path) -> StartFile:
     save_weights(weights, path)
     return StartFile(path)
@@ -251,15 +243,6 @@ def test_other_classes_leave_their_heads_fresh(tmp_path: Path, tiny: Maker):
         assert not any(name.split(".")[0] in fresh for name in start.state)
 
 
-def test_the_licence_goes_on(tmp_path: Path, tiny: Maker):
-    """Weights begun from some with a licence pass it on to what is begun from them."""
-    weights = with_record(tiny(), begun_from={"file": "x", "licence": "CC BY-NC"})
-    start = _kept(weights, tmp_path / "w.safetensors").begin(
-        weights.config, weights.basis, weights.normalisation, weights.class_names
-    )
-    assert start.record["licence"] == "CC BY-NC"
-
-
 def test_other_columns_are_reached_by_wavelength(tmp_path: Path, tiny: Maker):
     """First kernels are brought to the new number of columns and are no larger; the report says so."""
     weights = tiny(3)
@@ -288,14 +271,6 @@ def test_a_change_of_columns_is_exact_for_the_same_wavelengths():
     found = other.apply(pixels, every) @ change
     assert found == pytest.approx(one.apply(pixels, every), rel=1e-3, abs=1e-3)
     assert column_change(BASIS, one, BASIS, one) == pytest.approx(np.eye(4), abs=1e-5)
-
-
-def test_a_change_of_wavelengths_keeps_what_is_alike_everywhere():
-    """A spread more of light in every new column is a spread more in every old one, however many there are."""
-    small = SpectralBasis(500.0, 800.0, 2)
-    plain = Normalisation(np.zeros(2, np.float32), np.ones(2, np.float32), np.eye(2, dtype=np.float32))
-    assert np.ones(2) @ column_change(BASIS, PLAIN, small, plain) == pytest.approx(np.ones(4), abs=1e-6)
-    assert np.ones(4) @ column_change(small, plain, BASIS, PLAIN) == pytest.approx(np.ones(2), abs=1e-6)
 
 
 def test_kernels_for_the_same_data_say_what_they_said(tmp_path: Path, tiny):

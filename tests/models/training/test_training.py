@@ -9,25 +9,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from models.network.controls import build_network
 from models.network.segmenter import Segmenter
 from models.network.sizes import PRESETS, Preset, SegmenterConfig
 from models.training import objective
 from models.training import train as training
 from models.training.examples import CropSampler
-from models.training.objective import (
-    PHASES,
-    SHARES,
-    batch_loss,
-    class_weights,
-    draw_paper_seats,
-    draw_seats,
-    map_loss,
-    phase_at,
-    pixel_losses,
-)
-from models.training.train import Progress, TrainingError, TrainingSettings, rate_at, train
-from pipeline.errors import PipelineError, WeightsError
+from models.training.objective import batch_loss, class_weights, draw_seats, map_loss, phase_at, pixel_losses
+from models.training.train import Progress, TrainingSettings, rate_at, train
 from tests.models.conftest import block_example
 
 CONFIG = SegmenterConfig(classes=3, columns=2, patch=8, factor=2, width=8, dim=16, layers=1, heads=2)
@@ -78,15 +66,6 @@ def test_batches_are_halved_where_crops_grow(crop: int, last: tuple[int, int]):
     assert sizes == [(4, crop), last]
 
 
-def test_progress_runs_to_the_end():
-    """Every step reports itself and how far the run is, by steps here."""
-    seen: list[Progress] = []
-    train(CONFIG, [block_example()], SHIFT, replace(SETTINGS, minutes=1e6), seen.append)
-    assert [now.step for now in seen] == [1, 2, 3, 4, 5, 6]
-    assert [now.done for now in seen] == pytest.approx([step / 6 for step in range(6)], abs=1e-6)
-    assert all(np.isfinite(now.loss) for now in seen)
-
-
 def test_minutes_end_a_run(monkeypatch: pytest.MonkeyPatch):
     """A run over its time stops, and the summary counts the steps that were taken."""
     clock = iter(range(0, 10_000, 30))
@@ -95,35 +74,6 @@ def test_minutes_end_a_run(monkeypatch: pytest.MonkeyPatch):
     _, summary = train(CONFIG, [block_example()], SHIFT, replace(SETTINGS, steps=1000, minutes=2.5), seen.append)
     assert len(seen) == summary["steps"] == 3
     assert seen[-1].done == pytest.approx(0.8)
-
-
-def _spoilt(monkeypatch: pytest.MonkeyPatch, bad: set[int], value: float = float("nan")) -> None:
-    """Let the loss of the numbered steps be a number that is none."""
-    calls = iter(range(1, 1000))
-
-    def spoilt(*args: object, **flags: bool) -> Tensor:
-        loss = batch_loss(*args, **flags)  # type: ignore[arg-type]
-        return loss * value if next(calls) in bad else loss
-
-    monkeypatch.setattr(training, "batch_loss", spoilt)
-
-
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_steps_without_a_finite_loss_are_skipped(monkeypatch: pytest.MonkeyPatch, value: float):
-    """Two bad steps in a row are counted and leave finite weights and a finite loss to report."""
-    _spoilt(monkeypatch, {1, 3, 4}, value)
-    model, summary = train(CONFIG, [block_example()], SHIFT, SETTINGS)
-    assert summary["skipped_steps"] == 3
-    assert np.isfinite(summary["last_loss"])
-    assert all(parameter.isfinite().all() for parameter in model.parameters())
-
-
-def test_three_bad_steps_in_a_row_end_training(monkeypatch: pytest.MonkeyPatch):
-    """The message names the steps and what to do; the command line shows it as any other error."""
-    _spoilt(monkeypatch, {2, 3, 4})
-    with pytest.raises(TrainingError, match="not finite in steps 2 to 4; lower the learning rate"):
-        train(CONFIG, [block_example()], SHIFT, SETTINGS)
-    assert issubclass(TrainingError, PipelineError)
 
 
 def test_a_gradient_that_is_none_is_no_step():
@@ -155,17 +105,6 @@ def test_rare_classes_weigh_more():
     assert class_weights([replace(block_example(), labels=labels)], 3, 2.0).max() == 2
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_drawn_seats_are_distinct(seed: int):
-    """One of the shares is bought in every scene of a batch, no seat twice."""
-    glance = torch.randn(3, 3, 32, 32, generator=torch.Generator().manual_seed(seed))
-    seats = draw_seats(glance, torch.zeros(3, 64), CONFIG, np.random.default_rng(seed), phase_at(0.0))
-    assert seats.shape[1] in {max(1, round(64 * share)) for share, _ in SHARES}
-    assert all(len(row.unique()) == len(row) for row in seats)
-    assert seats.min() >= 0
-    assert seats.max() < 64
-
-
 def test_seats_are_drawn_where_the_glance_is_unsure_or_anywhere():
     """Half of the draws go by entropy: its seats come first there, and by chance elsewhere."""
     glance = torch.zeros(1, 3, 32, 32)
@@ -192,22 +131,6 @@ def test_late_in_a_run_the_scorer_places_seats_too():
 
     assert first(0.0) < 0.1
     assert 0.2 < first(0.9) < 0.6
-
-
-def test_phases_follow_each_other():
-    """Every part of a run has a phase, with odds that add up to 1."""
-    assert [phase_at(done).until for done in (0.0, 0.49, 0.5, 0.7, 1.0, 1.2)] == [0.5, 0.5, 0.7, 1.0, 1.0, 1.0]
-    assert all(phase.random + phase.entropy + phase.gain == pytest.approx(1) for phase in PHASES)
-    assert sum(odds for _, odds in SHARES) == pytest.approx(1)
-
-
-def test_a_perfect_map_loses_nothing():
-    """Sure and right predictions have no loss, with soft Dice neither; sure and wrong ones a large one."""
-    labels = torch.randint(0, 3, (2, 16, 16), generator=torch.Generator().manual_seed(0))
-    logits = torch.nn.functional.one_hot(labels, 3).permute(0, 3, 1, 2) * 40.0
-    for soft_dice in (False, True):
-        assert map_loss(logits, pixel_losses(logits, labels), labels, torch.ones(3), soft_dice=soft_dice) < 0.01
-        assert map_loss(-logits, pixel_losses(-logits, labels), labels, torch.ones(3), soft_dice=soft_dice) > 5
 
 
 def test_unlabelled_pixels_have_no_say():
@@ -244,37 +167,3 @@ def test_the_scorer_is_told_of_labelled_seats_alone(monkeypatch: pytest.MonkeyPa
     score, gain, known = told[0]
     assert score.shape == gain.shape == known.shape
     assert known.tolist() == [[False, True, False, False]]
-
-
-def test_a_start_that_has_no_place_is_refused():
-    """A tensor of another network is not passed over in silence."""
-    with pytest.raises(WeightsError, match=r"two-scale has no place for 1 tensors, the first encoder\.extra"):
-        train(CONFIG, [block_example()], SHIFT, SETTINGS, start={"encoder.extra": torch.zeros(1)})
-
-
-@pytest.mark.parametrize("preset", ["dense", "coarser", "upsampled"])
-def test_dense_controls_draw_no_chance(preset: Preset):
-    """They read each seat, whatever the generator says: two streams give one loss."""
-    batch = CropSampler([block_example(64, 16)], 8, 2, 32).draw(2, np.random.default_rng(0), SHIFT)
-    model, streams = build_network(replace(CONFIG, **PRESETS[preset])), map(np.random.default_rng, (0, 1))
-    first, other = (batch_loss(model, batch, torch.ones(3), rng, phase_at(0.0), soft_dice=True) for rng in streams)
-    assert first == other
-    assert first.requires_grad
-
-
-def test_paper_seats_are_distinct_and_sometimes_none():
-    """Every share of the segmenter's training occurs, no seat twice in a scene; some crops get no seat."""
-    coarse = torch.randn(3, 2, 32, 32, generator=torch.Generator().manual_seed(0))
-    drawn = [draw_paper_seats(coarse, 64, CONFIG, np.random.default_rng(seed)) for seed in range(80)]
-    assert {row.shape[1] for row in drawn} == {0, *(round(64 * share) for share, _ in SHARES)}
-    assert all(len(scene.unique()) == len(scene) for row in drawn for scene in row)
-    assert {int(row.max()) for row in drawn if row.numel()} <= set(range(64))
-
-
-def test_half_of_the_papers_seats_lie_on_edges():
-    """With one edge in the coarse image, about half of the draws begin with a seat that touches it."""
-    coarse = torch.zeros(1, 2, 32, 32)
-    coarse[..., 18:] = 1.0  # an edge between columns 17 and 18: seats of column 4
-    drawn = (draw_paper_seats(coarse, 64, CONFIG, np.random.default_rng(seed)) for seed in range(80))
-    first = [int(row[0, 0]) % 8 == 4 for row in drawn if row.numel()]
-    assert 0.35 < np.mean(first) < 0.75

@@ -56,12 +56,6 @@ def test_wrappers_are_opened(tmp_path: Path, content: dict[str, Any]):
     assert all(torch.equal(found[name], value) for name, value in STATE.items())
 
 
-def test_safetensors_are_read(tmp_path: Path):
-    """The same tensors from the format that cannot hold anything else."""
-    save_file(STATE, tmp_path / "w.safetensors")
-    assert read_state(tmp_path / "w.safetensors").keys() == STATE.keys()
-
-
 @pytest.mark.parametrize("how", ["torch", "pickle"])
 def test_python_objects_are_refused_unread(tmp_path: Path, how: str):
     """A file with an object that would run code is refused, and the code does not run."""

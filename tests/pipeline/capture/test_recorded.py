@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.capture.recorded import RecordedSource, RecordedSweep, line_runs, nearest_line, sum_references
-from pipeline.errors import NotRecordedError, SceneError, ShapeError
+from pipeline.capture.recorded import RecordedSweep, nearest_line, sum_references
+from pipeline.errors import NotRecordedError
 from pipeline.geometry.camera import bin_samples
 from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.source import Line, References
@@ -216,18 +216,6 @@ def test_finer_lines_than_were_recorded_are_refused() -> None:
             recorded_source(source, [record(source, one)]).pick(Sweep("fine-0", "fine", "x", 0.0, -9.5, 4))
 
 
-def test_sizes_that_do_not_fit_are_refused() -> None:
-    """No sweep, lines of other samples than the camera's, and columns of other lengths than the sweep."""
-    source = simulated()
-    one = record(source, FULL)
-    with pytest.raises(SceneError, match="holds no sweep"):
-        recorded_source(source, [])
-    with pytest.raises(SceneError, match=r"lines of \(64, 3\) \(sample, band\), and a camera of 640 samples"):
-        RecordedSource([one], replace(CAMERA, samples=640), source.wavelength_nm, (80, 64))
-    with pytest.raises(ShapeError, match="time_s is of 79 lines, not 80"):
-        replace(one, time_s=one.time_s[:-1])
-
-
 @given(st.lists(st.integers(-300, 300), min_size=1, unique=True), st.floats(-40, 40))
 def test_nearest_line_is_nearest(tenths: list[int], wanted: float) -> None:
     """No other line lies nearer, whatever the order of the lines."""
@@ -235,17 +223,6 @@ def test_nearest_line_is_nearest(tenths: list[int], wanted: float) -> None:
     near, distance = nearest_line(scan, np.array([wanted]))
     assert distance[0] == abs(scan[near[0]] - wanted)
     assert distance[0] <= np.abs(scan - wanted).min() + 1e-6
-
-
-def test_of_two_equally_near_lines_the_lower_counts() -> None:
-    """Rounding does not decide: a distance that differs by 1e-9 px is equal."""
-    scan = np.array([1.0, 2.0 - 1e-9, 0.0])
-    assert nearest_line(scan, np.array([1.5, 0.5]))[0].tolist() == [0, 2]
-
-
-def test_line_runs_are_what_follows_each_other() -> None:
-    """Hand-worked runs, half open."""
-    assert line_runs(np.array([0, 1, 2, 5, 7, 8])) == [(0, 3), (5, 6), (7, 9)]
 
 
 def test_sums_of_references() -> None:

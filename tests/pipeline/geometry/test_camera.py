@@ -132,10 +132,3 @@ def test_a_look_is_the_mean_of_footprints_over_the_smear():
     coarse = look(electrons, camera, step=4)
     blocks = fine.reshape(4, 4, 6, 4, 3).mean(axis=(1, 3))
     assert coarse == pytest.approx(blocks, abs=1.0)
-
-
-@pytest.mark.parametrize("shape", [(10, 12, 1), (12, 10, 1)])
-def test_a_scene_that_does_not_divide_is_refused(shape: tuple[int, ...]):
-    """The message says the size, the step, and to pad first."""
-    with pytest.raises(ShapeError, match=rf"{shape[0]}, {shape[1]}\) px does not divide by the step 4; pad it first"):
-        look(np.zeros(shape), CAMERA, step=4)

@@ -52,10 +52,3 @@ def test_reflection_repeats_with_its_period(size: int, more: int):
     grown = pad_by_reflection(np.arange(size)[:, None], (size + more, 1))[:, 0]
     place = np.arange(size + more) % (2 * size - 2)
     assert grown.tolist() == np.where(place < size, place, 2 * size - 2 - place).tolist()
-
-
-def test_a_single_pixel_is_repeated():
-    """Where reflection has nothing to show, the edge pixel is repeated; further axes are left alone."""
-    grown = pad_by_reflection(np.full((1, 2, 3), 7), (4, 3))
-    assert grown.shape == (4, 3, 3)
-    assert np.all(grown == 7)

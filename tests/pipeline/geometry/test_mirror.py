@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import PoseError, SettingsError, ShapeError
+from pipeline.errors import PoseError, SettingsError
 from pipeline.geometry.mirror import (
     Axes,
     Mounting,
@@ -141,21 +141,6 @@ def test_scene_tangents_and_directions_are_inverse(xi: float, eta: float):
     assert direction_to_scene(scene_to_direction([xi, eta])) == pytest.approx([xi, eta], abs=1e-15)
 
 
-def test_wrong_shapes_and_lengths_are_refused():
-    """A vector of the wrong size or length says so."""
-    with pytest.raises(ShapeError, match="needs 2 numbers"):
-        position_to_normal([0.0, 0.0, 1.0])
-    with pytest.raises(PoseError, match="not of length 1"):
-        direction_to_normal([2.0, 0.0, 0.0])
-    with pytest.raises(PoseError, match="looks away"):
-        direction_to_scene([-1.0, 0.0, 0.0])
-
-
-def test_no_positions_give_no_directions():
-    """Empty in, empty out, with the shape kept."""
-    assert position_to_direction(np.zeros((0, 4, 2))).shape == (0, 4, 3)
-
-
 @given(st.sampled_from(get_args(Axes)), st.floats(-5, 5), st.floats(-0.05, 0.05), st.floats(0, 0.9), st.floats(0, 7))
 def test_to_device_and_back_is_the_identity(axes: str, clocking: float, offset: float, radius: float, angle: float):
     """Any mounting is undone to rounding, anywhere that both disks hold."""
@@ -170,11 +155,6 @@ def test_axes_are_assigned_as_told():
     swapped = np.array([[0.1, -0.3], [0.5, 0.2], [0.0, 0.0]])
     assert Mounting(axes="y,-x").to_device(many) == pytest.approx(swapped)
     assert Mounting().to_device(many).tobytes() == Mounting().to_model(many).tobytes() == many.tobytes()
-
-
-def test_clocking_turns_from_x_to_y():
-    """A quarter turn takes X to Y."""
-    assert Mounting(clocking_deg=90).to_device([0.5, 0.0]) == pytest.approx([0, 0.5], abs=1e-15)
 
 
 def test_what_the_device_would_clamp_is_refused():

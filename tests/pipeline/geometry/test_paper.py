@@ -331,12 +331,6 @@ def test_line_models_err_as_tabulated(field_deg: float, px: tuple[float, ...]):
     assert errors[4] == 0
 
 
-def test_an_unknown_line_model_is_refused():
-    """The message names those there are."""
-    with pytest.raises(ValueError, match="one of L0, L1, L2, L3, L4, got 'L5'"):
-        line_points("L5", 0.0, np.zeros(1), CAMERA)
-
-
 def test_lines_turn_and_stretch_over_the_field():
     """10240 x 10240 px: psi is 14.5 deg on average and 37.0 at most, mean tan 0.265; lines stretch by up to 1.26."""
     side = np.linspace(-5120, 5120, 257)

@@ -168,13 +168,6 @@ def test_ends_are_converted_in_one_place(ends: str, expected: tuple[int, int]):
     assert device_range((0, 1450), ends) == expected
 
 
-@pytest.mark.parametrize("cells", [(3, 3), (5, 2), (-1, 4)])
-def test_empty_ranges_are_refused(cells: tuple[int, int]):
-    """With inclusive ends an empty range has no form at all."""
-    with pytest.raises(SettingsError, match="half-open range"):
-        device_range(cells, "inclusive")
-
-
 def test_a_line_that_no_load_holds_is_refused():
     """More positions in a line than the memory has."""
     for layout in (memory_loads, count_loads):

@@ -9,17 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from odc.geo.geobox import GeoBox
 
-from pipeline.errors import PoseError, ShapeError
+from pipeline.errors import PoseError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.ground.field_places import (
     NoPlace,
     PlacedPicture,
     PosedField,
     areas_by_number,
-    field_of_view_deg,
     footprint_of,
-    scale_of_angles,
-    scale_of_pixels,
     scale_of_view,
 )
 from pipeline.ground.georeference import class_areas_m2
@@ -53,8 +50,6 @@ def test_numbers_outside_are_left_out_and_unknown_ground_is_none() -> None:
     assert found is not None
     assert found.tolist() == [0.5, 0.25]
     assert areas_by_number(NoPlace((2, 3)), numbers, 2) is None
-    with pytest.raises(ShapeError, match=r"field of \(2, 3\) px \(y, x\), got \(3, 2\)"):
-        areas_by_number(NoPlace((2, 3)), numbers.T, 2)
 
 
 def looking(tilt_deg: float, *, heading_deg: float = 30.0, roll_deg: float = 0.0, height_m: float = 12.0) -> GroundView:
@@ -106,21 +101,6 @@ def test_a_view_of_the_horizon_ends_where_the_map_does():
     found = footprint_of(looking(1), (800, 400))
     assert np.isfinite(found.outline_m).all()
     assert found.range_m[2] < 100 * 12 / np.tan(np.deg2rad(1))
-
-
-def test_without_a_place_there_are_degrees_alone():
-    """Who knows no distance gets pixels and angles, and no hectares."""
-    found = scale_of_angles((512, 640), IFOV)
-    assert found.view_deg == field_of_view_deg((512, 640), IFOV)
-    assert found.view_deg[1] == pytest.approx(np.rad2deg(2 * np.arctan(0.032)))
-    assert (found.pixel_m, found.hectares, found.hectares_per_hour(10)) == (None,) * 3
-
-
-def test_a_picture_with_a_pixel_size_has_its_area():
-    """A georeferenced scene of 100 x 200 px of half a metre is half a hectare."""
-    found = scale_of_pixels((100, 200), IFOV, 0.5)
-    assert found.hectares == pytest.approx(0.5)
-    assert found.hectares_per_hour(0) is None
 
 
 def test_a_rig_that_looks_up_has_no_footprint():

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from odc.geo.geobox import GeoBox
 
 from pipeline.geometry.grid import SceneGrid, seat_pixels
-from pipeline.ground.georeference import class_areas_m2, georeference_record, pixel_side_m, zoomed_out
+from pipeline.ground.georeference import class_areas_m2, pixel_side_m, zoomed_out
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")
 PLACES = {32632: (8.0, 51.0), 3857: (8.0, 60.0), 3035: (8.0, 51.0), 4326: (8.0, 51.0), 2263: (-74.0, 40.7)}
@@ -67,13 +67,6 @@ def test_a_coarser_grid_begins_at_the_same_corner(height: int, width: int, facto
             for t, row, column in ((coarse.affine, y, x), (fine.affine, y * factor, x * factor))
         )
         np.testing.assert_allclose(there, wanted, atol=1e-6)
-
-
-def test_a_scene_without_a_place_has_none_in_its_keys() -> None:
-    """So that its stores are found again; with one, CRS and transform are there."""
-    assert georeference_record(None) == {}
-    record = georeference_record(box(32632, 0.5, 0))["georeference"]
-    assert (record["crs"], record["transform"][0]) == ("EPSG:32632", 0.5)
 
 
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(1, 9), st.integers(1, 3), st.integers(0, 2**32 - 1))

@@ -14,7 +14,6 @@ from pipeline.ground.map_grid import (
     GroundGrid,
     ground_grid,
     image_at,
-    map_blocks,
     median_footprint_m,
     median_sink,
     nearest_at,
@@ -107,14 +106,6 @@ def test_resolution_is_the_median_footprint_rounded():
     assert ground_grid(rig, (200, 200), resolution_m=0.0123).geobox.resolution.x == pytest.approx(0.0123)
 
 
-@given(st.floats(1e-4, 1e3))
-def test_rounding_keeps_the_order_and_is_idempotent(step: float):
-    """A rounded step is its own rounding, within a ratio of 1.16 of what came."""
-    rounded = round_step(step)
-    assert round_step(rounded) == rounded
-    assert max(rounded / step, step / rounded) < 1.16
-
-
 def test_grids_of_two_days_share_their_pixels():
     """A rig moved by a metre has another map, with pixels at the same multiples of the resolution."""
     here, there = (ground_grid(view(lat_deg=52.1 + shift), (90, 90)) for shift in (0.0, 1e-5))
@@ -140,15 +131,6 @@ def test_a_resolution_too_fine_for_memory_is_refused():
     """The message names the finest that goes, and the median footprint."""
     with pytest.raises(PoseError, match=r"resolution_m = 1e-05 .* 64 times the scene's .*; use 0\.\d+ or more"):
         ground_grid(view(), (100, 100), resolution_m=1e-5)
-
-
-def test_blocks_cover_the_map_once():
-    """Each pixel lies in one block, and blocks start at multiples of their size."""
-    seen = np.zeros((70, 45), int)
-    for rows, columns in map_blocks((70, 45), (32, 20)):
-        assert rows.start % 32 == columns.start % 20 == 0
-        seen[rows, columns] += 1
-    assert (seen == 1).all()
 
 
 def test_the_nearest_pixel_is_read_and_no_other():
@@ -183,9 +165,3 @@ def test_images_are_read_between_their_own_pixels():
     ramp[0, 0] = np.nan
     assert np.isnan(image_at(ramp, np.array([[[1.5, 1.5]]]), factor=4)).all()
     assert image_at(ramp, np.array([[[1.5, 5.5]]]), factor=4)[0, 0, 0] == pytest.approx(8.5)
-
-
-def test_an_image_without_bands_is_refused():
-    """The message says what axes an image has."""
-    with pytest.raises(ShapeError, match=r"axes \(y, x, band\), got shape \(4, 4\)"):
-        image_at(np.zeros((4, 4), np.float32), np.zeros((1, 1, 2)))

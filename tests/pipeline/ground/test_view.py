@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyproj import Geod, Proj
 
-from pipeline.errors import PoseError, ShapeError
+from pipeline.errors import PoseError
 from pipeline.ground.map_grid import MapFrame, default_epsg, map_crs
-from pipeline.ground.view import LEAST_SINK, GroundView, RigPose, pixel_places
+from pipeline.ground.view import GroundView, RigPose, pixel_places
 from pipeline.setting_fields import span_of
 
 IFOV = 7.4e-3 / 70
@@ -138,20 +138,6 @@ def test_height_or_range_but_not_both():
             view(**said)
 
 
-def test_points_need_two_numbers():
-    """A scene point is a pair; ground that is no scene's is refused by its shape."""
-    with pytest.raises(ShapeError, match=r"y and x on the last axis, got shape \(3,\)"):
-        view().scene_to_ground([1, 2, 3])
-
-
-def test_all_ground_is_counted_to_the_pixel():
-    """The count follows the closed form row by row, in blocks."""
-    rig = view(tilt_deg=3, roll_deg=7)
-    y, x = pixel_places((700, 90))
-    inside = rig.sink(np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1)) > LEAST_SINK
-    assert rig.count_ground((700, 90)) == np.count_nonzero(inside)
-
-
 def frame(lon: float = 9.5, lat: float = 52.1, epsg: int | None = None, **more: float) -> MapFrame:
     """A map around a rig at the place, 100 m up and looking down at 45 deg."""
     pose = RigPose(lon_deg=lon, lat_deg=lat, height_m=100.0, heading_deg=40.0, tilt_deg=45.0, **more)
@@ -265,8 +251,3 @@ def test_the_map_has_its_own_scale(place: dict[str, float], square_m2: float):
     origin, east, north = frame(**place).ground_to_map(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]))
     a, b = east - origin, north - origin
     assert a[0] * b[1] - a[1] * b[0] == pytest.approx(square_m2, rel=1e-4)
-
-
-def test_nan_stays_nan():
-    """A ray without ground has no place on the map."""
-    assert np.isnan(frame().ground_to_map([np.nan, 0, 0])).all()

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis
-from pipeline.planning.area_cover import sweeps_over
-from pipeline.planning.coverage import coarse_sweeps, full_sweeps, sweep_outline
+from pipeline.planning.coverage import coarse_sweeps, full_sweeps, sweep_outline, sweeps_over
 from pipeline.planning.strips import covered_seats
 
 GRID, CAMERA = SceneGrid(320, 416, 16, 4), LineCamera(samples=160)
@@ -43,12 +42,6 @@ def test_lines_stay_where_they_lie(shown: np.ndarray) -> None:
     whole = {sweep.name: sweep for sweep in coarse_sweeps(GRID, CAMERA, "x")}
     for sweep in sweeps_over(list(whole.values()), GRID, CAMERA, shown):
         assert np.isin(sweep.held_px(), whole[sweep.name].held_px()).all()
-
-
-def test_of_the_whole_field_nothing_is_cut() -> None:
-    """The same sweeps, value by value."""
-    sweeps = coarse_sweeps(GRID, CAMERA, "y")
-    assert sweeps_over(sweeps, GRID, CAMERA, GRID.valid_share().ravel() > 0) == sweeps
 
 
 def test_strips_beside_the_area_are_left_out() -> None:

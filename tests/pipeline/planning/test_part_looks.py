@@ -13,8 +13,7 @@ from pipeline.errors import SettingsError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, CostModel, exposing
-from pipeline.planning.area_cover import seats_shown
-from pipeline.planning.coverage import plain_sweeps
+from pipeline.planning.coverage import plain_sweeps, seats_shown
 from pipeline.planning.part_looks import SeatRows, cheapest_row_seconds, part_look, sweeps_of_runs
 
 GRID, CAMERA, COST = SceneGrid(320, 416, 16, 4), LineCamera(samples=160), CostModel()
@@ -153,13 +152,6 @@ def test_what_is_worth_much_is_looked_at_first() -> None:
     assert look is not None
     assert seats_shown(sweeps_of_runs(ROWS.sweeps, look.runs), GRID, CAMERA)[worth.ravel() > 0].all()
     assert len(look.runs) == 1
-
-
-def test_nothing_is_looked_at_where_nothing_is_worth_it() -> None:
-    """Without any worth, and without the seconds of a single row, there is no look."""
-    nothing, one = np.zeros(int(np.prod(GRID.seat_shape))), np.ones(int(np.prod(GRID.seat_shape)))
-    assert part_look(ROWS, nothing, CAMERA, COST, exposure_ms=EXPOSURE_MS, seconds=WHOLE_S) is None
-    assert part_look(ROWS, one, CAMERA, COST, exposure_ms=EXPOSURE_MS, seconds=1.0) is None
 
 
 @pytest.mark.parametrize(

@@ -135,15 +135,6 @@ def test_goals_out_of_reach_name_the_best_there_is() -> None:
         choose_scan(torn, ScanLimits(goals={MIOU: 0.93, "weed": 0.93}))
 
 
-def test_ties_go_to_the_cheaper_scan_and_then_to_the_first() -> None:
-    """Equal scores: fewer seconds; equal seconds too: fewer bytes; equal in all: the first."""
-    one = PlainScan(2, 25.0, 10.0, 100, {MIOU: 0.9})
-    faster, smaller = replace(one, seconds=9.0), replace(one, bytes_raw=90)
-    assert choose_scan([one, faster, smaller], ScanLimits()) is faster
-    assert choose_scan([one, smaller], ScanLimits()) is smaller
-    assert choose_scan([one, replace(one)], ScanLimits()) is one
-
-
 def test_the_frontier_holds_every_best_scan_of_its_seconds() -> None:
     """It rises, and whatever the seconds, nothing off it beats the last of it that they pay for."""
     best = frontier(SCANS)

@@ -63,14 +63,6 @@ def test_the_best_chain_beats_every_other(strips: list[list[Seat]], line: float,
     assert all(one.stop <= other.first for one, other in pairwise(found))
 
 
-def test_windows_are_chosen_apart():
-    """Two windows give the chains that each gives by itself."""
-    strips = [[(0, 2, 9.0)], [(3, 2, 9.0)], [(1, 2, 9.0)], [(5, 2, 0.1)]]
-    both = best_chains(tables(strips), np.array([[0, 1], [2, 3]]), 1.0, 1.0)
-    alone = [best_chains(tables(strips), np.array([pair]), 1.0, 1.0)[0] for pair in ([0, 1], [2, 3])]
-    assert both == alone == [[ScanRun(0, 0, 2), ScanRun(1, 3, 5)], [ScanRun(2, 1, 3)]]
-
-
 @given(st.floats(0, 60), st.integers(0, 6))
 def test_most_lines_are_the_most_that_the_seconds_pay_for(seconds: float, runs: int):
     """One line more would cost more than the seconds; a budget below the set-ups pays for less than nothing."""
@@ -154,12 +146,6 @@ def test_wide_fields_are_searched_window_by_window(columns: int):
         tops = [window.max() + 3 for window in windows]
         assert all(top < window.min() for top, window in zip(tops, windows[1:], strict=False))
     assert best_cover(field, (), 1e-3).worth == pytest.approx(field.total)
-
-
-def test_strips_side_by_side_share_no_column():
-    """The layout of a full scan holds every column, overlapping at the end alone."""
-    field = seats(np.ones((2, 10)), 4)
-    assert field.side_by_side.ravel().tolist() == [0, 4, 6]
 
 
 @settings(max_examples=15, deadline=None)

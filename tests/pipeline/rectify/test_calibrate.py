@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import PoseError, RigError, ShapeError
 from pipeline.geometry.mirror import mirror_throughput
-from pipeline.rectify.calibrate import calibrate, judge_elements, of_bands, reflectance
+from pipeline.rectify.calibrate import calibrate, judge_elements, reflectance
 from pipeline.rectify.detector import BadElementCriteria, find_bad_elements
 from pipeline.source import References
 
@@ -178,17 +178,6 @@ def test_blocks_do_not_show() -> None:
         np.testing.assert_array_equal(valid[n], known[0])
 
 
-def test_of_bands_takes_everything_along() -> None:
-    """Some bands of the references calibrate some bands of the lines as all calibrate all."""
-    rng = np.random.default_rng(2)
-    references = replace(
-        frames(6, 5), bad=rng.random((6, 5)) < 0.1, flat=rng.uniform(0.9, 1.1, (6, 5)).astype(np.float32)
-    )
-    raw = rng.integers(0, 4000, (2, 6, 5), dtype=np.uint16)
-    some = reflectance(raw[..., [3, 0]], of_bands(references, [3, 0]))
-    np.testing.assert_array_equal(some, reflectance(raw, references)[..., [3, 0]])
-
-
 def test_references_of_another_binning_are_refused() -> None:
     """The message names both sizes and says what to do."""
     with pytest.raises(ShapeError, match=r"8 samples and 3 bands, the dark frame \(4, 3\); take references"):
@@ -227,23 +216,6 @@ def test_faults_are_found_and_nothing_else() -> None:
     assert found == [[100, 3], [200, 5], [300, 8], [301, 8], [400, 9], [500, 1], [639, 6]]
 
 
-@pytest.mark.parametrize("samples", [2, 3, 5, 12])
-def test_few_samples_are_not_accused(samples: int) -> None:
-    """With hardly anything to compare a sound detector stays sound."""
-    for seed in range(20):
-        dark, white = simulated(samples, seed=seed)
-        white[samples // 3] = dark[samples // 3] + 1.5 * (white[samples // 3] - dark[samples // 3])
-        assert not find_bad_elements(dark, white).any()
-
-
-def test_one_sample_or_band() -> None:
-    """One sample has nothing to be compared with; in one band a dead element is found all the same."""
-    assert not find_bad_elements(*simulated(1)).any()
-    dark, white = simulated(200, 1)
-    white[150] = dark[150]
-    assert [150, 0] in np.argwhere(find_bad_elements(dark, white)).tolist()
-
-
 def test_bands_without_light_are_not_judged() -> None:
     """Where nothing responds no element is called dead, even where white lies below dark."""
     dark, white = simulated()
@@ -266,9 +238,3 @@ def test_more_than_a_detector_can_have_is_refused() -> None:
     with pytest.raises(RigError, match=r"1[01]\.\d % of the elements look bad, at most 5 % can be"):
         find_bad_elements(dark, white)
     assert find_bad_elements(dark, white, criteria=BadElementCriteria(most=0.2))[4::9].all()
-
-
-def test_frames_must_fit() -> None:
-    """Frames of two sizes are refused."""
-    with pytest.raises(ShapeError, match=r"\(4, 3\) and \(4, 2\)"):
-        find_bad_elements(np.zeros((4, 3)), np.zeros((4, 2)))

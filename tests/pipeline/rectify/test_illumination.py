@@ -8,7 +8,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pipeline.errors import ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Axis, Sweep
@@ -149,14 +148,3 @@ def test_crop_rows_are_not_taken_for_light(period: float, along: Axis):
     placed = [place(SimulatedSweep(source, sweep), camera) for sweep in sweeps]
     (ratio,) = overlap_light(placed, camera, [Window(0, 1, (0.0, 50.0), (-60.0, -12.0))])
     assert abs(ratio.log_ratio[0]) < 0.003
-
-
-def test_arrays_that_do_not_fit_are_refused():
-    """Unlike arrays, unknown sweeps and other bands are named."""
-    with pytest.raises(ShapeError, match="same points"):
-        light_ratio(np.zeros((3, 4, 5)), np.zeros((3, 4, 6)), pair=(0, 1))
-    ratio = LightRatio(0, 1, np.zeros(31), np.ones(31))
-    with pytest.raises(ShapeError, match="there are 1 sweeps of 31 bands"):
-        solve_lights([ratio], 1, WAVELENGTH)
-    with pytest.raises(ShapeError, match="has 31 bands"):
-        solve_lights([ratio], 2, WAVELENGTH[:5])

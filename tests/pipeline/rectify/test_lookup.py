@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import PoseError, SettingsError, ShapeError
+from pipeline.errors import PoseError
 from pipeline.geometry.mirror import direction_to_scene, position_to_normal, reflect
 from pipeline.geometry.scan import Sweep, line_positions, points_of_scan, scene_to_sweep
 from pipeline.rectify.lookup import KnotCurve, lookup, track_lookup
@@ -98,17 +98,6 @@ def test_sweeps_that_turn_or_dwell_are_refused() -> None:
         lookup(turning, CAMERA, np.zeros((1, 2)), along="x")
     with pytest.raises(PoseError, match="near line 1"):
         lookup(aim(0.0, np.array([0.0, 1, 1, 2])), CAMERA, np.zeros((1, 2)), along="x")
-
-
-def test_unusable_input_is_refused() -> None:
-    """No lines, points that are not pairs, and positions off the disk raise."""
-    position = aim(0.0, np.arange(3.0))
-    with pytest.raises(ShapeError, match="at least one line"):
-        lookup(position[:0], CAMERA, np.zeros((1, 2)), along="x")
-    with pytest.raises(ShapeError, match=r"\(\.\.\., 2\) of y and x"):
-        lookup(position, CAMERA, np.zeros((1, 3)), along="x")
-    with pytest.raises(PoseError, match="unit disk"):
-        lookup(position + np.array([0, 1.5]), CAMERA, np.zeros((1, 2)), along="x")
 
 
 def wandering_track(seed: int, amount_px: float, strip: float = 2600.0) -> Track:
@@ -243,14 +232,6 @@ def test_parts_are_those_of_the_whole(tie: int) -> None:
     assert table.coordinates(slice(5, 5), slice(0, 9)).shape == (0, 9, 2)
 
 
-def test_part_is_no_view_of_the_table() -> None:
-    """Writing to coordinates leaves the table as it is."""
-    table = tie_table(track_of(*PATHS["jittered"]), CAMERA, along="x", **GRID)
-    before = table.ties.copy()
-    table.coordinates(*EVERYTHING)[:] = 0
-    np.testing.assert_array_equal(table.ties, before)
-
-
 def test_knots_that_nothing_saw_are_left_out() -> None:
     """Around lost lines the table is NaN where the lookup is."""
     track = track_of(2600.0, LINES[(LINES < 40) | (LINES > 44)])
@@ -258,15 +239,6 @@ def test_knots_that_nothing_saw_are_left_out() -> None:
     assert table.spacing == 16
     differs = np.isnan(table.coordinates(*EVERYTHING)) != np.isnan(exact(track))
     assert differs.mean() < 1e-4
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (1, 40), (0, 5), (5, 0), (17, 16)])
-def test_grids_of_any_size(shape: tuple[int, int]) -> None:
-    """One pixel, one row, none at all: the table answers with the grid's shape."""
-    track = track_of(*PATHS["even"])
-    grid = GRID | {"origin_px": (30.0, 2600.0), "shape": shape}
-    found = tie_table(track, CAMERA, along="x", **grid).coordinates(*EVERYTHING)
-    np.testing.assert_allclose(found, exact(track, **grid), atol=2e-3)
 
 
 def test_track_smaller_than_a_cell_is_not_lost() -> None:
@@ -288,13 +260,3 @@ def test_only_what_the_track_can_have_seen_is_kept(tie: int) -> None:
     truth = exact(track, **grid)
     for rows, columns in (EVERYTHING, (slice(0, 90), slice(0, 80)), (slice(300, 320), slice(0, 1500))):
         np.testing.assert_allclose(table.coordinates(rows, columns), truth[rows, columns], atol=2e-3)
-
-
-def test_settings_are_checked() -> None:
-    """Ties less than a pixel apart and a tolerance below 0 are refused; at tolerance 0 every pixel is a tie."""
-    track = track_of(*PATHS["even"])
-    for wrong in ({"tie": 0}, {"tolerance_px": -1.0}, {"tolerance_px": np.nan}):
-        with pytest.raises(SettingsError, match="ties at least 1 px apart and a tolerance from 0"):
-            tie_table(track, CAMERA, along="x", **GRID, **wrong)
-    table = tie_table(track, CAMERA, along="x", tolerance_px=0.0, **GRID)
-    np.testing.assert_array_equal(table.coordinates(*EVERYTHING), exact(track))

@@ -13,7 +13,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import ShapeError
 from pipeline.geometry.camera import LineCamera, footprint
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
@@ -27,7 +26,6 @@ from pipeline.simulator.scenes.scene import RasterScene, raster_from_values
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
 
 LINES, SAMPLES, BANDS = 300, 100, 2
-BLOCK_BYTES = 64 * SAMPLES * BANDS * 2
 
 
 def part(seed: int, points: int = 20, bands: int = 4) -> MosaicPart:
@@ -119,14 +117,6 @@ def test_edge_distance_is_to_the_nearest_border() -> None:
     np.testing.assert_allclose(edge_distance(at, 100, 640), [0.5, 0.5, 0.5, 0, 49.5, np.nan])
 
 
-def test_nothing_and_misfits_are_refused() -> None:
-    """No sweep at all, and sweeps resampled at different points, raise."""
-    with pytest.raises(ShapeError, match="at least one sweep"):
-        mosaic([])
-    with pytest.raises(ShapeError, match="part 1 has values"):
-        mosaic([part(1), part(2, points=19)])
-
-
 CAMERA = LineCamera()
 
 
@@ -196,15 +186,6 @@ def test_every_seat_at_once_is_each_by_itself(along: str, shape: tuple[int, int]
     assert not valid.all()
 
 
-def test_seats_beside_all_sweeps_are_empty() -> None:
-    """A seat that no sweep shows is NaN and not valid."""
-    grid = SceneGrid(200, 40, 10, 2)
-    short = replace(full_sweeps(grid, CAMERA, "x")[0], lines=60)
-    patches, valid = read_seats(looked_at(smooth_scene((200, 40)), [short]), CAMERA, grid, grid.valid_seats()[-4:])
-    assert np.isnan(patches).all()
-    assert not valid.any()
-
-
 def test_a_partial_seat_is_filled_from_inside() -> None:
     """Pixels beyond the scene repeat pixels of the same seat and are marked as not on the scene."""
     grid = SceneGrid(12, 21, 8, 2)
@@ -248,23 +229,6 @@ def test_a_window_is_that_part_of_the_lines(first: int, count: int, left: int, w
     np.testing.assert_array_equal(window, lines.raw[wanted, samples])
 
 
-def test_the_block_used_longest_ago_goes_first() -> None:
-    """With room for two blocks, the one just used again outlives one used before it."""
-    lines, cache = Numbered(), LineCache(2 * BLOCK_BYTES)
-    for block in (0, 1, 0, 2, 0, 1):
-        cache.window(lines, slice(block * 64, block * 64 + 5), slice(0, 10))  # type: ignore[arg-type]
-        assert cache.bytes_held <= cache.most_bytes
-    assert [start // 64 for start, _ in lines.asked] == [0, 1, 2, 1]
-
-
-def test_the_newest_block_stays_even_without_room() -> None:
-    """A cache too small for one block still keeps the last one read, for who reads on in it."""
-    lines, cache = Numbered(), LineCache(0)
-    for first in (0, 5, 70, 80):
-        cache.window(lines, slice(first, first + 5), slice(0, 10))  # type: ignore[arg-type]
-    assert [start // 64 for start, _ in lines.asked] == [0, 1]
-
-
 def test_a_block_being_read_is_not_let_go() -> None:
     """While one thread reads a block another fills a full cache: both get their lines."""
     started, go = threading.Event(), threading.Event()
@@ -288,14 +252,6 @@ def test_a_block_being_read_is_not_let_go() -> None:
         slow.join()
     np.testing.assert_array_equal(other, lines.raw[70:74, :4])
     np.testing.assert_array_equal(got[0], lines.raw[:4, :4])
-
-
-def test_sweeps_do_not_share_blocks() -> None:
-    """The same lines of two sweeps are two blocks."""
-    one, other, cache = Numbered(), Numbered(), LineCache(2**20)
-    other.raw = other.raw + np.uint16(1)
-    first, second = (cache.window(lines, slice(0, 4), slice(0, 4)) for lines in (one, other))  # type: ignore[arg-type]
-    np.testing.assert_array_equal(second, first + 1)
 
 
 def test_threads_wait_for_one_read() -> None:

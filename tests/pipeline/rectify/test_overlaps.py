@@ -178,11 +178,3 @@ def test_places_are_those_of_the_scan():
     sweep = Sweep("s", "fine", "x", 900.0, -700.0, 30)
     seen = places_seen(line_positions(sweep, CAMERA), CAMERA.pixel_slopes(), CAMERA)
     np.testing.assert_allclose(np.moveaxis(seen, -1, 0), sweep_to_scene(sweep, CAMERA), atol=1e-7)
-
-
-def test_no_sweeps_and_impossible_settings():
-    """Nothing registers to nothing; a negative prior is refused."""
-    found = register_sweeps([], CAMERA, prior_px=5)
-    assert (found.shifts, found.reference, found.untied) == ((), None, ())
-    with pytest.raises(SettingsError, match="finite prior >= 0 px, got -1 px"):
-        register_sweeps([], CAMERA, prior_px=-1)

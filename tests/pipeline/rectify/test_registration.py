@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, gaussian_filter1d, rotate
 
-from pipeline.errors import SettingsError, ShapeError
 from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.mirror import direction_to_scene, position_to_direction
 from pipeline.geometry.scan import Sweep, line_positions, shifted_position
@@ -105,17 +104,6 @@ def test_rows_without_gaps_are_undecidable(turned: bool):
         found = pair_shift(*(view.T if turned else view for view in views), prior_px=26)
         assert found.status == "undecidable"
         assert np.isnan(found.shift).all()
-
-
-def test_unlike_images_and_bad_priors_are_refused():
-    """Images of two sizes, none at all, and a negative prior are named."""
-    image = np.zeros((20, 30))
-    with pytest.raises(ShapeError, match=r"one grid, got \(20, 30\) and \(20, 29\)"):
-        pair_shift(image, image[:, 1:], prior_px=3)
-    with pytest.raises(ShapeError, match=r"got \(0, 3\)"):
-        pair_shift(image[:0, :3], image[:0, :3], prior_px=3)
-    with pytest.raises(SettingsError, match="got -1 px"):
-        pair_shift(image, image, prior_px=-1)
 
 
 def test_error_is_the_scatter_of_the_shift():
@@ -245,15 +233,6 @@ def test_positions_shift_as_the_scene_does():
     np.testing.assert_allclose(after - before, shift, atol=1e-8)
 
 
-def test_windows_of_sweeps_that_are_not_there_are_refused():
-    """Numbers beyond the sweeps, and a reference beyond them, are named."""
-    window = WindowShift(0, 3, (0.0, 0.0), np.stack([np.eye(2)] * 2), np.zeros(2), np.ones(2))
-    with pytest.raises(ShapeError, match="joins sweeps 0 and 3; there are 2"):
-        solve_sweeps([window], ("a", "b"), (10, 10))
-    with pytest.raises(SettingsError, match="one of the sweeps 0 to 1, got 2"):
-        solve_sweeps([], ("a", "b"), (10, 10), reference=2)
-
-
 def textured(seed: int, shape: tuple[int, int] = (180, 210)) -> NDArray[np.float64]:
     """A field with structure over some pixels, larger than what is compared."""
     rng = np.random.default_rng(seed)
@@ -304,11 +283,3 @@ def test_where_nothing_is_shown_nothing_is_said(now: NDArray[np.float64]) -> Non
     """No value at all, or no structure; and fields that have nothing in common."""
     assert field_shift(now, cut(textured(6)), reach_px=REACH) == FieldShift()
     assert field_shift(cut(textured(7)), cut(textured(8)), reach_px=REACH) == FieldShift()
-
-
-def test_a_small_field_is_compared_as_one() -> None:
-    """Too small for windows, it is moved by what it says as a whole."""
-    field = textured(9)
-    found = field_shift(cut(field, 3, -2)[:60, :60], cut(field)[:60, :60], reach_px=REACH)
-    np.testing.assert_allclose(found.shift, (3, -2), atol=0.2)
-    assert found.turned_deg == 0

@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from pipeline.errors import ShapeError
 from pipeline.rectify.kernels import Kernel, kernel_taps
 from pipeline.rectify.resample import BLOCK_PX, merge_lines, resample
 
@@ -115,36 +114,6 @@ def test_raw_numbers_come_back_as_they_are() -> None:
     assert not out[failed].any()
 
 
-def test_writes_to_given_memory() -> None:
-    """``out`` receives the result and comes back; one that does not fit is refused."""
-    values, valid, at = np.random.default_rng(17).random((6, 6, 2), np.float32), np.ones((6, 6), bool), everywhere(6, 6)
-    memory = np.full((36, 2), 7, np.float32)
-    out, _ = resample(values, valid, at, out=memory)
-    assert out is memory
-    np.testing.assert_array_equal(out, resample(values, valid, at)[0])
-    with pytest.raises(ShapeError, match=r"\(36, 2\) of float32.*got \(36, 2\) of float64"):
-        resample(values, valid, at, out=memory.astype(float))
-
-
-def test_read_only_values_are_accepted() -> None:
-    """Arrays that may not be written, as read from a store, pass without a warning."""
-    values = np.ones((4, 4, 1), np.float32)
-    values.flags.writeable = False
-    out, _ = resample(values, np.ones((4, 4), bool), np.array([[1.5, 1.5]]))
-    assert out[0, 0] == pytest.approx(1)
-
-
-def test_shapes_that_do_not_fit_are_named() -> None:
-    """A mask of another sweep and coordinates of a whole grid are refused with their shapes."""
-    values = np.ones((4, 4, 1), np.float32)
-    with pytest.raises(ShapeError, match=r"\(4, 4, 1\) and \(4, 5\)"):
-        resample(values, np.ones((4, 5), bool), np.zeros((1, 2)))
-    with pytest.raises(ShapeError, match="flatten the grid"):
-        resample(values, np.ones((4, 4), bool), np.zeros((2, 2, 2)))
-    with pytest.raises(ValueError, match="'cubic'"):
-        resample(values, np.ones((4, 4), bool), np.zeros((1, 2)), "cubic")  # type: ignore[arg-type]
-
-
 def test_dwell_is_the_mean_of_its_valid_lines() -> None:
     """Lines of one dwell are averaged sample by sample over what is valid; a line alone comes back bit by bit."""
     values = np.random.default_rng(18).random((6, 3, 2), np.float32)
@@ -169,22 +138,6 @@ def test_dwell_by_element() -> None:
     np.testing.assert_allclose(merged, [[[(3 * 65_535 + 1) / 4, 65_535]]], rtol=1e-7)
     assert known.shape == (1, 1, 2)
     assert known.all()
-
-
-def test_sweep_without_dwell_is_handed_through() -> None:
-    """Nothing is copied or converted where every line is alone, and no lines stay no lines."""
-    values, valid = np.ones((3, 2, 1), np.uint16), np.ones((3, 2), bool)
-    merged, known = merge_lines(values, valid, np.arange(3))
-    assert merged is values
-    assert known is valid
-    assert merge_lines(values[:0], valid[:0], np.arange(0))[0].shape == (0, 2, 1)
-
-
-@pytest.mark.parametrize("starts", [[1, 2], [0, 2, 2], [0, 2, 1], [0, 3], []])
-def test_dwells_must_part_the_lines(starts: list[int]) -> None:
-    """First lines that do not begin at 0, do not ascend or lie beyond the end are refused."""
-    with pytest.raises(ShapeError, match="ascending first lines from 0 on, below 3"):
-        merge_lines(np.ones((3, 2, 1), np.float32), np.ones((3, 2), bool), np.array(starts, np.intp))
 
 
 @pytest.mark.parametrize("kernel", KERNELS)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import PoseError, SettingsError, ShapeError
+from pipeline.errors import PoseError
 from pipeline.rectify.tracks import Track, line_centres, make_tracks, number_lines, single_track
 from tests.pipeline.rectify.aiming import CAMERA, aim
 
@@ -133,17 +133,6 @@ def test_single_track_has_a_knot_for_every_line() -> None:
     np.testing.assert_array_equal(track.lines, np.arange(4))
 
 
-def test_arrays_must_fit() -> None:
-    """Flags and shifts of another number of lines, and positions that are not pairs, raise."""
-    position = aim(0.0, np.arange(3.0))
-    with pytest.raises(ShapeError, match="one flag for each of 3 lines"):
-        make_tracks(position, CAMERA, usable=np.ones(2, np.bool_))
-    with pytest.raises(ShapeError, match=r"shift_px has shape \(3,\)"):
-        make_tracks(position, CAMERA, shift_px=np.zeros(3))
-    with pytest.raises(ShapeError, match=r"\(line, 2\)"):
-        make_tracks(np.zeros((3, 3)), CAMERA)
-
-
 def test_line_out_of_reach_is_named() -> None:
     """A usable line beyond the disk or without a position raises with its number; one that is not usable does not."""
     position = aim(0.0, np.arange(6.0))
@@ -221,11 +210,3 @@ def test_slow_clock_makes_no_frame_late() -> None:
     found = number_lines(np.arange(3000) * 0.1001, 0.1)
     np.testing.assert_array_equal(found.number, np.arange(3000))
     assert (found.late, found.lost) == (0, 0)
-
-
-def test_unusable_input_is_refused() -> None:
-    """A period of 0 and stamps that are no row raise."""
-    with pytest.raises(SettingsError, match="above 0 s, got 0"):
-        number_lines(np.arange(3.0), 0.0)
-    with pytest.raises(ShapeError, match=r"\(frame,\)"):
-        number_lines(np.zeros((3, 2)), 1.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from flows.settings.survey_settings import RECORDED, Settings
+from flows.tasks.scene import FieldSource
 from pipeline.capture.recorded import RecordedSource
 from pipeline.capture.recorded_passes import RecordedPasses
 from pipeline.capture.straight_scans import covered_field
 from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.lazy import Once
-from pipeline.simulator.effects.effect import Effect
 from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 from pipeline.source import Source
 from storage.archive.keys import stage_key
@@ -29,22 +29,15 @@ OFF_CENTRE_PX = 0.5  # of a recorded field, from which on the run says so
 
 
 @dataclass(frozen=True)
-class RecordedField:
-    """A `FieldSource`: a recording, whose lines were taken before."""
+class RecordedField(FieldSource):
+    """A recording, whose lines were taken before."""
 
     source: RecordedSource
     content: Mapping[str, Any]  # what its lines depend on
     name = RECORDED
-    simulates = False
 
     def key(self, field: str) -> dict[str, Any]:
         return {"recording": dict(self.content)}
-
-    def saying(self, say: Callable[[str], None]) -> RecordedField:
-        return self  # lines come all the time
-
-    def lit(self, chosen: Mapping[Effect, str], clock: Mapping[str, float]) -> RecordedField:
-        return self
 
     def opened(self, spool: Path) -> AbstractContextManager[Source]:
         return nullcontext(self.source)

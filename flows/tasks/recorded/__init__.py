@@ -1,1 +1,0 @@
-"""A recording as the source of a survey."""

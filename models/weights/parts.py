@@ -1,0 +1,98 @@
+"""What a file of weights may hold beside the network: what is familiar to it, and its reader of prior maps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from models.evaluation.expected_scores import MapScores
+from models.network.sizes import MemorySizes, SegmenterConfig
+
+FAMILIAR, READER = "familiar", "memory"  # their entries in the description, and the beginnings of their tensors' names
+TRAINED_ON = "trained_on"  # its entry in a record
+MAP_SCORES = "map_scores"  # of the record: how what maps expect to score came true, where that was measured
+MOST_WIDTH = 1024
+
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class TrainedOn:
+    """Ranges of what training saw; None where that is not known."""
+
+    bands: int
+    wavelength_nm: Range
+    exposure_ms: Range
+    scenes: int
+    classes: tuple[str, ...]
+    day: tuple[int, int] | None = None  # of the year
+    sun_elevation_deg: Range | None = None
+    ground_pixel_m: float | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values for a record; `read` gives them back."""
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
+
+    @staticmethod
+    def read(content: Mapping[str, Any]) -> TrainedOn:
+        """Read what `as_dict` gave. Raises KeyError, TypeError or ValueError where that is not what it is."""
+
+        def span(name: str) -> Range:
+            low, high = map(float, content[name])
+            return low, high
+
+        return TrainedOn(
+            int(content["bands"]),
+            span("wavelength_nm"),
+            span("exposure_ms"),
+            int(content["scenes"]),
+            tuple(map(str, content["classes"])),
+            None if content["day"] is None else (int(content["day"][0]), int(content["day"][1])),
+            None if content["sun_elevation_deg"] is None else span("sun_elevation_deg"),
+            None if content["ground_pixel_m"] is None else float(content["ground_pixel_m"]),
+        )
+
+
+@dataclass(frozen=True)
+class FamiliarPart:
+    """What is familiar to weights, by its description."""
+
+    key: str  # names what it holds
+    trained_on: TrainedOn
+    steps: tuple[int, ...]
+    bands: int
+    record: Mapping[str, Any]  # command, scenes, calibration, map scores
+
+    @staticmethod
+    def read(key: str, about: Mapping[str, Any]) -> FamiliarPart:
+        """Read an entry of a description. Raises KeyError, TypeError or ValueError where something is missing."""
+        trained_on, steps = TrainedOn.read(about[TRAINED_ON]), tuple(map(int, about["steps"]))
+        found = FamiliarPart(key, trained_on, steps, int(about["bands"]), about["record"])
+        _ = found.map_scores
+        return found
+
+    @property
+    def map_scores(self) -> MapScores | None:
+        """How what maps expect of themselves came true; None of weights that were trained in one light."""
+        scores = self.record.get(MAP_SCORES)
+        return None if scores is None else MapScores.read(scores)
+
+
+@dataclass(frozen=True)
+class ReaderPart:
+    """The reader of prior maps of weights, by its description."""
+
+    key: str
+    sizes: MemorySizes
+    record: Mapping[str, Any]
+
+    @staticmethod
+    def read(key: str, about: Mapping[str, Any], config: SegmenterConfig) -> ReaderPart:
+        """Read an entry of a description. KeyError, TypeError, ValueError: missing, or not for such a network."""
+        sizes = MemorySizes(**about["sizes"])
+        if (sizes.classes, sizes.columns, sizes.factor) != (config.classes, config.columns, config.factor):
+            raise ValueError(f"its reader of prior maps is for another network: {sizes.as_dict()}")
+        if not 0 < sizes.width <= MOST_WIDTH or not 0 < sizes.coarse_width <= MOST_WIDTH:
+            raise ValueError(f"its reader of prior maps is {sizes.width} and {sizes.coarse_width} wide")
+        return ReaderPart(key, sizes, about["record"])

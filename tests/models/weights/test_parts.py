@@ -1,0 +1,143 @@
+"""Parts of a file of weights, familiar and reader: what is added is read, what is damaged or unfit is refused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from models.network.memory_reader import MemoryReader
+from models.network.sizes import MemorySizes
+from models.reading.familiar import Familiar
+from models.weights.files import (
+    add_familiar,
+    add_reader,
+    content_key,
+    describe_weights,
+    load_familiar,
+    load_reader,
+    load_weights,
+    save_weights,
+)
+from models.weights.parts import TrainedOn
+from pipeline.errors import WeightsError
+from tests.models.conftest import make_weights
+from tests.models.reading.test_familiar import some_limits
+
+SEEN = TrainedOn(10, (400.0, 1000.0), (3.0, 100.0), 48, ("a", "b"), (96, 300), (15.0, 60.0), 0.12)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """A file of small weights."""
+    save_weights(make_weights(), tmp_path / "own.safetensors")
+    return tmp_path / "own.safetensors"
+
+
+def with_familiar(path: Path) -> None:
+    """Add what is familiar to the weights."""
+    columns = describe_weights(path).config.columns
+    one = np.eye(columns)
+    measured = Familiar(np.zeros((1, columns)), one[None], 0.1 * one[None], 0.1 * one, some_limits(), 10)
+    add_familiar(path, path, measured, SEEN, {"scenes": 48})
+
+
+def with_reader(path: Path, **changed: int) -> None:
+    """Add a reader of prior maps."""
+    config = describe_weights(path).config
+    sizes = {"classes": config.classes, "columns": config.columns, "factor": config.factor, "width": 8}
+    built = MemoryReader(MemorySizes(**{**sizes, "coarse_width": 4, **changed}))
+    add_reader(path, path, built, {"seed": 1})
+
+
+def test_what_is_added_is_read_and_leaves_the_weights_as_they_were(path: Path) -> None:
+    """Both parts come back in any order; each has a key of its own, which adding it again does not change."""
+    bare, weights = describe_weights(path), load_weights(path)
+    assert (bare.familiar, bare.reader) == (None, None)
+    for add in (with_familiar, with_reader, with_familiar):
+        add(path)
+    told = describe_weights(path)
+    assert content_key(path) == told.key == bare.key
+    assert told.familiar is not None
+    assert told.reader is not None
+    assert (told.familiar.trained_on, told.familiar.record, told.reader.record) == (SEEN, {"scenes": 48}, {"seed": 1})
+    key, reader = told.reader.key, load_reader(path)
+    add_reader(path, path, reader, {"seed": 1})
+    again = describe_weights(path)
+    assert again.reader is not None
+    assert (again.reader.key, again.familiar) == (key, told.familiar)
+    assert load_familiar(path).limits.steps == (1, 2)
+    for name, tensor in load_weights(path).segmenter.state_dict().items():
+        torch.testing.assert_close(weights.segmenter.state_dict()[name], tensor, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize(("load", "words"), [(load_familiar, "--familiar"), (load_reader, "--remember")])
+def test_a_part_that_is_not_there_says_how_it_is_made(path: Path, load: Callable[[Path], object], words: str) -> None:
+    """The message names the file and the command."""
+    with pytest.raises(WeightsError, match=rf"own\.safetensors.*spectralzoom train DATASET {words}"):
+        load(path)
+
+
+def test_what_training_saw_is_read_as_it_was_told() -> None:
+    """With and without what is not known."""
+    bare = TrainedOn(3, (460.0, 640.0), (100.0, 100.0), 2, ("a", "b"))
+    assert [TrainedOn.read(one.as_dict()) for one in (SEEN, bare)] == [SEEN, bare]
+
+
+@pytest.mark.parametrize(("add", "load"), [(with_familiar, load_familiar), (with_reader, load_reader)])
+def test_every_flipped_bit_is_told(path: Path, add: Callable[[Path], None], load: Callable[[Path], object]) -> None:
+    """Of a part's own tensors and of the description, in a message that names the file and says what to do."""
+    add(path)
+    whole, rng = path.read_bytes(), np.random.default_rng(0)
+    size = 8 + int.from_bytes(whole[:8], "little")
+    header = json.loads(whole[8:size])
+    told = header.pop("__metadata__")["about"]
+    own = [one["data_offsets"] for name, one in header.items() if name.startswith(("familiar.", "memory."))]
+    start = whole.index(b'{\\"')
+    places = [*(size + rng.integers(*ends) for ends in own * 3), *(start + rng.integers(0, len(told), 40))]
+    for place in places:
+        damaged = bytearray(whole)
+        damaged[place] ^= 1 << int(rng.integers(8))
+        path.write_bytes(damaged)
+        with pytest.raises(WeightsError, match=r"own\.safetensors.*(copy|train|measure)"):
+            load(path)
+
+
+@pytest.mark.parametrize(
+    ("changed", "why"),
+    [({"columns": 5}, "for another network"), ({"factor": 8}, "for another network"), ({"width": 2048}, "4 wide")],
+)
+def test_a_reader_for_others_is_refused(path: Path, changed: dict[str, int], why: str) -> None:
+    """Other columns or another factor than the weights have; and a width that is damage."""
+    with_reader(path, **changed)
+    with pytest.raises(WeightsError, match=why):
+        load_reader(path)
+
+
+def test_numbers_that_are_none_are_refused(path: Path) -> None:
+    """A NaN among the tensors."""
+    with_reader(path)
+    found = load_reader(path)
+    with torch.no_grad():
+        found.gates[0] = torch.nan
+    add_reader(path, path, found, {})
+    with pytest.raises(WeightsError, match="not finite"):
+        load_reader(path)
+
+
+def test_what_was_read_stays_where_the_file_is_written_over(path: Path) -> None:
+    """Copied onto while a survey reads with them, weights, reader and limits are still those that were checked."""
+    with_familiar(path)
+    with_reader(path)
+    weights, told, numbers = load_weights(path), load_familiar(path), load_reader(path).state_dict()
+    kept = told.read.copy(), weights.normalisation.whitening.copy()
+    before = {name: one.clone() for name, one in numbers.items()}
+    with path.open("r+b") as opened:
+        opened.write(bytes(path.stat().st_size))
+    np.testing.assert_array_equal(told.read, kept[0])
+    np.testing.assert_array_equal(weights.normalisation.whitening, kept[1])
+    assert all(torch.equal(numbers[name], one) for name, one in before.items())
