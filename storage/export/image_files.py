@@ -23,7 +23,7 @@ from storage.archive.whole_files import written_aside
 from storage.arrays.class_maps import ClassNames
 from storage.arrays.georeference import map_attributes
 from storage.arrays.layout import AngularGrid
-from storage.readers.envi_cubes import DATA_TYPES, INTERLEAVES
+from storage.readers.envi_files import DATA_TYPES, INTERLEAVES
 
 LARGEST_GHOST = 1024  # bytes that GDAL's note of the layout may take before the first directory
 TILE = 512  # px: rasters within one tile need no overviews

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.lazy import deferred
-from storage.readers.headwall_folders import is_headwall_folder
+from storage.readers.envi_files import is_headwall_folder
 from storage.readers.label_files import (
     folders_within,
     image_folder,
@@ -26,8 +26,7 @@ from storage.readers.label_files import (
     scene_entries,
 )
 from storage.readers.labels import Labels, load_labels
-from storage.readers.raster_files import split_variable
-from storage.readers.scan_files import reader_of
+from storage.readers.open_cubes import reader_of, split_variable
 from storage.readers.scene_files import OpenScene, open_scene_file
 from storage.readers.scene_toml import find_scene_settings
 

@@ -18,14 +18,16 @@ from storage.readers.label_files import (
     image_folder,
     is_label_name,
     is_store,
+    label_file,
     listed_names,
     match_folder,
     scene_entries,
+    scene_number,
 )
 from storage.readers.labels import found_classes, load_codes
-from storage.readers.polygon_labels import is_polygon_file, polygon_classes
-from storage.readers.raster_files import SCENE_ENDINGS, split_variable
-from storage.readers.scene_files import SceneFile, label_file, load_scene_file, scene_number
+from storage.readers.open_cubes import CUBE_ENDINGS, split_variable
+from storage.readers.polygons import is_polygon_file, polygon_classes
+from storage.readers.scene_files import SceneFile, load_scene_file
 from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings
 
 
@@ -218,7 +220,7 @@ def _scenes(path: str | Path, train_mask: str | Path | None) -> _Scenes:
     images = [image for image in found.images if image.resolve() not in masks]
     if not images:
         raise SceneError(
-            f"{folder} holds no scene ({', '.join(SCENE_ENDINGS)}); give a folder of images, or with images/ in it"
+            f"{folder} holds no scene ({', '.join(CUBE_ENDINGS)}); give a folder of images, or with images/ in it"
             f"{folders_within(folder)}"
         )
     names = _names(images)

@@ -1,13 +1,9 @@
-"""Which label file belongs to which image, by their names alone, and the names of classes that lie beside label files.
+"""Label files that belong to scenes by their names, and the names of classes that lie beside label files.
 
 Labels are pictures, or polygons where there is no picture. They lie beside their images (``001_mask.png``,
 ``field_a_labels.png``, ``field_a.gpkg``) or in a folder of labels there, or beside a folder of images
 (``labels/001.png``, ``annotations/001_annotation.png``); names are equal, or but for a word such as ``_mask``. Upper
 and lower case are alike.
-
-Names of classes come as a list in a text file, as JSON, and as GDAL, QGIS and ENVI write them. Each is read leniently,
-as people write them: ``1 crop``, ``crop: 1``, ``crop, 0, 255, 0``, ``#00ff00 crop``, or names alone, in the order of
-their numbers.
 """
 
 from __future__ import annotations
@@ -23,10 +19,10 @@ from typing import Any
 from xml.etree import ElementTree
 
 from pipeline.errors import SceneError
-from storage.readers.envi_cubes import find_envi_pair, load_envi_header
-from storage.readers.polygon_labels import POLYGON_ENDINGS
-from storage.readers.raster_files import SCENE_ENDINGS
-from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, is_image_folder
+from storage.readers.envi_files import find_envi_pair, load_envi_header
+from storage.readers.open_cubes import CUBE_ENDINGS
+from storage.readers.polygons import POLYGON_ENDINGS, split_layer
+from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, is_image_folder
 
 LABEL_WORDS = ("mask", "masks", "label", "labels", "annotation", "annotations", "gt", "groundtruth", "truth", "seg")
 LABEL_FOLDERS = {*LABEL_WORDS, "ground_truth", "segmentation", "segmentations", "targets", "labelimages"}
@@ -66,7 +62,7 @@ def scene_entries(folder: Path) -> list[Path]:
         entry
         for entry in folder.iterdir()
         if not entry.name.startswith(".")
-        and ((entry.suffix.lower() in SCENE_ENDINGS and entry.is_file()) or is_store(entry))
+        and ((entry.suffix.lower() in CUBE_ENDINGS and entry.is_file()) or is_store(entry))
     )
 
 
@@ -92,7 +88,14 @@ def match_folder(folder: Path) -> MatchedFiles:
     labels = {image: found for image, found in told.items() if found is not None}
     if len(images) == len([*beside, *apart]) == 1:  # they need no name to belong together
         labels = dict(zip(images, [*beside, *apart], strict=True))
-    _refuse_shared(labels)
+    owner: dict[Path, Path] = {}
+    for image, label in labels.items():
+        if label in owner:
+            raise SceneError(
+                f"{owner[label]} and {image} would both have the labels {label}, by their names; rename one of them, or"
+                f" say which files are labels in a {SETTINGS_NAME}"
+            )
+        owner[label] = image
     alone = tuple(entry for entry in (*beside, *apart) if entry not in set(labels.values()))
     return MatchedFiles(tuple(images), labels, alone)
 
@@ -161,7 +164,11 @@ def _label_of(image: Path, candidates: Sequence[Path]) -> Path | None:
     stem = image.stem.lower()
     for alike in (lambda name: name, lambda name: _IMAGE_WORD.sub("", name)):
         wanted = alike(stem)
-        found = [one for one in candidates if wanted in (alike(one.stem.lower()), alike(_bare(one)))]
+        found = [
+            one
+            for one in candidates
+            if wanted in (alike(one.stem.lower()), alike(_LABEL_WORD.sub("", one.stem.lower(), count=1)))
+        ]
         if len(found) > 1:
             names = " and ".join(str(one) for one in found[:SHOWN])
             home = image.parent.parent if is_image_folder(image.parent) else image.parent
@@ -175,19 +182,39 @@ def _label_of(image: Path, candidates: Sequence[Path]) -> Path | None:
     return None
 
 
-def _bare(label: Path) -> str:
-    return _LABEL_WORD.sub("", label.stem.lower(), count=1)
+def label_file(scene: Path, settings: SceneSettings) -> tuple[Path | None, str]:
+    """Return the labels of a scene, by scene.toml or else by their name; and why there are none, if that is known.
+
+    Raises SceneError: scene.toml asks for a number that the scene's name lacks, or several files may be meant.
+    """
+    if settings.labels is None or settings.path is None:
+        return find_label(scene), ""
+    if not settings.labels:
+        return None, ""
+    number = scene_number(scene)
+    if "{number}" in settings.labels and number is None:
+        raise SceneError(
+            f"{scene} has no number in its name, which labels = {settings.labels!r} in scene.toml asks for; write"
+            " {name} for the whole name"
+        )
+    address = settings.path.parent / filled(settings.labels, scene)
+    if address != settings.path.parent / settings.labels and not split_layer(address)[0].is_file():
+        return None, f"no labels: there is no {address}"
+    return address, ""
 
 
-def _refuse_shared(labels: dict[Path, Path]) -> None:
-    owner: dict[Path, Path] = {}
-    for image, label in labels.items():
-        if label in owner:
-            raise SceneError(
-                f"{owner[label]} and {image} would both have the labels {label}, by their names; rename one of them, or"
-                f" say which files are labels in a {SETTINGS_NAME}"
-            )
-        owner[label] = image
+def filled(pattern: str, scene: Path) -> str:
+    """Return the ``labels`` of a scene.toml with the name and the number of a scene put in."""
+    return pattern.replace("{number}", scene_number(scene) or "").replace("{name}", scene.stem)
+
+
+def scene_number(path: Path) -> str | None:
+    """``059_image.png`` -> ``059``: the first digits of the file's name."""
+    digits = re.search(r"\d+", path.stem)
+    return None if digits is None else digits.group()
+
+
+# --- names of classes -------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -42,8 +42,8 @@ from storage.archive.staging import MANIFEST_NAME
 from storage.arrays.cubes import RawCube, open_raw_cube
 from storage.arrays.layout import open_group
 from storage.readers.cube_sources import CubeSource
-from storage.readers.envi_cubes import DATA_ENDINGS, INTERLEAVES, find_envi_pair, load_envi_header
-from storage.readers.headwall_folders import find_reference
+from storage.readers.envi_files import DATA_ENDINGS, INTERLEAVES, find_envi_pair, find_reference, load_envi_header
+from storage.readers.open_cubes import load_frame, open_cube, reader_of, with_wavelengths
 from storage.readers.pointing_tables import (
     ENDINGS,
     WITHOUT_MIRROR,
@@ -53,8 +53,7 @@ from storage.readers.pointing_tables import (
     load_played_vector,
     load_pointing_table,
 )
-from storage.readers.scan_files import load_frame, open_cube_source, reader_of, with_wavelengths
-from storage.readers.zarr_scenes import find_zarr_store
+from storage.readers.zarr_files import find_zarr_store
 from storage.remote.object_stores import is_remote
 from storage.remote.opening import is_archive, open_archive
 
@@ -337,7 +336,7 @@ def _stem(path: Path) -> str:
 
 def _open_file(path: Path, wavelengths: Sequence[float] | None) -> RecordedFile:
     """Open one cube of whole numbers with wavelengths."""
-    source = open_cube_source(path)
+    source = open_cube(path)
     if reader_of(path) == "envi":
         header, data = find_envi_pair(path)
         said, ending = load_envi_header(header).interleave, data.suffix.lower().removeprefix(".")
@@ -352,7 +351,7 @@ def _open_file(path: Path, wavelengths: Sequence[float] | None) -> RecordedFile:
             "reflectance or radiance is no recording: give it as --scene"
         )
     if wavelengths is not None:
-        source = with_wavelengths(source, wavelengths)
+        source = with_wavelengths(source, path, wavelengths)
     if source.bands.wavelength_nm is None:
         raise WavelengthError(
             f"{path} has {source.shape[2]} bands and nothing says their wavelengths; give --wavelengths in nm, or "
@@ -376,7 +375,7 @@ def _fitting_bits(camera: LineCamera, cubes: Sequence[RecordedFile], notes: list
     """
     bits = camera.bits
     for cube in cubes:
-        valid = np.flatnonzero(cube.source.lines.valid)
+        valid = np.flatnonzero(cube.source.valid)
         chosen = valid[:: max(len(valid) // SAMPLED_LINES, 1)][:SAMPLED_LINES]
         values = np.concatenate([cube.source.read(int(line), int(line) + 1) for line in chosen])
         full = camera.full_scale_dn * max(camera.samples // cube.source.shape[1], 1)
@@ -482,7 +481,7 @@ def _sweeps_of(
 ) -> list[RecordedSweep]:
     """The sweeps of one cube: one, or those that its pointing table cuts it into."""
     source = cube.source
-    valid = source.lines.valid & pointing.valid
+    valid = source.valid & pointing.valid
     time_s = _middle_s(source, pointing.time_s, camera, notes)
     exposure_ms = _exposures(source, pointing.exposure_ms, camera, cube.name, notes)
     references = _references(cube, camera, given, notes)

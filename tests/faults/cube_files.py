@@ -20,7 +20,7 @@ from PIL import Image
 
 from pipeline.errors import PipelineError
 from storage.export.image_files import EnviFile, write_envi
-from storage.readers.scan_files import open_cube_source
+from storage.readers.open_cubes import open_cube
 
 SHAPE = (20, 12, 5)
 LONGEST_S = 30  # then it counts as hanging
@@ -199,7 +199,7 @@ def try_reading(address: Path) -> Reading:
     begun, refused, wrong = time.monotonic(), None, None
     try:
         with at_most(LONGEST_S):
-            source = open_cube_source(address)
+            source = open_cube(address)
             held = source.shape[0] - source.lost_lines
             source.read(0, min(held, 64))
             source.read(max(held - 64, 0), held)

@@ -14,7 +14,7 @@ from PIL import Image
 from flows.settings.load import load_settings
 from storage.archive.archive import Archive
 from storage.readers.datasets import load_data_set
-from storage.readers.raster_files import image_shape
+from storage.readers.open_cubes import open_cube
 from storage.readers.scene_files import load_scene_file
 from tests.conftest import WeightsMaker
 from tests.flows.conftest import command_line
@@ -247,7 +247,7 @@ def test_a_picture_beyond_the_limit_of_pillow_is_read(files: Path, monkeypatch: 
     """What is large is a mosaic, not an attack; looking at its size alone says so, too."""
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)
     assert load_scene_file(files / "field.png").values.shape == (24, 32, 3)
-    assert image_shape(files / "field.png") == (24, 32, 3)
+    assert open_cube(files / "field.png").shape == (24, 32, 3)
 
 
 def test_a_step_is_that_step(files: Path) -> None:

@@ -26,7 +26,7 @@ from pipeline.ground.view import RigPose
 from storage.archive.archive import Archive
 from storage.export.image_files import cog_problems
 from storage.export.stac_items import stac_problems
-from storage.readers.envi_cubes import open_envi_cube
+from storage.readers.envi_files import open_envi_cube
 from storage.remote.opening import verify_archive
 from tests.remembered_work import without_effects
 from tests.storage.export.stac_rules import extension_problems

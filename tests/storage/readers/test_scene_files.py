@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.errors import SceneError, WavelengthError
-from storage.readers.raster_files import ALPHA_NOTE
+from storage.readers.image_files import ALPHA_NOTE
 from storage.readers.scene_files import load_scene_file
 
 NM = [450.0, 550.0, 650.0, 800.0, 900.0]
@@ -136,7 +136,7 @@ def test_wrong_wavelengths_say_what_to_write(
     [
         (np.ones((2, 2), complex), "complex numbers"),
         (np.array([[None, 1]], object), "Python objects"),
-        (np.zeros((0, 4, 2)), "empty array"),
+        (np.zeros((0, 4, 2)), "empty cube"),
         (np.zeros(4), r"shape \(4,\)"),
         (np.full((2, 2, 2), np.nan), "no finite number"),
         (np.array([["a"]]), "expected whole or floating numbers"),
