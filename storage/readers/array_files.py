@@ -68,10 +68,7 @@ def _load_array(path: Path, variable: str | None, dims: int) -> NamedArray:
         named, step = split_step(variable, ())
         if named is not None:
             raise SceneError(f"{path} holds one array, which has no name; only a step of time can be named: {path}:0")
-        whole = np.load(path, mmap_mode="r", allow_pickle=False)
-        if not isinstance(whole, np.ndarray):
-            raise SceneError(f"{path} is a pack of several arrays; call it .npz")
-        return NamedArray(take_step(whole, step, dims, str(path)), Bands())
+        return NamedArray(take_step(np.load(path, mmap_mode="r", allow_pickle=False), step, dims, str(path)), Bands())
     if path.suffix.lower() == ".npz":
         found = _npz_arrays(path)
     else:

@@ -174,8 +174,9 @@ def _opened(path: Path, image: str) -> Iterator[Any]:
         except SceneError:
             raise
         except Exception as error:  # decoders raise anything at all on damaged bytes
+            kind, why = _CALLED.get(driver, path.suffix.lower()), error.__cause__ or error
             raise SceneError(
-                f"{path} cannot be read as {_CALLED.get(driver, driver)}: {error}; is it damaged? copy it again"
+                f"{path} cannot be read as {kind}: {why}; is it damaged? Copy it again, or save it as PNG or TIFF"
             ) from error
 
 
