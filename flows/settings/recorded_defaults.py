@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from flows.settings.survey_settings import BUILT_IN_SCENES, OF_TWO_PASSES, PLAIN, RECORDED, RIG_FIELD, SPARING
-from storage.readers.recordings import find_recorded_run
+from storage.readers.recorded_runs import find_recorded_run
 
 OF_THE_PLAN = (*PLAIN, *OF_TWO_PASSES, *SPARING, "scan_exposure_ms", "look")
 OF_THE_RUN = ("camera", "cost", "rig", "pose", "map", "zones", "kernel", "pointing_px", "seed", "weights", "unknown")

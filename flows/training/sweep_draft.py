@@ -10,7 +10,8 @@ from storage.readers.envi_files import find_reference
 from storage.readers.label_files import image_folder, is_store, match_folder
 from storage.readers.open_cubes import open_cube, reader_of
 from storage.readers.pointing_tables import ENDINGS
-from storage.readers.recordings import Recording, find_cubes, open_recording
+from storage.readers.recorded_cubes import find_cubes
+from storage.readers.recordings import Recording, open_recording
 
 CAMERA_NUMBERS = ("uint8", "uint16", "int16")
 

@@ -1,0 +1,124 @@
+"""Cubes of files that recordings consist of: found in a folder, opened, and their numbers checked for a camera's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.errors import SceneError, WavelengthError
+from pipeline.geometry.camera import LineCamera
+from storage.readers.cube_sources import CubeSource
+from storage.readers.envi_files import DATA_ENDINGS, INTERLEAVES, find_envi_pair, load_envi_header
+from storage.readers.open_cubes import open_cube, reader_of, with_wavelengths
+from storage.readers.reference_frames import FRAMES
+from storage.readers.zarr_files import find_zarr_store
+
+SAMPLED_LINES = 16  # looked at for byte order and bits
+MOST_LINES_OVER = 0.5  # share of numbers above full scale that says the byte order is wrong, if swapped ones fit
+SWAPPED_OVER = 0.01
+
+
+@dataclass(frozen=True)
+class RecordedFile:
+    """One cube of files and what belongs to it."""
+
+    name: str
+    path: Path
+    source: CubeSource
+
+    @property
+    def folder(self) -> Path:
+        """Where its companions lie."""
+        return self.path if self.path.is_dir() and find_zarr_store(self.path) is None else self.path.parent
+
+
+def find_cubes(path: Path) -> list[Path]:
+    """Find the cubes that an address of files stands for: itself, or the ENVI cubes or Zarr stores of a folder.
+
+    Raises SceneError: the folder holds none.
+    """
+    if not path.is_dir() or find_zarr_store(path) is not None:
+        return [path]
+    headers = sorted(entry for entry in path.iterdir() if entry.suffix.lower() == ".hdr" and entry.is_file())
+    if any(entry.name.lower().startswith("raw_") for entry in headers):
+        return [path]  # parts of a Headwall camera's cube
+    stems = [(entry, _stem(entry).lower()) for entry in headers]
+    cubes = [
+        entry
+        for entry, stem in stems
+        if not stem.startswith(("dark", "white")) and stem.rpartition(".")[2] not in FRAMES
+    ]
+    stores = sorted(entry for entry in path.iterdir() if entry.is_dir() and find_zarr_store(entry) == entry)
+    if not cubes and not stores:
+        raise SceneError(f"{path} holds no cube; expected ENVI headers (.hdr), raw_<frame> files or Zarr stores in it")
+    return cubes or stores
+
+
+def _stem(path: Path) -> str:
+    """Name of a cube without the endings of its files."""
+    stem = path.name.removesuffix(path.suffix) if path.suffix.lower() == ".hdr" else path.name
+    ending = Path(stem).suffix
+    return stem.removesuffix(ending) if ending.lower() in (*filter(None, DATA_ENDINGS), ".zarr") else stem
+
+
+def open_recorded_cube(path: Path, wavelengths: Sequence[float] | None) -> RecordedFile:
+    """Open one cube of whole numbers with wavelengths."""
+    source = open_cube(path)
+    if reader_of(path) == "envi":
+        header, data = find_envi_pair(path)
+        said, ending = load_envi_header(header).interleave, data.suffix.lower().removeprefix(".")
+        if ending in INTERLEAVES and ending != said and source.shape[2] > 1:
+            raise SceneError(
+                f"{header} says interleave = {said}, and the name of {data.name} says {ending}; correct the header, or "
+                "rename the file"
+            )
+    if source.dtype not in (np.uint8, np.uint16, np.int16):
+        raise SceneError(
+            f"{path} holds {source.dtype}, expected a camera's own numbers (whole, 8 or 16 bits); a cube of "
+            "reflectance or radiance is no recording: give it as --scene"
+        )
+    if wavelengths is not None:
+        source = with_wavelengths(source, path, wavelengths)
+    if source.bands.wavelength_nm is None:
+        raise WavelengthError(
+            f"{path} has {source.shape[2]} bands and nothing says their wavelengths; give --wavelengths in nm, or "
+            "write a list 'wavelength' into its header"
+        )
+    return RecordedFile(_stem(path), path, source)
+
+
+def with_bits(camera: LineCamera, cubes: Sequence[RecordedFile], notes: list[str]) -> LineCamera:
+    """The camera with as many bits as the numbers have, by some lines of each cube.
+
+    Raises SceneError: most numbers are above full scale, and would not be with their bytes swapped; or some are below
+    0.
+    """
+    bits = camera.bits
+    for cube in cubes:
+        valid = np.flatnonzero(cube.source.valid)
+        chosen = valid[:: max(len(valid) // SAMPLED_LINES, 1)][:SAMPLED_LINES]
+        values = np.concatenate([cube.source.read(int(line), int(line) + 1) for line in chosen])
+        full = camera.full_scale_dn * max(camera.samples // cube.source.shape[1], 1)
+        plain = np.ascontiguousarray(values).astype(np.uint16)
+        other = plain if values.dtype.itemsize == 1 else plain.byteswap()
+        over, swapped = (float((numbers > full).mean()) for numbers in (plain, other))
+        if over > MOST_LINES_OVER and swapped < SWAPPED_OVER:
+            raise SceneError(
+                f"{cube.source.files[0]} has the wrong byte order: {over:.0%} of its numbers are above the camera's "
+                f"full scale of {full}, and {swapped:.0%} are with their bytes swapped. Write the other byte order (0 "
+                "or 1) into the header"
+            )
+        if values.min() < 0:
+            raise SceneError(
+                f"{cube.path} holds the number {values.min()}, expected a camera's own numbers from 0; write data type "
+                "12 (unsigned) into the header if they are unsigned"
+            )
+        if values.max() > full:
+            needed = (int(values.max()) * camera.full_scale_dn // full).bit_length()
+            if needed > bits:
+                bits = needed
+                notes.append(f"{cube.name}: numbers reach {values.max()}, so {bits} bits are taken for camera.bits")
+    return replace(camera, bits=bits)
