@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +30,7 @@ from storage.readers.cube_sources import (
     MOST_RATIO,
     Bands,
     CubeSource,
+    ReadLines,
     check_claim,
     check_memory,
     read_by_chunks,
@@ -133,9 +134,15 @@ def open_image(path: Path, name: str | None = None, *, scaled: bool = True, pale
             void=void,
             notes=tuple(notes),
         )
+    if scaled and void is not None:
+        source = replace(source, dtype=np.dtype(np.float32), read=partial(_with_gaps, read, void))
     if scaled and not ((scale == 1).all() and (offset == 0).all()):
         source = rescaled(source, scale, offset, source.nodata)
     return replace(source, read=read_by_chunks(source.read, height, block[0] if driver == "JP2OpenJPEG" else 1))
+
+
+def _with_gaps(read: ReadLines, void: NDArray[np.bool_], first: int, last: int) -> NDArray[np.float32]:
+    return np.where(void[first:last, :, None], np.float32(np.nan), read(first, last).astype(np.float32))
 
 
 def rescaled(

@@ -63,8 +63,6 @@ def write_ingested_cube(
     for start in range(0, source.shape[0], BLOCK_LINES):
         stop = min(start + BLOCK_LINES, source.shape[0])
         lines, valid = source.read(start, stop), source.valid[start:stop]
-        if source.void is not None:
-            lines = np.where(source.void[start:stop, :, None], np.float32(np.nan), lines.astype(np.float32))
         with np.errstate(over="ignore"):  # a float64 beyond float32 becomes infinite, which a scene takes for missing
             block = lines.astype(kind)
         if not valid.all():
@@ -79,8 +77,6 @@ def write_ingested_cube(
 
 def stored_dtype(source: CubeSource, report: Report = lambda done: None) -> np.dtype[Any]:
     """Type of the store: uint8 and uint16 stay, other whole numbers become uint16 where all fit, the rest float32."""
-    if source.void is not None:
-        return np.dtype(np.float32)
     if source.dtype.kind == "b" or source.dtype == np.uint8:
         return np.dtype(np.uint8)
     if source.dtype == np.uint16:

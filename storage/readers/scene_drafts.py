@@ -90,7 +90,7 @@ def draft_scene(address: str | Path, report: Report = lambda done, name: None) -
     folder = path.parent if alone else path
     first = address if alone else found.images[0]
     source = with_wavelengths(open_cube(first), first, None)
-    legend = find_legend([folder, *(label.parent for label in found.labels.values())], list(found.labels.values()))
+    legend = find_legend([folder, *(label.parent for label in found.labels.values())])
     unseen: list[str] = []
     # files that may hold outlines in words that no reader here knows
     outlines = [one for image in found.bare for one in map(image.with_suffix, (".json", ".xml")) if one.is_file()]

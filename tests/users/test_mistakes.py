@@ -9,12 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from flows.settings.load import load_settings
 from storage.archive.archive import Archive
 from storage.readers.datasets import load_data_set
-from storage.readers.open_cubes import open_cube
 from storage.readers.scene_files import load_scene_file
 from tests.conftest import WeightsMaker
 from tests.flows.conftest import command_line
@@ -241,13 +239,6 @@ def test_what_is_no_mistake_works(case: str, files: Path) -> None:
     scene = load_scene_file(f"{files}/{address}", wavelengths=nm)
     assert scene.values.shape == shape
     assert re.search(words, "; ".join(scene.provenance))
-
-
-def test_a_picture_beyond_the_limit_of_pillow_is_read(files: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is large is a mosaic, not an attack; looking at its size alone says so, too."""
-    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)
-    assert load_scene_file(files / "field.png").values.shape == (24, 32, 3)
-    assert open_cube(files / "field.png").shape == (24, 32, 3)
 
 
 def test_a_step_is_that_step(files: Path) -> None:

@@ -121,9 +121,7 @@ def test_links_are_relative(tmp_path: Path) -> None:
     """The folder can be moved: no link and no asset holds a path of this machine, none says where it lies itself."""
     paths = write_stac(tmp_path, ABOUT, "Surveys", item("r1"))
     texts = [path.read_bytes() for path in paths]
-    assert [
-        path.read_bytes() for path in write_stac(tmp_path, ABOUT, "Surveys", item("r1"))
-    ] == texts  # no clock
+    assert [path.read_bytes() for path in write_stac(tmp_path, ABOUT, "Surveys", item("r1"))] == texts  # no clock
     for path in paths:
         content = read(path)
         hrefs = [about["href"] for about in (*content["links"], *content.get("assets", {}).values())]

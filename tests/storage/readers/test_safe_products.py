@@ -14,7 +14,7 @@ import rasterio
 from affine import Affine
 from numpy.typing import NDArray
 
-from pipeline.errors import SceneError, WavelengthError
+from pipeline.errors import SceneError
 from storage.readers.open_cubes import open_cube
 from storage.readers.scene_files import load_scene_file
 
@@ -238,13 +238,6 @@ def test_jpeg_2000(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:80])
     with pytest.raises(SceneError, match="cannot be read as JPEG 2000"):
         load_scene_file(path, wavelengths=[500, 600, 700])
-
-
-def test_jpeg_2000_without_wavelengths(tmp_path: Path) -> None:
-    """Five bands without a word on them end in the message on wavelengths."""
-    path = write_jp2(tmp_path / "a.jp2", RNG.integers(1, 9, (5, 8, 9)).astype(np.uint16))
-    with pytest.raises(WavelengthError, match="has 5 bands and nothing says their wavelengths"):
-        load_scene_file(path)
 
 
 def write_tiff(path: Path, scales: tuple[float, ...] | None = None, offsets: tuple[float, ...] = (0, 0)) -> Path:
