@@ -59,8 +59,8 @@ from storage.archive.archive import Archive
 from storage.archive.keys import array_digest
 from storage.arrays.layout import AngularGrid, image_spec
 from storage.arrays.tile_work import MosaicWork, tile_budget
-from storage.rasters.raster_work import RasterPixels
 from storage.readers.open_cubes import load_labels_array
+from storage.readers.raster_work import RasterPixels
 from storage.readers.scene_files import OpenScene
 from storage.remote.opening import is_archive, open_archive
 

@@ -25,9 +25,9 @@ from pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE, farm_scene, la
 from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Source
-from storage.rasters.raster_fields import is_glob, open_raster
 from storage.readers.cube_sources import machine_bytes
 from storage.readers.open_cubes import load_labels_array, split_variable
+from storage.readers.raster_fields import is_glob, open_raster
 from storage.readers.scene_files import OpenScene, SceneFacts, load_scene_file
 
 if TYPE_CHECKING:

@@ -48,9 +48,8 @@ from storage.readers.pointing_tables import (
     load_played_vector,
     load_pointing_table,
 )
-from storage.readers.recorded_cubes import RecordedFile, find_cubes, open_recorded_cube, with_bits
+from storage.readers.recorded_cubes import RecordedFile, find_cubes, find_references, open_recorded_cube, with_bits
 from storage.readers.recorded_runs import find_raw_cubes
-from storage.readers.reference_frames import find_references
 
 Floats = NDArray[np.float64]
 
