@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import importlib
 import math
+import mmap
+import struct
 import warnings
 import zipfile
-from collections.abc import Callable, Container, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -196,16 +198,42 @@ def _mat_arrays(path: Path) -> dict[str, HeldArray]:
         """Read one array (SceneError: it claims more than the file or the memory can hold)."""
         check_claim(f"{path}:{name}", claimed, path.stat().st_size, 8 * DEFLATE_RATIO)  # a double may be one byte
         check_memory(path, 2 * claimed)
-        return np.asarray(scipy_io.loadmat(path, variable_names=[name])[name])
+        with _mapped(path) as content:
+            return np.asarray(scipy_io.loadmat(content, variable_names=[name])[name])
 
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), _mapped(path) as content:
         warnings.simplefilter("ignore")  # of names that are there twice
-        listed = scipy_io.whosmat(path)
+        _check_names(content)
+        listed = scipy_io.whosmat(content)
     return {
         name: HeldArray(shape, partial(load, name, math.prod(shape) * _MATLAB[kind]))
         for name, shape, kind in listed
         if kind in _MATLAB
     }
+
+
+def _check_names(content: mmap.mmap) -> None:
+    """Refuse names of variables beyond the file's end (ValueError): scipy takes the memory before it reads one."""
+    order, place = "<" if content[126:128] == b"IM" else ">", 128
+    while content[126:128] in (b"IM", b"MI") and place + 48 <= len(content):
+        kind, size, *_, axes = struct.unpack(order + "8I", content[place : place + 32])[:8]
+        name = place + 32 + axes + -axes % 8  # after flags and axes
+        if kind == 14 and (name + 8 > len(content) or _length(content[name : name + 8], order) > len(content) - name):
+            raise ValueError(f"the variable at byte {place} is cut off")
+        place += 8 + size
+
+
+def _length(tag: bytes, order: str) -> int:
+    """Return the bytes of an element by its tag; those of up to four bytes stand in the tag itself."""
+    kind, size = struct.unpack(order + "II", tag)
+    return 4 if kind >> 16 else int(size)
+
+
+@contextmanager
+def _mapped(path: Path) -> Iterator[mmap.mmap]:
+    """Open a file so that asking for more bytes than it has takes no memory for them."""
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        yield content
 
 
 def _hdf_arrays(path: Path) -> dict[str, HeldArray]:
@@ -222,7 +250,7 @@ def _hdf_arrays(path: Path) -> dict[str, HeldArray]:
             item = file[name]
             stored = min(item.id.get_storage_size(), path.stat().st_size)
             chunk = math.prod(item.chunks or ()) * item.dtype.itemsize
-            check_claim(f"{path}:{name}", max(int(item.nbytes), chunk), stored)
+            check_claim(f"{path}:{name}", max(int(item.nbytes), chunk), stored, DEFLATE_RATIO)
             check_memory(path, int(item.nbytes) + chunk)
             return np.asarray(item).T
 
