@@ -132,7 +132,12 @@ def run_export(
             for folder in (out, export.folder, export.folder / "envi", export.folder / "sweeps"):
                 remove_leftovers(folder)
             _export_images(export, layers, console)
-            _export_tables(export, choice, console)
+            areas = export.folder / "areas.csv"
+            write_areas(opened, areas)
+            export.add("areas", areas, "Areas of the classes, and how surely they are known", CSV, ["data", "metadata"])
+            with console.status("drawing polygons"):
+                for made in write_zones(opened, export.folder, choice):
+                    export.add(made.key, made.path, made.title, made.kind, list(made.roles), **made.fields)
             name_stores(export)
             if envi:
                 _export_cubes(export, console)
@@ -163,16 +168,6 @@ def _export_images(export: Export, layers: Sequence[Layer], console: Console) ->
         export.add(layer.name, path, layer.title, COG, list(layer.roles), **fields)
         style = write_layer_style(layer, path)
         export.add(f"{layer.name}_style", style, f"QGIS style of {path.name}", STYLE, ["metadata", "style"])
-
-
-def _export_tables(export: Export, choice: ProductChoice, console: Console) -> None:
-    """Areas as a table, and what else is no image."""
-    path = export.folder / "areas.csv"
-    write_areas(export.run, path)
-    export.add("areas", path, "Areas of the classes, and how surely they are known", CSV, ["data", "metadata"])
-    with console.status("drawing polygons"):
-        for made in write_zones(export.run, export.folder, choice):
-            export.add(made.key, made.path, made.title, made.kind, list(made.roles), **made.fields)
 
 
 def _export_cubes(export: Export, console: Console) -> None:
@@ -250,10 +245,12 @@ def name_stores(export: Export) -> None:
     run, root = export.run, export.run.archive.root
     nowhere = export.nowhere
     about = {"data_type": "float32", "nodata": "nan", "unit": "1"}
+    boxes = {product: load_geobox(run.path(product)) for product in ("mosaic", "class_map")}
+    places = {product: nowhere if box is None else projection(box) for product, box in boxes.items()}
     bands = spectral_bands(*load_bands(run.path("mosaic")), about)
     stores: dict[str, tuple[str, dict[str, Any]]] = {
-        "mosaic": ("Coarse mosaic", {**_store_place(run, "mosaic", nowhere), **bands}),
-        "class_map": ("Class map and confidence on the camera's grid", _store_place(run, "class_map", nowhere)),
+        "mosaic": ("Coarse mosaic", {**places["mosaic"], **bands}),
+        "class_map": ("Class map and confidence on the camera's grid", places["class_map"]),
         "attention": ("Score and rank of the seats", nowhere),
         "patches": ("Fine patches", nowhere),
     }
@@ -268,12 +265,6 @@ def name_stores(export: Export) -> None:
     for name, (title, kind, roles) in RUN_FILES.items():
         if (run.folder / name).is_file():
             export.add(Path(name).stem, run.folder / name, title, kind, roles)
-
-
-def _store_place(run: ExportedRun, product: str, nowhere: Asset) -> Asset:
-    """Where one of the archive's own stores lies, where it says so."""
-    geobox = load_geobox(run.path(product))
-    return nowhere if geobox is None else projection(geobox)
 
 
 def describe_item(export: Export) -> Item:
