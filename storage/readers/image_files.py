@@ -84,6 +84,9 @@ def open_image(path: Path, name: str | None = None, *, scaled: bool = True, pale
     driver = _driver(image)
     with _opened(path, image) as file:
         pages, notes = _pages(path, image, file)
+        block, item = max(file.block_shapes), max(np.dtype(one).itemsize for one in file.dtypes)
+        claimed = (file.height, file.width, file.count * len(pages))
+        _check_size(path, image, driver, claimed, item, math.prod(block) * file.count)  # before any of it is read
         kinds = [kind.name for kind in file.colorinterp]
         if driver in _CALLED and "alpha" in kinds and not _is_mask(file, kinds.index("alpha")):
             kinds, notes = ["undefined" if kind == "alpha" else kind for kind in kinds], [*notes, NO_MASK_NOTE]
@@ -91,8 +94,6 @@ def open_image(path: Path, name: str | None = None, *, scaled: bool = True, pale
         keep = [band for band in range(file.count) if band != alpha]
         kind = np.result_type(*(np.dtype(file.dtypes[band]) for band in keep or [0]))
         height, width, count = file.height, file.width, len(keep) * len(pages)
-        block = max(file.block_shapes)
-        _check_size(path, image, driver, (height, width, count), kind.itemsize, math.prod(block) * file.count)
         void = _void(file, alpha)
         geobox, where = place_of_file(file)
         known, of_bands = (
@@ -107,20 +108,7 @@ def open_image(path: Path, name: str | None = None, *, scaled: bool = True, pale
                 colours[number] = colour[:3]
             known, notes = _of_colours(RGB_NM), ["colours looked up in the image's palette"]
 
-        def read_window(first: int, last: int) -> NDArray[Any]:
-            planes = []
-            for page in pages:
-                with _opened(path, page) as opened:
-                    planes.append(opened.read([band + 1 for band in keep], window=((first, last), (0, width))))
-            return np.ascontiguousarray(np.moveaxis(np.concatenate(planes), 0, -1), kind)
-
-        whole = cache(lambda: read_window(0, height))
-
-        def read(first: int, last: int) -> NDArray[Any]:
-            """Give some rows, (y, x, band) (SceneError: they are damaged)."""
-            numbers = whole()[first:last] if picture else read_window(first, last)
-            return numbers if colours is None else colours[numbers[..., 0]]
-
+        read = _reader(path, pages, [band + 1 for band in keep], (height, width), kind, picture, colours)
         source = CubeSource(
             name=path.name,
             shape=(height, width, count),
@@ -134,11 +122,39 @@ def open_image(path: Path, name: str | None = None, *, scaled: bool = True, pale
             void=void,
             notes=tuple(notes),
         )
-    if scaled and void is not None:
+    if scaled and void is not None and not void.all():
         source = replace(source, dtype=np.dtype(np.float32), read=partial(_with_gaps, read, void))
     if scaled and not ((scale == 1).all() and (offset == 0).all()):
         source = rescaled(source, scale, offset, source.nodata)
     return replace(source, read=read_by_chunks(source.read, height, block[0] if driver == "JP2OpenJPEG" else 1))
+
+
+def _reader(
+    path: Path,
+    pages: Sequence[str],
+    bands: list[int],
+    shape: tuple[int, int],
+    kind: np.dtype[Any],
+    picture: bool,
+    colours: NDArray[np.uint8] | None,
+) -> ReadLines:
+    """Return what reads rows of some bands, from 1, of all pages; a picture is read once, as a whole."""
+
+    def read_window(first: int, last: int) -> NDArray[Any]:
+        planes = []
+        for page in pages:
+            with _opened(path, page) as opened:
+                planes.append(opened.read(bands, window=((first, last), (0, shape[1]))))
+        return np.ascontiguousarray(np.moveaxis(np.concatenate(planes), 0, -1), kind)
+
+    whole = cache(lambda: read_window(0, shape[0]))
+
+    def read(first: int, last: int) -> NDArray[Any]:
+        """Give some rows, (y, x, band) (SceneError: they are damaged)."""
+        numbers = whole()[first:last] if picture else read_window(first, last)
+        return numbers if colours is None else colours[numbers[..., 0]]
+
+    return read
 
 
 def _with_gaps(read: ReadLines, void: NDArray[np.bool_], first: int, last: int) -> NDArray[np.float32]:
@@ -204,7 +220,7 @@ def _check_size(path: Path, image: str, driver: str, shape: tuple[int, int, int]
     stored = Path(image).stat().st_size if Path(image).is_file() else path.stat().st_size
     claimed = math.prod(shape) * item
     if driver != "JPEG":  # which may say that blocks without end are alike
-        check_claim(path, max(claimed, shape[0] * shape[1]), stored, MOST_RATIO if driver in _CALLED else DEFLATE_RATIO)
+        check_claim(path, claimed, stored, MOST_RATIO if driver in _CALLED else DEFLATE_RATIO)
     check_memory(path, claimed * 3 if driver not in _CALLED else block * item + claimed // shape[0] * BLOCK_LINES)
 
 

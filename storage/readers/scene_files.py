@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import UNLABELLED
 from storage.archive.staging import file_hash
-from storage.readers.cube_sources import BLOCK_LINES, check_memory, scene_lines
+from storage.readers.cube_sources import BLOCK_LINES, Bands, CubeSource, check_memory, scene_lines
 from storage.readers.label_files import label_file
 from storage.readers.labels import Labels, load_labels
 from storage.readers.open_cubes import open_cube, split_variable
@@ -157,47 +157,71 @@ def _open(
         numbers, gaps = rows(first, last)
         return as_values(numbers, chosen, nodata, gaps)
 
-    values = None
     if keep:
         check_memory(address, 8 * height * width * count)  # as float32, and once more while the scene is made
-        values = np.empty((height, width, len(chosen)), np.float32)
     counted = ValueCount(file, chosen, nodata, (height, width))
-    for first in range(0, height, BLOCK_LINES):
-        last = min(first + BLOCK_LINES, height)
-        taken = counted.take(*rows(first, last))
-        if values is not None:
-            values[first:last] = taken
+    values = _count_values(counted, rows, np.empty((height, width, len(chosen)), np.float32) if keep else None)
     missing_notes = counted.notes()
     found, label_note, by_name = _labels_of(
         file, source.shape[:2], source.geobox, labels, settings, classes, labels_needed
     )
-    widths = None if light.fwhm_nm is None else light.fwhm_nm.tolist()
-    said: tuple[str, ...] = () if settings.nodata is None else (f"nodata {settings.nodata!r}",)
-    said += () if void is None else (f"void {hashlib.sha256(np.packbits(void).tobytes()).hexdigest()}",)
-    said += (source.scaling,) if source.scaling else ()
-    assert light.wavelength_nm is not None
-    content = _content_hash(file, source.files)
-    light_hash = _digest(content, variable, chosen, light.wavelength_nm.tolist(), widths, *said)
+    light_hash = _light_hash(file, variable, source, chosen, light, settings.nodata, void)
     some = () if chosen == list(range(count)) else (f"bands {bands_text(chosen)} of {count}, counted from 0",)
     over = ("values are over the white panel",) if calibrated else ()
+    of_labels: dict[str, Any] = {
+        "labels": None if found is None else found.index,
+        "class_names": () if found is None else found.names,
+        "class_colours": np.zeros((0, 3), np.uint8) if found is None else found.colours,
+        "class_values": () if found is None else found.values,
+        "labels_found": by_name and found is not None,
+    }
+    labelled = light_hash if found is None else _labelled_hash(light_hash, found.names, found.values, found.index)
     facts = {
         "name": file.stem,
         "path": file,
         "wavelength_nm": light.wavelength_nm,
         "fwhm_nm": light.fwhm_nm,
-        "labels": None if found is None else found.index,
-        "class_names": () if found is None else found.names,
-        "class_colours": np.zeros((0, 3), np.uint8) if found is None else found.colours,
-        "class_values": () if found is None else found.values,
-        "content_hash": light_hash
-        if found is None
-        else _labelled_hash(light_hash, found.names, found.values, found.index),
+        "content_hash": labelled,
         "light_hash": light_hash,
         "provenance": (*some, *bad_note, *source.notes, *over, light.origin, *gap_notes, *missing_notes, *label_note),
         "geobox": source.geobox,
-        "labels_found": by_name and found is not None,
+        **of_labels,
     }
     return facts, read, values, counted
+
+
+def _count_values(
+    counted: ValueCount,
+    rows: Callable[[int, int], tuple[NDArray[Any], NDArray[np.bool_] | None]],
+    values: NDArray[np.float32] | None,
+) -> NDArray[np.float32] | None:
+    """Read all rows once, count what is missing, and fill ``values`` (y, x, band) where they are to be kept."""
+    height = counted.missing.shape[0]
+    for first in range(0, height, BLOCK_LINES):
+        last = min(first + BLOCK_LINES, height)
+        taken = counted.take(*rows(first, last))
+        if values is not None:
+            values[first:last] = taken
+    return values
+
+
+def _light_hash(
+    file: Path,
+    variable: str | None,
+    source: CubeSource,
+    chosen: list[int],
+    light: Bands,
+    nodata: float | None,
+    void: NDArray[np.bool_] | None,
+) -> str:
+    """Return the hash of values and wavelengths: of the files, and of all that says what their numbers mean."""
+    assert light.wavelength_nm is not None
+    widths = None if light.fwhm_nm is None else light.fwhm_nm.tolist()
+    stated: tuple[str, ...] = () if nodata is None else (f"nodata {nodata!r}",)
+    stated += () if void is None else (f"void {hashlib.sha256(np.packbits(void).tobytes()).hexdigest()}",)
+    stated += (source.scaling,) if source.scaling else ()
+    content = _content_hash(file, source.files)
+    return _digest(content, variable, chosen, light.wavelength_nm.tolist(), widths, *stated)
 
 
 def _refuse_bands_first(path: Path, shape: tuple[int, ...], wavelengths: Sequence[float] | None) -> None:
