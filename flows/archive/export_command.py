@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,6 @@ from rich.markup import escape
 from flows.archive.export_layers import (
     ExportedRun,
     Layer,
-    Rows,
     map_layers,
     memory_layers,
     open_exported,
@@ -43,7 +42,6 @@ from storage.export.recorded_files import write_recorded_files
 from storage.export.stac_items import (
     COG,
     ZARR,
-    Collection,
     Item,
     angular,
     check_owner,
@@ -56,6 +54,10 @@ from storage.export.stac_items import (
 )
 from storage.remote.opening import open_archive
 
+COLLECTION_TEXT = (
+    "Surveys exported from the archive {}: a coarse look at a whole field, a fine look where it changes the map. Where "
+    "no survey says where it was, the extent is the whole earth."
+)
 ENVI_NUMBERS = "application/octet-stream"
 NOT_PLACED = (
     "The survey has no rig pose, and its scene no georeference: its images lie on the camera's angular grid "
@@ -117,21 +119,29 @@ def run_export(
     """
     opened = open_exported(open_archive(archive, create=False, write=False), run)
     out = check_outside(out, opened.archive.root)
-    about = describe_collection(opened)
+    surveys = opened.archive.root.name
+    collection_id = clean_id(surveys, "surveys")
     choice = check_zones(opened, choice)
     layers = [*map_layers(opened), *memory_layers(opened), *spectral_layers(opened, choice)]
     export = Export(opened, out)
     try:
-        with _alone_in(out):
-            check_owner(out, about.id)
+        with ExitStack() as stack:
+            release = take_lock(out / ".export.lock")
+            stack.callback(release if release is not None else lambda: None)
+            check_owner(out, collection_id)
             for folder in (out, export.folder, export.folder / "envi", export.folder / "sweeps"):
                 remove_leftovers(folder)
             _export_images(export, layers, console)
-            _export_tables(export, choice, console)
+            areas = export.folder / "areas.csv"
+            write_areas(opened, areas)
+            export.add("areas", areas, "Areas of the classes, and how surely they are known", CSV, ["data", "metadata"])
+            with console.status("drawing polygons"):
+                for made in write_zones(opened, export.folder, choice):
+                    export.add(made.key, made.path, made.title, made.kind, list(made.roles), **made.fields)
             name_stores(export)
             if envi:
                 _export_cubes(export, console)
-            item, collection = write_stac(out, about, describe_item(export))
+            item, collection = write_stac(out, collection_id, COLLECTION_TEXT.format(surveys), describe_item(export))
     except PipelineError:  # which some OSErrors are
         raise
     except OSError as error:
@@ -149,16 +159,6 @@ def run_export(
     return {"run": opened.id, "item": str(item), "collection": str(collection), "placed": placed, "files": files}
 
 
-@contextmanager
-def _alone_in(out: Path) -> Iterator[None]:
-    release = take_lock(out / ".export.lock")
-    try:
-        yield
-    finally:
-        if release is not None:
-            release()
-
-
 def _export_images(export: Export, layers: Sequence[Layer], console: Console) -> None:
     for layer in layers:
         path = export.folder / f"{layer.name}.tif"
@@ -170,16 +170,6 @@ def _export_images(export: Export, layers: Sequence[Layer], console: Console) ->
         export.add(f"{layer.name}_style", style, f"QGIS style of {path.name}", STYLE, ["metadata", "style"])
 
 
-def _export_tables(export: Export, choice: ProductChoice, console: Console) -> None:
-    """Areas as a table, and what else is no image."""
-    path = export.folder / "areas.csv"
-    write_areas(export.run, path)
-    export.add("areas", path, "Areas of the classes, and how surely they are known", CSV, ["data", "metadata"])
-    with console.status("drawing polygons"):
-        for made in write_zones(export.run, export.folder, choice):
-            export.add(made.key, made.path, made.title, made.kind, list(made.roles), **made.fields)
-
-
 def _export_cubes(export: Export, console: Console) -> None:
     run = export.run
     mosaic = open_image(run.path("mosaic"), "values")
@@ -189,8 +179,12 @@ def _export_cubes(export: Export, console: Console) -> None:
     unplaced = NOT_PLACED_RASTER if run.receipt["source"] == RASTER else NOT_PLACED
     place = unplaced if run.geobox is None else "camera grid, no CRS" if geobox is None else "on the scene's map"
     text = f"coarse mosaic of {run.id}, scene values; {place}"
-    file = EnviFile((rows, columns, bands), "<f4", "bil", wave, width, text, float("nan"), geobox)
-    _write_cube(export, "mosaic", file, mosaic.rows(), console)
+    file = EnviFile((rows, columns, bands), "f4", wave, width, text, float("nan"), geobox)
+    header = export.folder / "envi" / "mosaic.hdr"
+    with console.status("writing mosaic.img"):
+        data = write_envi(header, file, mosaic.rows())
+    export.add("mosaic_envi", data, "mosaic as ENVI, numbers", ENVI_NUMBERS, ["data"], **export.nowhere)
+    export.add("mosaic_envi_header", header, "mosaic as ENVI, header", "text/plain", ["metadata"])
     for path in run.sweeps():
         name = path.stem
         with console.status(f"writing {name}.bil"):
@@ -199,14 +193,6 @@ def _export_cubes(export: Export, console: Console) -> None:
         export.add(f"{name}_envi", data, f"Raw numbers of sweep {name}", ENVI_NUMBERS, ["data"], **export.nowhere)
         export.add(f"{name}_envi_header", header, f"{name} as ENVI, header", "text/plain", ["metadata"])
         export.add(f"{name}_pointing", table, f"Where the lines of {name} looked", CSV, ["metadata"])
-
-
-def _write_cube(export: Export, name: str, file: EnviFile, blocks: Rows, console: Console) -> None:
-    header = export.folder / "envi" / f"{name}.hdr"
-    with console.status(f"writing {name}.img"):
-        data = write_envi(header, file, blocks)
-    export.add(f"{name}_envi", data, f"{name} as ENVI, numbers", ENVI_NUMBERS, ["data"], **export.nowhere)
-    export.add(f"{name}_envi_header", header, f"{name} as ENVI, header", "text/plain", ["metadata"])
 
 
 @dataclass
@@ -259,10 +245,12 @@ def name_stores(export: Export) -> None:
     run, root = export.run, export.run.archive.root
     nowhere = export.nowhere
     about = {"data_type": "float32", "nodata": "nan", "unit": "1"}
+    boxes = {product: load_geobox(run.path(product)) for product in ("mosaic", "class_map")}
+    places = {product: nowhere if box is None else projection(box) for product, box in boxes.items()}
     bands = spectral_bands(*load_bands(run.path("mosaic")), about)
     stores: dict[str, tuple[str, dict[str, Any]]] = {
-        "mosaic": ("Coarse mosaic", {**_store_place(run, "mosaic", nowhere), **bands}),
-        "class_map": ("Class map and confidence on the camera's grid", _store_place(run, "class_map", nowhere)),
+        "mosaic": ("Coarse mosaic", {**places["mosaic"], **bands}),
+        "class_map": ("Class map and confidence on the camera's grid", places["class_map"]),
         "attention": ("Score and rank of the seats", nowhere),
         "patches": ("Fine patches", nowhere),
     }
@@ -277,22 +265,6 @@ def name_stores(export: Export) -> None:
     for name, (title, kind, roles) in RUN_FILES.items():
         if (run.folder / name).is_file():
             export.add(Path(name).stem, run.folder / name, title, kind, roles)
-
-
-def _store_place(run: ExportedRun, product: str, nowhere: Asset) -> Asset:
-    """Where one of the archive's own stores lies, where it says so."""
-    geobox = load_geobox(run.path(product))
-    return nowhere if geobox is None else projection(geobox)
-
-
-def describe_collection(run: ExportedRun) -> Collection:
-    """The collection of an archive's surveys."""
-    name = clean_id(run.archive.root.name, "surveys")
-    words = (
-        f"Surveys exported from the archive {run.archive.root.name}: a coarse look at a whole field, a fine look where "
-        "it changes the map. Where no survey says where it was, the extent is the whole earth."
-    )
-    return Collection(name, f"Surveys of {run.archive.root.name}", words)
 
 
 def describe_item(export: Export) -> Item:

@@ -58,7 +58,10 @@ def write_areas(run: ExportedRun, path: Path) -> None:
     path_of_map = run.path(run.map_product)
     names = tuple(open_image(path_of_map, "classes").about["class_names"])
     pixels, confidence = _counted(path_of_map, len(names))
-    hectares = _hectares(run, names)
+    hectares = None  # where nothing says where the field lies
+    if "ground" in run.receipt:
+        areas = run.receipt["ground"]["areas_ha"]
+        hectares = np.array([areas.get(name, 0.0) for name in names], np.float64)
     share = pixels / max(pixels.sum(), 1) if hectares is None else hectares / (hectares.sum() or 1.0)
     estimate, source = _estimate(run, share)
     total = np.nan if hectares is None else hectares.sum()
@@ -68,13 +71,10 @@ def write_areas(run: ExportedRun, path: Path) -> None:
     table = csv.writer(text, lineterminator="\n")
     table.writerow(COLUMNS)
     for number, (name, count) in enumerate(zip(names, pixels.tolist(), strict=True)):
-        told = [_cell(figure[number]) for figure in (*figures, estimate.errors * total)]
+        own_figures = [figure[number] for figure in (*figures, estimate.errors * total)]
+        told = [f"{value:.{DIGITS}g}" if np.isfinite(value) else "" for value in own_figures]
         table.writerow([name, count, *told, source])
     write_whole(path, text.getvalue())
-
-
-def _cell(value: float) -> str:
-    return f"{value:.{DIGITS}g}" if np.isfinite(value) else ""
 
 
 def _counted(path: Path, count: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -88,14 +88,6 @@ def _counted(path: Path, count: int) -> tuple[NDArray[np.int64], NDArray[np.floa
         sums += np.bincount(classes[known], sure[known], 256)
         sure_pixels += np.bincount(classes[known], minlength=256)
     return pixels[:count], np.where(sure_pixels > 0, sums / np.maximum(sure_pixels, 1), np.nan)[:count]
-
-
-def _hectares(run: ExportedRun, names: tuple[str, ...]) -> NDArray[np.float64] | None:
-    """Hectares of each class as the receipt has them; None where nothing says where the field lies."""
-    if "ground" not in run.receipt:
-        return None
-    areas = run.receipt["ground"]["areas_ha"]
-    return np.array([areas.get(name, 0.0) for name in names], np.float64)
 
 
 def _estimate(run: ExportedRun, share: NDArray[np.float64]) -> tuple[ShareEstimate, str]:
@@ -264,9 +256,13 @@ def spectral_layers(run: ExportedRun, choice: ProductChoice) -> list[Layer]:
     """
     if not (choice.reflectance or choice.indices):
         return []
-    view, (wave, _) = _view(run), load_bands(run.path("mosaic"))
+    # a raster's own pixels, unless its map is drawn on the ground by a pose; else the coarse mosaic
+    own = run.receipt["source"] == RASTER and run.store("ground_map") is None
+    view: MosaicView | RasterView = RasterView(run) if own else MosaicView(run)
+    wave, _ = load_bands(run.path("mosaic"))
     picked = [pick_bands(index, wave) for index in choice.indices]
-    white = _white(run)
+    blocks = open_image(run.path("mosaic"), "values").rows()
+    white = white_level(np.concatenate([values[::SAMPLED, ::SAMPLED].reshape(-1) for _, values in blocks]))
     for index in choice.indices:
         if index.wants_reflectance and white != 1.0:
             raise SettingsError(
@@ -275,17 +271,6 @@ def spectral_layers(run: ExportedRun, choice: ProductChoice) -> list[Layer]:
             )
     layers = [_reflectance(view, white)] if choice.reflectance else []
     return layers + [_index(view, index, bands, white) for index, bands in zip(choice.indices, picked, strict=True)]
-
-
-def _view(run: ExportedRun) -> MosaicView | RasterView:
-    """Give a raster's own pixels, unless its map is drawn on the ground by a pose; else the coarse mosaic."""
-    taken = run.receipt["source"] == RASTER and run.store("ground_map") is None
-    return RasterView(run) if taken else MosaicView(run)
-
-
-def _white(run: ExportedRun) -> float:
-    blocks = open_image(run.path("mosaic"), "values").rows()
-    return white_level(np.concatenate([values[::SAMPLED, ::SAMPLED].reshape(-1) for _, values in blocks]))
 
 
 def _reflectance(view: MosaicView | RasterView, white: float) -> Layer:

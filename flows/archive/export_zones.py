@@ -164,7 +164,12 @@ def _write_prescription(run: ExportedRun, raster: ClassRaster, folder: Path, cho
     assert asked.heading is not None
     heading = Heading(asked.heading)
     plane, to_own = to_plane(raster.geobox)
-    grid, found = _dosed(raster, doses, asked.least_share, (asked.cell_m, asked.cell_m), _turned(plane, heading))
+
+    def along_heading(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+        place = plane(x, y)
+        return heading.to_axes(place[..., 0], place[..., 1])
+
+    grid, found = _dosed(raster, doses, asked.least_share, (asked.cell_m, asked.cell_m), along_heading)
     seen = np.isfinite(found)
     row, column = np.nonzero(seen)
     columns = {"dose": found[seen], "unit": [asked.unit.name] * len(row), "row": row, "col": column}
@@ -181,7 +186,13 @@ def _write_prescription(run: ExportedRun, raster: ClassRaster, folder: Path, cho
     degrees = to_degrees(raster.geobox)
     grid, found = _dosed(raster, doses, asked.least_share, (step[0], step[1]), degrees)
     known = int((raster.classes != UNLABELLED).sum())
-    told = TaskWords(run.receipt["survey"], run.receipt["survey"], words, layer_version(run), known * raster.pixel_m**2)
+    told = TaskWords(
+        run.receipt["survey"],
+        run.receipt["survey"],
+        words,
+        str(run.receipt["versions"].get("spectralzoom", "unknown")),
+        known * raster.pixel_m**2,
+    )
     task = TaskGrid(*grid.corner, *grid.step, found, asked.unit)
     for key, path, kind in zip(
         ("task_data", "task_grid"),
@@ -192,14 +203,6 @@ def _write_prescription(run: ExportedRun, raster: ClassRaster, folder: Path, cho
         yield Made(
             key, path, f"{title.split(' in ')[0]} as ISOXML task data, cells along north", kind, fields=IN_DEGREES
         )
-
-
-def _turned(plane: ToAxes, heading: Heading) -> ToAxes:
-    def turned(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        place = plane(x, y)
-        return heading.to_axes(place[..., 0], place[..., 1])
-
-    return turned
 
 
 def _dosed(
@@ -236,8 +239,3 @@ def row_heading(run: ExportedRun) -> float:
         ends = ground.frame.view.scene_to_ground(np.array([[-down, -across], [down, across]]))
         east, north = np.diff(ground.frame.ground_to_map(ends), axis=0)[0]
     return round(float(np.rad2deg(np.arctan2(east, north))) % 180, 1)
-
-
-def layer_version(run: ExportedRun) -> str:
-    """Version of the program that made the run."""
-    return str(run.receipt["versions"].get("spectralzoom", "unknown"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,9 @@ from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.archive.staging import check_name, file_hash
 from storage.readers.cube_sources import CubeSource
+from storage.readers.ingested_cubes import Report, SourceFile, write_ingested_cube
+from storage.readers.open_cubes import open_cube, with_wavelengths
 from storage.readers.pointing_tables import find_pointing
-from storage.readers.scan_files import Report, SourceFile, open_cube_source, with_wavelengths, write_ingested_cube
 from storage.remote.opening import open_archive
 
 STAGE = "ingest"
@@ -81,9 +83,7 @@ def run_ingest(
     if name is not None:
         check_name(name)
     with console.status("opening the source"):
-        cube = open_cube_source(source, dark=dark, white=white)
-        if wavelengths is not None:
-            cube = with_wavelengths(cube, wavelengths)
+        cube = with_wavelengths(open_cube(source, dark=dark, white=white), source, wavelengths)
         opened = open_archive(archive)
         opened.reclaim()  # what a killed ingest left half made
     with opened.in_use(), StageProgress(console, TITLES) as progress:
@@ -146,7 +146,7 @@ def _key(name: str | None, source: CubeSource, files: Sequence[SourceFile]) -> d
         "fwhm_nm": None if widths is None else widths.tolist(),
         **georeference_record(source.geobox),
         **({"bad_bands": source.bad_bands} if source.bad_bands else {}),
-        **({"gaps": True} if source.gaps else {}),
+        **({} if source.void is None else {"gaps": True}),
         **({"numbers_in_names": source.by_names} if source.by_names else {}),
     }
 
@@ -170,7 +170,7 @@ def _record(
         "white": source.white is not None,
         "bytes_read": sum(file.size for file in files),
         "bytes_stored": archive.stored_bytes(ref),
-        "files": [file.record() for file in files],
+        "files": [asdict(file) for file in files],
         "notes": list(source.notes),
     }
 

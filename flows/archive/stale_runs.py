@@ -20,8 +20,8 @@ from pipeline.simulator.scenes.farm.farm_scene import FARM_LAW, USUAL_DAY, USUAL
 from storage.archive.keys import canonical_json
 from storage.archive.lineage import Catalogue
 from storage.archive.records import Run, Store
-from storage.readers.raster_files import split_variable
-from storage.readers.recordings import RAW_PRODUCTS, find_raw_cubes
+from storage.readers.open_cubes import split_variable
+from storage.readers.recorded_runs import RAW_PRODUCTS, find_raw_cubes
 
 OF_THE_SURVEY = ("labels", "weights", "memory", "accuracy", "prior")  # settings that its raw cubes do not bring
 # what the light of a field depends on; surveys that agree in these are generations of one

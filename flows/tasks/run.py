@@ -58,8 +58,8 @@ from storage.archive.archive import Archive
 from storage.archive.keys import array_digest
 from storage.arrays.layout import AngularGrid, image_spec
 from storage.arrays.tile_work import MosaicWork, tile_budget
-from storage.rasters.raster_work import RasterPixels
-from storage.readers.raster_files import load_raster
+from storage.readers.open_cubes import load_labels_array
+from storage.readers.raster_work import RasterPixels
 from storage.readers.scene_files import OpenScene
 from storage.remote.opening import is_archive, open_archive
 
@@ -190,7 +190,7 @@ class SurveyRun(CaptureRun):
     @cached_property
     def mask(self) -> NDArray[np.generic] | None:
         """The mask of policy ``mask``, (y, x) or (y, x, channel)."""
-        return None if self.settings.mask is None else load_raster(self.settings.mask, dims=2).values
+        return None if self.settings.mask is None else load_labels_array(self.settings.mask)
 
     @cached_property
     def vgg(self) -> VggFile | None:

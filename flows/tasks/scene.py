@@ -25,9 +25,9 @@ from pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE, farm_scene, la
 from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
 from pipeline.simulator.simulated import SimulatedSource
 from pipeline.source import Source
-from storage.rasters.raster_fields import is_glob, open_raster
 from storage.readers.cube_sources import machine_bytes
-from storage.readers.raster_files import load_raster, split_variable
+from storage.readers.open_cubes import load_labels_array, split_variable
+from storage.readers.raster_fields import is_glob, open_raster
 from storage.readers.scene_files import OpenScene, SceneFacts, load_scene_file
 
 if TYPE_CHECKING:
@@ -209,7 +209,7 @@ def _some_bands(scene: RasterScene, bands: tuple[int, ...]) -> RasterScene:
 
 def check_mask(mask: str, shape: tuple[int, int]) -> None:
     """Refuse a mask file that is no image of this (y, x) size (SceneError)."""
-    values = load_raster(mask, dims=2).values
+    values = load_labels_array(mask)
     if values.shape[:2] != shape:
         raise SceneError(f"--mask {mask} is {values.shape[:2]} px (y, x), the scene is {shape}; give one of its size")
 

@@ -20,7 +20,7 @@ from pipeline.ground.zones import FieldZones, extent_deg, field_zones, on_field,
 from pipeline.lazy import deferred
 from pipeline.simulator.scenes.scene import RasterScene
 from storage.archive.keys import array_digest
-from storage.readers.zone_files import GEOJSON, ZoneFile, read_zones
+from storage.readers.polygons import GEOJSON, ZoneFile, read_zones
 
 if TYPE_CHECKING:
     import pyproj

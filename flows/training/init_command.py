@@ -22,8 +22,8 @@ from flows.training.survey_draft import draft_sweeps, set_aside, show_survey_dra
 from pipeline.readings import MOST_VALUE
 from storage.archive.whole_files import write_whole
 from storage.readers.label_files import is_store, listed_names
-from storage.readers.polygon_labels import is_polygon_file
-from storage.readers.raster_files import split_variable
+from storage.readers.open_cubes import split_variable
+from storage.readers.polygons import is_polygon_file
 from storage.readers.scene_drafts import FoundClass, SceneDraft, draft_scene
 from storage.readers.scene_toml import SETTINGS_NAME
 

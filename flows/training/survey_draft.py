@@ -16,11 +16,12 @@ from rich.markup import escape
 from flows.terminal.processes import writing
 from pipeline.errors import PipelineError, SettingsError
 from storage.archive.whole_files import write_whole
-from storage.readers.headwall_folders import find_reference
+from storage.readers.envi_files import find_reference
 from storage.readers.label_files import image_folder, is_store, match_folder
+from storage.readers.open_cubes import open_cube, reader_of
 from storage.readers.pointing_tables import ENDINGS
-from storage.readers.recordings import Recording, find_cubes, open_recording
-from storage.readers.scan_files import open_cube_source, reader_of
+from storage.readers.recorded_cubes import find_cubes
+from storage.readers.recordings import Recording, open_recording
 
 SURVEY_NAME = "survey.toml"
 
@@ -172,7 +173,7 @@ def draft_sweeps(folder: Path) -> SweepsDraft | None:
         cubes = find_cubes(folder)
         if match_folder(image_folder(folder)).labels:
             return None
-        sources = [open_cube_source(cube) for cube in cubes]
+        sources = [open_cube(cube) for cube in cubes]
     except (PipelineError, OSError):
         return None
     if any(source.dtype.name not in CAMERA_NUMBERS for source in sources):

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,52 +26,43 @@ from storage.arrays.cubes import RawCube
 from storage.arrays.layout import SHARD_ROWS
 from storage.export.image_files import EnviFile, write_envi
 
-Interleave = Literal["bil", "bip", "bsq"]
 
-
-def write_recorded_files(
-    cube: RawCube, folder: Path, *, interleave: Interleave = "bil", big_endian: bool = False
-) -> Path:
+def write_recorded_files(cube: RawCube, folder: Path) -> Path:
     """Write a raw cube as ENVI with a pointing table and reference frames, named like its sweep; gives the header.
 
     What is there under these names is replaced. Raises ArchiveError: the disk refuses; IncompleteStoreError: the cube
     is damaged.
     """
     make_folder(folder)
-    name, order = cube.sweep.name, ">" if big_endian else "<"
+    name = cube.sweep.name
 
     def blocks() -> Iterator[tuple[int, NDArray[Any]]]:
         for first in range(0, cube.shape[0], SHARD_ROWS):
             yield first, cube.read(first, min(first + SHARD_ROWS, cube.shape[0]))
 
     header = folder / f"{name}.hdr"
-    bands = EnviFile(cube.shape, f"{order}u2", interleave, cube.wavelength_nm, cube.fwhm_nm)
+    bands = EnviFile(cube.shape, "u2", cube.wavelength_nm, cube.fwhm_nm)
     axis = {"line axis": cube.sweep.along}
     about = f"raw numbers of sweep {name}"
-    write_envi(header, replace(bands, description=about, ending=f".{interleave}", more=axis), blocks())
+    write_envi(header, replace(bands, description=about, ending=".bil", more=axis), blocks())
     known = cube.references
     panel = ", ".join(repr(value) for value in known.panel.astype(np.float64).tolist())
     of_white = {"panel": f"{{{panel}}}", **({"mirror at rest": "1"} if known.by_mirror else {})}
     bad = np.zeros(known.dark.shape, np.bool_) if known.bad is None else known.bad
     frames: dict[str, tuple[NDArray[Any], str, dict[str, str]]] = {
-        "dark": (known.dark, f"{order}f4", {}),
-        "white": (known.white, f"{order}f4", of_white),
-        "bad": (bad.astype(np.uint8), "|u1", {}),
+        "dark": (known.dark, "f4", {}),
+        "white": (known.white, "f4", of_white),
+        "bad": (bad.astype(np.uint8), "u1", {}),
     }
     if known.flat is not None:
-        frames["flat"] = (known.flat, f"{order}f4", {})
+        frames["flat"] = (known.flat, "f4", {})
     for kind, (frame, dtype, more) in frames.items():
         shape = (1, *known.dark.shape)
         file = replace(bands, shape=shape, dtype=dtype, description=f"{kind} frame of {name}", more=more)
         write_envi(folder / f"{name}.{kind}.hdr", file, [(0, frame[None])])
-    write_whole(folder / f"{name}.pointing.csv", pointing_text(cube))
-    return header
-
-
-def pointing_text(cube: RawCube) -> str:
-    """Give the pointing table of a raw cube as CSV, a row a line."""
     rows = ["line,time,mirror_x,mirror_y,exposure_ms,valid"]
     columns = (cube.time_s, *cube.position.T, cube.exposure_ms)
     for number, values in enumerate(zip(*(column.tolist() for column in columns), strict=True)):
         rows.append(",".join([str(number), *map(repr, values), str(int(cube.valid_line[number]))]))
-    return "\n".join(rows) + "\n"
+    write_whole(folder / f"{name}.pointing.csv", "\n".join(rows) + "\n")
+    return header

@@ -9,16 +9,17 @@ import importlib
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyproj
+import shapely
+import shapely.affinity
 from numpy.typing import NDArray
 from odc.geo.geobox import GeoBox
-from odc.geo.geom import multipoint
 
 from pipeline.errors import ArchiveError
 from storage.archive.whole_files import write_whole
@@ -42,12 +43,6 @@ def clean_id(text: str, otherwise: str) -> str:
     return re.sub(r"[^A-Za-z0-9_-]+", "-", text).strip("-") or otherwise
 
 
-def bounds(geometry: Mapping[str, Any]) -> list[float]:
-    """West, south, east and north of a GeoJSON polygon [degrees]."""
-    points = np.array(geometry["coordinates"][0])
-    return [*points.min(axis=0).tolist(), *points.max(axis=0).tolist()]
-
-
 def footprint(geobox: GeoBox, seen: Iterable[tuple[int, NDArray[np.bool_]]]) -> dict[str, Any] | None:
     """Convex outline of what a map shows, as a GeoJSON polygon in longitude and latitude, anticlockwise.
 
@@ -60,19 +55,16 @@ def footprint(geobox: GeoBox, seen: Iterable[tuple[int, NDArray[np.bool_]]]) -> 
         left, right = mask[rows].argmax(axis=1), mask.shape[1] - mask[rows, ::-1].argmax(axis=1)
         for columns in (left, right):
             corners += [np.stack([columns, first + rows + down], axis=-1) for down in (0, 1)]
-    points = np.concatenate(corners) if corners else np.empty((0, 2), np.intp)
+    points = np.concatenate(corners) if corners else np.empty((0, 2))
     if not len(points):
         return None
-    a, b, c, d, e, f = (float(number) for number in geobox.affine[:6])
-    x, y = points.T
-    places = np.stack([a * x + b * y + c, d * x + e * y + f], axis=-1)
-    hull = multipoint(places.tolist(), geobox.crs).convex_hull.simplify(float(np.hypot(a, d)))
-    to_degrees = pyproj.Transformer.from_crs(map_attributes(geobox)["proj:wkt2"], "EPSG:4326", always_xy=True)
-    ring = np.round(np.stack(to_degrees.transform(*np.array(hull.json["coordinates"][0]).T[:2]), axis=-1), _DIGITS)
-    x, y = (ring - ring[0]).T
-    if float(np.sum(x[:-1] * y[1:] - x[1:] * y[:-1])) < 0:  # twice the area, negative where clockwise
-        ring = ring[::-1]
-    return {"type": "Polygon", "coordinates": [ring.tolist()]}
+    hull = shapely.MultiPoint(points.astype(np.float64)).convex_hull
+    place = map_attributes(geobox)
+    to_degrees = pyproj.Transformer.from_crs(place["proj:wkt2"], "EPSG:4326", always_xy=True)
+    a, b, c, d, e, f = place["spatial:transform"]
+    on_map = shapely.affinity.affine_transform(hull, [a, b, d, e, c, f]).simplify(float(np.hypot(a, d)))
+    on_earth = shapely.transform(on_map, lambda xy: np.stack(to_degrees.transform(*xy.T), axis=-1).round(_DIGITS))
+    return dict(shapely.geometry.mapping(shapely.geometry.polygon.orient(on_earth)))
 
 
 def projection(geobox: GeoBox) -> dict[str, Any]:
@@ -140,45 +132,36 @@ class Item:
     footprint: Mapping[str, Any] | None = None  # GeoJSON geometry; None where the place is not known
 
 
-@dataclass(frozen=True)
-class Collection:
-    """What the collection of a folder says."""
-
-    id: str
-    title: str
-    description: str
-    summaries: Mapping[str, Any] = field(default_factory=dict)
-
-
-def write_stac(folder: Path, collection: Collection, item: Item) -> tuple[Path, Path]:
+def write_stac(folder: Path, collection_id: str, description: str, item: Item) -> tuple[Path, Path]:
     """Write ``ID/ID.json`` and the collection of all items that lie in ``folder``; gives both paths.
 
-    Raises ArchiveError: the folder is another collection's, one of its items cannot be read,
-    or what would be written does not fit STAC's own schemas.
+    Raises ArchiveError: the folder is another collection's, or one of its items cannot be read.
     """
     pystac = importlib.import_module("pystac")
-    check_owner(folder, collection.id)
+    check_owner(folder, collection_id)
     root = pystac.Collection(
-        collection.id,
-        collection.description,
+        collection_id,
+        description,
         _extent(pystac, []),
-        title=collection.title,
+        title=f"Surveys of {collection_id}",
         license="other",
         catalog_type=pystac.CatalogType.SELF_CONTAINED,
     )
     mine = _item(pystac, item)
-    others = [other for other in _items_there(pystac, folder) if other.id != item.id]
-    items = sorted([mine, *others], key=lambda one: (str(one.datetime), one.id))
+    items = [mine]
+    for path in sorted(folder.glob("*/*.json")):  # earlier exports, each in the folder of its own name
+        if path.stem == path.parent.name and path.stem != item.id:
+            try:
+                items.append(pystac.Item.from_dict(_load(path), href=str(path), preserve_dict=False))
+            except (pystac.STACError, pystac.STACTypeError, KeyError, TypeError, ValueError) as error:
+                raise ArchiveError(f"{path} is no STAC item: {error}; remove its folder and export again") from error
+    items.sort(key=lambda one: (str(one.datetime), one.id))
     root.add_items(items)
     root.extent = _extent(pystac, items)
-    root.summaries = pystac.Summaries(_summaries(items) | dict(collection.summaries))
     root.normalize_hrefs(str(folder))
     paths = folder / item.id / f"{item.id}.json", folder / COLLECTION
-    contents = [made.to_dict(include_self_link=False) for made in (mine, root)]
-    for path, content in zip(paths, contents, strict=True):
-        if problems := stac_problems(content):
-            raise ArchiveError(f"{path} would be no valid STAC: {problems[0]}; this is a defect, please report it")
-    for path, content in zip(paths, contents, strict=True):
+    for path, made in zip(paths, (mine, root), strict=True):
+        content = made.to_dict(include_self_link=False)
         write_whole(path, json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n")
     return paths
 
@@ -202,18 +185,6 @@ def _load(path: Path) -> dict[str, Any]:
     return content
 
 
-def _items_there(pystac: Any, folder: Path) -> list[Any]:
-    """Items of earlier exports, each in the folder of its own name."""
-    found = []
-    for path in sorted(folder.glob("*/*.json")):
-        if path.stem == path.parent.name:
-            try:
-                found.append(pystac.Item.from_dict(_load(path), href=str(path), preserve_dict=False))
-            except (pystac.STACError, pystac.STACTypeError, KeyError, TypeError, ValueError) as error:
-                raise ArchiveError(f"{path} is no STAC item: {error}; remove its folder and export again") from error
-    return found
-
-
 def _item(pystac: Any, item: Item) -> Any:
     start, end = (datetime.fromisoformat(text) for text in (item.started, item.finished))
     made = pystac.Item(
@@ -226,7 +197,7 @@ def _item(pystac: Any, item: Item) -> Any:
         end_datetime=end,
     )
     if item.footprint is not None:
-        made.bbox = bounds(item.footprint)
+        made.bbox = list(shapely.geometry.shape(item.footprint).bounds)
     for key, about in item.assets.items():
         made.add_asset(key, pystac.Asset.from_dict(dict(about)))
     names = {*item.properties, *(name for about in item.assets.values() for name in about)}
@@ -242,33 +213,3 @@ def _extent(pystac: Any, items: Sequence[Any]) -> Any:
     times = [(item.common_metadata.start_datetime, item.common_metadata.end_datetime) for item in items]
     interval = [min(start for start, _ in times), max(end for _, end in times)] if times else [None, None]
     return pystac.Extent(pystac.SpatialExtent([box]), pystac.TemporalExtent([interval]))
-
-
-def _summaries(items: Sequence[Any]) -> dict[str, Any]:
-    """What the items' CRS and wavelengths have between them."""
-    found: dict[str, Any] = {}
-    codes = sorted({item.properties["proj:code"] for item in items if item.properties.get("proj:code")})
-    if codes:
-        found["proj:code"] = codes
-    for name in ("hsi:wavelength_min", "hsi:wavelength_max"):
-        values = [item.properties[name] for item in items if name in item.properties]
-        if values:
-            found[name] = {"minimum": min(values), "maximum": max(values)}
-    return found
-
-
-def stac_problems(content: Mapping[str, Any]) -> list[str]:
-    """What STAC's own schemas say of an item or a collection, without a network; empty where nothing.
-
-    Checked: the core schemas of STAC 1.1 that pystac brings, and GeoJSON's. Not checked: the extensions' schemas,
-    which lie on a server.
-    """
-    jsonschema = importlib.import_module("jsonschema")
-    registry = importlib.import_module("referencing").Registry
-    resource = importlib.import_module("referencing").Resource
-    schemas = importlib.import_module("pystac.validation.local_validator").get_local_schema_cache()
-    known = registry().with_resources([(name, resource.from_contents(schema)) for name, schema in schemas.items()])
-    kind = "collection" if content.get("type") == "Collection" else "item"
-    schema = schemas[f"https://schemas.stacspec.org/v1.1.0/{kind}-spec/json-schema/{kind}.json"]
-    errors = jsonschema.Draft7Validator(schema, registry=known).iter_errors(content)
-    return [f"{error.json_path}: {error.message}" for error in errors]

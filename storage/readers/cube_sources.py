@@ -1,7 +1,6 @@
-"""What readers give: an array as it stands in its file, or a cube that gives its lines when asked; and what is known.
+"""The record that all readers return: a cube whose lines are read when asked for, and what is known of it.
 
-Those who open a cube fill it in; whoever stores it asks for 64 lines at a time. What a file says it holds is judged,
-against its bytes and the machine, before anything of that size is asked for.
+The size that a file claims is checked against its bytes and the machine before anything of that size is read.
 """
 
 from __future__ import annotations
@@ -20,7 +19,6 @@ from numpy.typing import NDArray
 from pipeline.errors import SceneError
 from pipeline.rectify.calibrate import calibrate
 from pipeline.source import References
-from storage.readers.scene_toml import BandWavelengths
 
 if TYPE_CHECKING:
     from odc.geo.geobox import GeoBox
@@ -62,42 +60,14 @@ def check_memory(where: object, needed: int) -> None:
 BLOCK_LINES = 64
 MOST_MISSING = 1 << 14  # lines a cube may promise beyond those it has: each costs memory before any of them is seen
 
-RGB_NM = (640.0, 550.0, 460.0)
-NEAR_INFRARED_NM = 800.0
-GREY_NM = 550.0
-
 ReadLines = Callable[[int, int], NDArray[Any]]
-
-
-@dataclass(frozen=True)
-class Raster:
-    """One array as it stands in its file: (y, x) or (y, x, band), numbers of any kind."""
-
-    values: NDArray[Any]
-    assumed_nm: tuple[float, ...] | None = None  # what the file's colours suggest, band by band
-    nodata: float | None = None
-    notes: tuple[str, ...] = ()
-    indices: NDArray[np.uint8] | None = None  # (y, x) of an image that numbers its colours
-    known: BandWavelengths | None = None  # what the file says of its bands
-    files: tuple[Path, ...] = ()  # that it was read from, where that is more than the one named
-    geobox: GeoBox | None = None  # where its pixels lie on the earth
-    void: NDArray[np.bool_] | None = None  # (y, x) pixels that are transparent or masked: they have no value
-    bad_bands: tuple[int, ...] = ()  # that the file itself calls bad, from 0
-    scaling: str = ""  # scale and offset that were applied to the file's numbers, for hashes
-
-    def three_axes(self, path: Path) -> NDArray[Any]:
-        """(y, x, band) values; two axes are one band (SceneError: it has others)."""
-        cube = self.values[..., None] if self.values.ndim == 2 else self.values
-        if cube.ndim != 3:
-            raise SceneError(f"{path} holds shape {cube.shape}; expected (y, x, band), or (y, x) for one band")
-        return cube
 
 
 @dataclass(frozen=True)
 class LineFacts:
     """What is known of each line; None where nothing is known of any."""
 
-    valid: NDArray[np.bool_]  # (line,) the file holds it whole
+    valid: NDArray[np.bool_] | None = None  # (line,) the file holds it whole; None where it holds all
     time_s: NDArray[np.float64] | None = None  # (line,) since the first stamp; NaN where not known
     exposure_ms: NDArray[np.float64] | None = None  # (line,)
     frame: NDArray[np.int64] | None = None  # (line,) as the camera counts; -1 where not known
@@ -123,7 +93,7 @@ class CubeSource:
     dtype: np.dtype[Any]
     read: ReadLines
     files: tuple[Path, ...]  # that all this came from
-    lines: LineFacts
+    lines: LineFacts = LineFacts()
     bands: Bands = field(default_factory=Bands)
     dark: NDArray[np.float32] | None = None  # (sample, band)
     white: NDArray[np.float32] | None = None  # (sample, band)
@@ -134,7 +104,8 @@ class CubeSource:
     nodata: float | None = None
     geobox: GeoBox | None = None  # where (line, sample) lie on the earth
     bad_bands: tuple[int, ...] = ()  # that the files themselves call bad, from 0
-    gaps: bool = False  # some pixels are transparent or masked: NaN
+    void: NDArray[np.bool_] | None = None  # (line, sample) transparent or masked, which have no value
+    scaling: str = ""  # scale and offset that were applied to the file's numbers, for hashes
     headers: Mapping[str, str] = field(default_factory=dict)  # file name -> its text
     root: Path | None = None  # of a store whose files' names count, too
     by_names: tuple[tuple[int, ...], ...] = ()  # numbers in the files' names, where lines or times follow from them
@@ -143,13 +114,21 @@ class CubeSource:
     @property
     def lost_lines(self) -> int:
         """Lines that should be there and are not."""
-        return int(np.count_nonzero(~self.lines.valid))
+        return int(np.count_nonzero(~self.valid))
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """(line,) that are whole in their file."""
+        return np.ones(self.shape[0], np.bool_) if self.lines.valid is None else self.lines.valid
 
 
 def check_cube_source(source: CubeSource) -> None:
     """Refuse what cannot be a cube (SceneError): no real numbers, nothing in it, frames of another size."""
     where = source.name
-    check_numbers(source.dtype, where)
+    if source.dtype.kind == "c":
+        raise SceneError(f"{where} holds complex numbers; store their magnitude")
+    if source.dtype.kind not in "buif":
+        raise SceneError(f"{where} holds {source.dtype}, expected whole or floating numbers")
     if min(source.shape) < 1:
         raise SceneError(f"{where} holds an empty cube of shape {source.shape}")
     for name, frame in (("dark", source.dark), ("white", source.white)):
@@ -158,14 +137,6 @@ def check_cube_source(source: CubeSource) -> None:
                 f"the {name} frame is {frame.shape} (sample, band), {where} is {source.shape[1:]}; give one taken with "
                 "the cube's own binning"
             )
-
-
-def check_numbers(kind: np.dtype[Any], where: object) -> None:
-    """Refuse what is no real number (SceneError)."""
-    if kind.kind == "c":
-        raise SceneError(f"{where} holds complex numbers; store their magnitude")
-    if kind.kind not in "buif":
-        raise SceneError(f"{where} holds {kind}, expected whole or floating numbers")
 
 
 def unpacked(
@@ -216,7 +187,7 @@ def scene_lines(source: CubeSource, start: int, stop: int) -> NDArray[Any]:
     nothing is missing and there are no references.
     """
     raw = source.read(start, stop)
-    valid = source.lines.valid[start:stop]
+    valid = source.valid[start:stop]
     if source.dark is None or source.white is None:
         if valid.all():
             return raw

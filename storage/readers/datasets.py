@@ -18,14 +18,16 @@ from storage.readers.label_files import (
     image_folder,
     is_label_name,
     is_store,
+    label_file,
     listed_names,
     match_folder,
     scene_entries,
+    scene_number,
 )
 from storage.readers.labels import found_classes, load_codes
-from storage.readers.polygon_labels import is_polygon_file, polygon_classes
-from storage.readers.raster_files import SCENE_ENDINGS, split_variable
-from storage.readers.scene_files import SceneFile, label_file, load_scene_file, scene_number
+from storage.readers.open_cubes import CUBE_ENDINGS, split_variable
+from storage.readers.polygons import is_polygon_file, polygon_classes
+from storage.readers.scene_files import SceneFile, load_scene_file
 from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings
 
 
@@ -136,8 +138,7 @@ def load_data_set(
     i the label file's class ``mask_classes[i - 1]``, or i where that is None. Raises SceneError: there is no scene, a
     name to hold out does not exist, a mask is given for several scenes, or labels may belong to several.
     """
-    found = _scenes(path, train_mask)
-    files = found.files
+    files, label_files, alone = _scenes(path, train_mask)
     unknown = [name for name in hold_out if name not in files]
     if unknown:
         raise SceneError(f"{path} has no scene {', '.join(unknown)} to hold out; it has {', '.join(files)}")
@@ -156,8 +157,8 @@ def load_data_set(
         wavelengths=None if wavelengths is None else tuple(wavelengths),
         train_mask=train_mask,
         mask_classes=None if mask_classes is None else tuple(mask_classes),
-        label_files={} if labels is not None else found.labels,
-        alone=found.alone,
+        label_files={} if labels is not None else label_files,
+        alone=alone,
     )
 
 
@@ -175,42 +176,33 @@ def split_labels(
     if mask.shape != scene.labels.shape:
         sizes = [f"{image.shape[0]} x {image.shape[1]} px" for image in (mask, scene.labels)]
         raise SceneError(f"mask {train_mask} is {sizes[0]}, the scene is {sizes[1]} (y x x)")
-    wanted = _mask_to_index(scene, train_mask, int(mask.max(initial=0)), mask_classes)[np.maximum(mask, 0)]
-    trains = (wanted == scene.labels) & (wanted != UNLABELLED)
-    return (np.where(trains, scene.labels, np.uint8(UNLABELLED)), np.where(trains, np.uint8(UNLABELLED), scene.labels))
-
-
-def _mask_to_index(
-    scene: SceneFile, train_mask: str | Path, highest: int, mask_classes: Sequence[int] | None
-) -> NDArray[np.uint8]:
-    """Class index for each number 0..highest of the mask."""
+    highest = int(mask.max(initial=0))
     numbers = {value: index for index, value in enumerate(scene.class_values) if isinstance(value, int)}
     if not numbers:
         raise SceneError(f"{scene.path} has classes by colour; a training mask needs classes by number")
-    given = range(1, highest + 1) if mask_classes is None else mask_classes  # a range: a stray number may be huge
-    if highest > len(given):
-        raise SceneError(f"mask {train_mask} goes up to {highest}, but only {len(given)} mask classes are given")
-    unknown = next((number for number in given[:highest] if number not in numbers), None)
+    classes = range(1, highest + 1) if mask_classes is None else mask_classes  # a range: a stray number may be huge
+    if highest > len(classes):
+        raise SceneError(f"mask {train_mask} goes up to {highest}, but only {len(classes)} mask classes are given")
+    unknown = next((number for number in classes[:highest] if number not in numbers), None)
     if unknown is not None:
         raise SceneError(
             f"mask {train_mask}: class {unknown} is none of the labels' {sorted(numbers)}; correct the mask classes"
         )
-    return np.array([UNLABELLED, *(numbers[number] for number in given[:highest])], np.uint8)
+    index = np.array([UNLABELLED, *(numbers[number] for number in classes[:highest])], np.uint8)
+    wanted = index[np.maximum(mask, 0)]
+    trains = (wanted == scene.labels) & (wanted != UNLABELLED)
+    return (np.where(trains, scene.labels, np.uint8(UNLABELLED)), np.where(trains, np.uint8(UNLABELLED), scene.labels))
 
 
-@dataclass(frozen=True)
-class _Scenes:
-    files: dict[str, str]  # name -> file (or FILE:VARIABLE)
-    labels: dict[str, Path] = field(default_factory=dict)
-    alone: tuple[Path, ...] = ()
-
-
-def _scenes(path: str | Path, train_mask: str | Path | None) -> _Scenes:
+def _scenes(
+    path: str | Path, train_mask: str | Path | None
+) -> tuple[dict[str, str], dict[str, Path], tuple[Path, ...]]:
+    """Return the files of scenes, their label files, both by name, and label files without a scene."""
     file, _ = split_variable(path)
     if not file.is_dir() or is_store(file):
         if not file.exists():
             raise SceneError(f"there is no file or folder {file}; check the name (seen from {Path.cwd()})")
-        return _Scenes({file.stem: str(path)})
+        return {file.stem: str(path)}, {}, ()
     folder = image_folder(file)
     settings = find_scene_settings(folder / SETTINGS_NAME)
     masks = () if train_mask is None else (split_variable(train_mask)[0].resolve(),)
@@ -218,12 +210,12 @@ def _scenes(path: str | Path, train_mask: str | Path | None) -> _Scenes:
     images = [image for image in found.images if image.resolve() not in masks]
     if not images:
         raise SceneError(
-            f"{folder} holds no scene ({', '.join(SCENE_ENDINGS)}); give a folder of images, or with images/ in it"
+            f"{folder} holds no scene ({', '.join(CUBE_ENDINGS)}); give a folder of images, or with images/ in it"
             f"{folders_within(folder)}"
         )
     names = _names(images)
     labels = {image: label for image, label in found.labels.items() if label.resolve() not in masks}
-    return _Scenes(
+    return (
         {name: str(image) for name, image in names.items()},
         {name: labels[image] for name, image in names.items() if image in labels},
         tuple(one for one in found.alone if one.resolve() not in masks),

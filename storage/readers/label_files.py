@@ -1,39 +1,31 @@
-"""Which label file belongs to which image, by their names alone, and the names of classes that lie beside label files.
+"""Label files that belong to scenes by their names, and the names of classes that lie beside label files.
 
 Labels are pictures, or polygons where there is no picture. They lie beside their images (``001_mask.png``,
 ``field_a_labels.png``, ``field_a.gpkg``) or in a folder of labels there, or beside a folder of images
 (``labels/001.png``, ``annotations/001_annotation.png``); names are equal, or but for a word such as ``_mask``. Upper
 and lower case are alike.
-
-Names of classes come as a list in a text file, as JSON, and as GDAL, QGIS and ENVI write them. Each is read leniently,
-as people write them: ``1 crop``, ``crop: 1``, ``crop, 0, 255, 0``, ``#00ff00 crop``, or names alone, in the order of
-their numbers.
 """
 
 from __future__ import annotations
 
 import csv
-import json
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-from xml.etree import ElementTree
 
 from pipeline.errors import SceneError
-from storage.readers.envi_cubes import find_envi_pair, load_envi_header
-from storage.readers.polygon_labels import POLYGON_ENDINGS
-from storage.readers.raster_files import SCENE_ENDINGS
-from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, is_image_folder
+from storage.readers.open_cubes import CUBE_ENDINGS
+from storage.readers.polygons import POLYGON_ENDINGS, split_layer
+from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, is_image_folder
 
 LABEL_WORDS = ("mask", "masks", "label", "labels", "annotation", "annotations", "gt", "groundtruth", "truth", "seg")
 LABEL_FOLDERS = {*LABEL_WORDS, "ground_truth", "segmentation", "segmentations", "targets", "labelimages"}
 IMAGE_WORDS = ("image", "img", "rgb", "picture", "photo", "scene", "ortho", "cube")
 SHOWN = 5  # names in a message
 STEMS = ("classes", "class_names", "classnames", "labels", "label_names", "legend", "categories", "class_dict", "names")
-TEXTS, TABLES = (".txt", ".csv", ".tsv"), (".json",)
+TEXTS = (".txt", ".csv", ".tsv")
 MOST_BYTES = 1 << 20  # of a legend
 _HEX = re.compile(r"^#?([0-9a-fA-F]{6})$")
 
@@ -66,7 +58,7 @@ def scene_entries(folder: Path) -> list[Path]:
         entry
         for entry in folder.iterdir()
         if not entry.name.startswith(".")
-        and ((entry.suffix.lower() in SCENE_ENDINGS and entry.is_file()) or is_store(entry))
+        and ((entry.suffix.lower() in CUBE_ENDINGS and entry.is_file()) or is_store(entry))
     )
 
 
@@ -92,7 +84,14 @@ def match_folder(folder: Path) -> MatchedFiles:
     labels = {image: found for image, found in told.items() if found is not None}
     if len(images) == len([*beside, *apart]) == 1:  # they need no name to belong together
         labels = dict(zip(images, [*beside, *apart], strict=True))
-    _refuse_shared(labels)
+    owner: dict[Path, Path] = {}
+    for image, label in labels.items():
+        if label in owner:
+            raise SceneError(
+                f"{owner[label]} and {image} would both have the labels {label}, by their names; rename one of them, or"
+                f" say which files are labels in a {SETTINGS_NAME}"
+            )
+        owner[label] = image
     alone = tuple(entry for entry in (*beside, *apart) if entry not in set(labels.values()))
     return MatchedFiles(tuple(images), labels, alone)
 
@@ -161,7 +160,11 @@ def _label_of(image: Path, candidates: Sequence[Path]) -> Path | None:
     stem = image.stem.lower()
     for alike in (lambda name: name, lambda name: _IMAGE_WORD.sub("", name)):
         wanted = alike(stem)
-        found = [one for one in candidates if wanted in (alike(one.stem.lower()), alike(_bare(one)))]
+        found = [
+            one
+            for one in candidates
+            if wanted in (alike(one.stem.lower()), alike(_LABEL_WORD.sub("", one.stem.lower(), count=1)))
+        ]
         if len(found) > 1:
             names = " and ".join(str(one) for one in found[:SHOWN])
             home = image.parent.parent if is_image_folder(image.parent) else image.parent
@@ -175,31 +178,51 @@ def _label_of(image: Path, candidates: Sequence[Path]) -> Path | None:
     return None
 
 
-def _bare(label: Path) -> str:
-    return _LABEL_WORD.sub("", label.stem.lower(), count=1)
+def label_file(scene: Path, settings: SceneSettings) -> tuple[Path | None, str]:
+    """Return the labels of a scene, by scene.toml or else by their name; and why there are none, if that is known.
+
+    Raises SceneError: scene.toml asks for a number that the scene's name lacks, or several files may be meant.
+    """
+    if settings.labels is None or settings.path is None:
+        return find_label(scene), ""
+    if not settings.labels:
+        return None, ""
+    number = scene_number(scene)
+    if "{number}" in settings.labels and number is None:
+        raise SceneError(
+            f"{scene} has no number in its name, which labels = {settings.labels!r} in scene.toml asks for; write"
+            " {name} for the whole name"
+        )
+    address = settings.path.parent / filled(settings.labels, scene)
+    if address != settings.path.parent / settings.labels and not split_layer(address)[0].is_file():
+        return None, f"no labels: there is no {address}"
+    return address, ""
 
 
-def _refuse_shared(labels: dict[Path, Path]) -> None:
-    owner: dict[Path, Path] = {}
-    for image, label in labels.items():
-        if label in owner:
-            raise SceneError(
-                f"{owner[label]} and {image} would both have the labels {label}, by their names; rename one of them, or"
-                f" say which files are labels in a {SETTINGS_NAME}"
-            )
-        owner[label] = image
+def filled(pattern: str, scene: Path) -> str:
+    """Return the ``labels`` of a scene.toml with the name and the number of a scene put in."""
+    return pattern.replace("{number}", scene_number(scene) or "").replace("{name}", scene.stem)
+
+
+def scene_number(path: Path) -> str | None:
+    """``059_image.png`` -> ``059``: the first digits of the file's name."""
+    digits = re.search(r"\d+", path.stem)
+    return None if digits is None else digits.group()
+
+
+# --- names of classes -------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Legend:
-    """Names by the value of their class in the label files, or in the order of their numbers where no value is told."""
+    """Names by the value of their class in the label files, or in the order of their numbers where no value stands."""
 
     path: Path
     names: Mapping[ClassValue, str]
     listed: tuple[str, ...] = ()
 
     def name_of(self, value: ClassValue, place: int, values: Sequence[ClassValue]) -> str | None:
-        """The name of a value, the ``place``-th of the ``values`` that the files hold; None where none is told.
+        """Return the name of a value, the ``place``-th of the ``values`` that the files hold; None where none is known.
 
         Names in a list without numbers are those of 0, 1, ...; where there are as many as values, of these in order.
         """
@@ -210,15 +233,11 @@ class Legend:
         return self.listed[place] if isinstance(value, int) and len(self.listed) == len(values) else None
 
 
-def find_legend(folders: Sequence[Path], labels: Sequence[Path]) -> Legend | None:
-    """The first legend beside the labels, or one that stands in or beside a label file; None where there is none."""
-    for label in labels[:1]:
-        for found in _of_label(label):
-            if found.names or found.listed:
-                return found
+def find_legend(folders: Sequence[Path]) -> Legend | None:
+    """Return the first list of names in the folders; None where there is none."""
     for folder in dict.fromkeys(folders):
         for path in sorted(folder.iterdir()):
-            if path.stem.lower() in STEMS and path.suffix.lower() in (*TEXTS, *TABLES) and path.is_file():
+            if path.stem.lower() in STEMS and path.suffix.lower() in TEXTS and path.is_file():
                 legend = read_legend(path)
                 if legend is not None:
                     return legend
@@ -226,16 +245,15 @@ def find_legend(folders: Sequence[Path], labels: Sequence[Path]) -> Legend | Non
 
 
 def read_legend(path: Path) -> Legend | None:
-    """Read one legend; None where nothing in it names a class."""
+    """Read a list of names, leniently: ``1 crop``, ``crop: 1``, ``crop, 0, 255, 0``, ``#00ff00 crop``, or names alone.
+
+    None where nothing in it names a class.
+    """
     if path.stat().st_size > MOST_BYTES:
         return None
     try:
-        text = path.read_text(encoding="utf-8-sig")
-        if path.suffix.lower() in TABLES:
-            pairs = list(_of_table(json.loads(text)))
-        else:
-            pairs = [pair for line in text.splitlines() if (pair := _of_line(line)) is not None]
-    except (ValueError, RecursionError):
+        pairs = [pair for line in path.read_text(encoding="utf-8-sig").splitlines() if (pair := _of_line(line))]
+    except ValueError:
         return None
     names = {value: name for value, name in pairs if value is not None}
     listed = tuple(name for value, name in pairs if value is None)
@@ -243,9 +261,9 @@ def read_legend(path: Path) -> Legend | None:
 
 
 def _of_line(line: str) -> tuple[ClassValue | None, str] | None:
-    """Value and name of one line, in any order; None of a heading, a comment or an empty line."""
+    """Return value and name of one line, in any order; None of a heading, a comment or an empty line."""
     bare = line.strip()
-    if not bare or bare.startswith(("//", "__ignore__")) or (bare.startswith("#") and not _HEX.match(bare.split()[0])):
+    if not bare or bare.startswith("//") or (bare.startswith("#") and not _HEX.match(bare.split()[0])):
         return None
     parts = next(csv.reader([bare])) if "," in bare else re.split(r"[\t:;=]+", bare)
     words = [word for part in parts for word in part.split()]
@@ -257,71 +275,6 @@ def _of_line(line: str) -> tuple[ClassValue | None, str] | None:
     if len(numbers) >= 3 and max(numbers[-3:]) < 256:
         return (numbers[-3], numbers[-2], numbers[-1]), name
     if not numbers and colours and name != colours[0]:
-        return _colour(colours[0]), name
+        red, green, blue = bytes.fromhex(colours[0])
+        return (red, green, blue), name
     return (numbers[0] if numbers else None), name
-
-
-def _colour(hexadecimal: str) -> ClassValue:
-    red, green, blue = bytes.fromhex(hexadecimal)
-    return red, green, blue
-
-
-def _of_table(content: Any) -> Iterator[tuple[ClassValue | None, str]]:
-    """Pairs of value and name in what a JSON file holds, however they are put."""
-    if isinstance(content, dict):
-        inner = next((content[key] for key in ("classes", "categories", "labels", "legend") if key in content), None)
-        if isinstance(inner, dict | list):
-            yield from _of_table(inner)
-            return
-        for key, value in content.items():
-            if isinstance(value, str):
-                yield _value(key), value
-            elif (found := _value(value)) is not None:
-                yield found, str(key)
-    elif isinstance(content, list):
-        for entry in content:
-            if isinstance(entry, str):
-                yield None, entry
-            elif isinstance(entry, dict):
-                told = [entry.get(key) for key in ("color", "colour", "rgb", "id", "value", "index", "class")]
-                values = [found for one in told if (found := _value(one)) is not None]
-                name = entry.get("name", entry.get("label", entry.get("title")))
-                if isinstance(name, str):
-                    yield (values[0] if values else None), name
-
-
-def _value(told: Any) -> ClassValue | None:
-    if isinstance(told, bool):
-        return None
-    if isinstance(told, int):
-        return told
-    if isinstance(told, str):
-        found = _HEX.match(told)
-        return int(told) if told.isdecimal() else None if found is None else _colour(found[1])
-    if isinstance(told, list) and len(told) >= 3 and all(isinstance(one, int) and 0 <= one < 256 for one in told[:3]):
-        return told[0], told[1], told[2]
-    return None
-
-
-def _of_label(label: Path) -> Iterator[Legend]:
-    """What stands beside one label file: GDAL's .aux.xml, QGIS's .qml; of ENVI, what its header says."""
-    for path in (label.with_name(label.name + ".aux.xml"), label.with_suffix(".qml")):
-        if not path.is_file() or path.stat().st_size > MOST_BYTES:
-            continue
-        try:
-            root = ElementTree.fromstring(path.read_bytes())
-        except ElementTree.ParseError:
-            continue
-        listed = tuple((entry.text or "").strip() for entry in root.iter("Category"))
-        entries = [(entry.get("value", ""), entry.get("label", "")) for entry in root.iter("paletteEntry")]
-        yield Legend(
-            path,
-            {int(value): name for value, name in entries if value.isdecimal() and len(value) < 10 and name},
-            listed,
-        )
-    try:
-        header, _ = find_envi_pair(label)
-        told = load_envi_header(header).fields.get("class names", "") if header.is_file() else ""
-    except SceneError:
-        return
-    yield Legend(header, {}, tuple(name.strip() for name in told.split(",") if name.strip()))

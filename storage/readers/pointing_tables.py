@@ -22,8 +22,9 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -82,11 +83,6 @@ class PointingTable:
     sweep: tuple[str, ...] | None  # (row,)
     first_row: int  # number of the first row in the file, as an editor counts them
 
-    @property
-    def sweeps(self) -> tuple[str, ...]:
-        """Names in the column ``sweep``, in the order of the file; none without it."""
-        return tuple(dict.fromkeys(self.sweep or ()))
-
     def of_cube(self, name: str, lines: int, mounting: Mounting = STRAIGHT, *, alone: bool = False) -> LinePointing:
         """Give the pointing of a cube's ``lines`` lines: rows whose ``sweep`` is its name, or all without that column.
 
@@ -94,14 +90,13 @@ class PointingTable:
         the device's positions to the model's. Raises SceneError: the table has no row or another number of rows for the
         cube, a value that is no number, out of range or beyond the mirror, times that do not rise, or no valid row.
         """
-        rows = np.arange(len(self.columns[KINDS[self.kind][0]]))
-        cut = self.sweep is not None and alone and name not in self.sweeps
+        rows, sweeps = np.arange(len(self.columns[KINDS[self.kind][0]])), tuple(dict.fromkeys(self.sweep or ()))
+        cut = self.sweep is not None and alone and name not in sweeps
         if self.sweep is not None and not cut:
             rows = np.array([row for row in rows if self.sweep[row] == name], np.intp)
             if not len(rows):
                 raise SceneError(
-                    f"{self.path} has no row for the cube {name!r}; its column 'sweep' names "
-                    f"{', '.join(self.sweeps[:8])}"
+                    f"{self.path} has no row for the cube {name!r}; its column 'sweep' names {', '.join(sweeps[:8])}"
                 )
         if len(rows) != lines:
             way = "fewer" if len(rows) < lines else "more"
@@ -109,54 +104,33 @@ class PointingTable:
                 f"{self.path} has {len(rows)} rows for {name}, {way} than its {lines} lines; give one row for each "
                 "line, with valid = 0 for those to be left out"
             )
-        rows = self._in_order(rows, lines)
-        valid = self._flags(rows)
+        if "line" in self.columns:
+            order = np.argsort(self.columns["line"][rows], kind="stable")
+            wrong = self.columns["line"][rows][order] != np.arange(lines)
+            rows = rows[order]
+            self._refuse(rows, wrong, "line", f"expected each of 0 to {lines - 1} once")
+        valid = np.ones(lines, np.bool_)
+        if "valid" in self.columns:
+            flags = self.columns["valid"][rows]
+            self._refuse(rows, ~np.isin(flags, (0, 1)), "valid", "expected 0 or 1")
+            valid = flags == 1
         if not valid.any():
             raise SceneError(f"{self.path} calls no line of {name} valid; set valid = 1 for lines that can be used")
-        for column in (*KINDS[self.kind], "time", "exposure_ms"):
-            self._check_known(column, rows, valid)
-        time_s = self._times(rows)
-        exposure_ms = None
+        for column in {*KINDS[self.kind], "time", "exposure_ms"} & set(self.columns):
+            unknown = valid & ~np.isfinite(self.columns[column][rows])
+            self._refuse(rows, unknown, column, "expected a number; set valid = 0 where it is not known")
+        time_s = exposure_ms = None
+        if "time" in self.columns:  # NaN where a line is not valid and has none
+            time_s = self.columns["time"][rows]
+            known = np.flatnonzero(np.isfinite(time_s))
+            stuck = np.zeros(lines, np.bool_)
+            stuck[known[1:]] = np.diff(time_s[known]) <= 0
+            self._refuse(rows, stuck, "time", "expected a time after that of the line before [s]")
         if "exposure_ms" in self.columns:
             exposure_ms = _filled(self.columns["exposure_ms"][rows], valid)
             self._refuse(rows, exposure_ms <= 0, "exposure_ms", "expected a time above 0 ms")
         part = tuple(self.sweep[row] for row in rows) if self.sweep is not None and cut else None
         return LinePointing(self.kind, self._positions(rows, valid, mounting), valid, time_s, exposure_ms, part)
-
-    def _in_order(self, rows: NDArray[np.intp], lines: int) -> NDArray[np.intp]:
-        """The rows by their line numbers, where the table has them (SceneError: they are not 0 to lines - 1)."""
-        if "line" not in self.columns:
-            return rows
-        numbers = self.columns["line"][rows]
-        order = np.argsort(numbers, kind="stable")
-        self._refuse(rows[order], numbers[order] != np.arange(lines), "line", f"expected each of 0 to {lines - 1} once")
-        return rows[order]
-
-    def _flags(self, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
-        if "valid" not in self.columns:
-            return np.ones(len(rows), np.bool_)
-        values = self.columns["valid"][rows]
-        self._refuse(rows, ~np.isin(values, (0, 1)), "valid", "expected 0 or 1")
-        flags: NDArray[np.bool_] = values == 1
-        return flags
-
-    def _check_known(self, column: str, rows: NDArray[np.intp], valid: NDArray[np.bool_]) -> None:
-        if column in self.columns:
-            values = self.columns[column][rows]
-            self._refuse(
-                rows, valid & ~np.isfinite(values), column, "expected a number; set valid = 0 where it is not known"
-            )
-
-    def _times(self, rows: NDArray[np.intp]) -> Floats | None:
-        """(line,) times, NaN where a line is not valid and has none (SceneError: they do not rise)."""
-        if "time" not in self.columns:
-            return None
-        times = self.columns["time"][rows]
-        known = np.flatnonzero(np.isfinite(times))
-        stuck = np.zeros(len(rows), np.bool_)
-        stuck[known[1:]] = np.diff(times[known]) <= 0
-        self._refuse(rows, stuck, "time", "expected a time after that of the line before [s]")
-        return times
 
     def _positions(self, rows: NDArray[np.intp], valid: NDArray[np.bool_], mounting: Mounting) -> Floats:
         """(line, 2) positions of the model, or (line, 1) places; made up between valid lines for those that are not."""
@@ -187,15 +161,10 @@ class PointingTable:
         came = ", ".join(f"{name} = {self.columns[name][first]:.10g}" for name in names)
         count = int(np.count_nonzero(wrong))
         more = "" if count == 1 else f" (the first of {count} such rows)"
-        spans = "; ".join(f"{name} goes from {low:.6g} to {high:.6g}" for name, low, high in self._spans(names))
-        raise SceneError(
-            f"{self.path}, row {first + self.first_row}: {came}{more}, {expected}. {spans}; correct the table"
-        )
-
-    def _spans(self, names: Sequence[str]) -> Iterator[tuple[str, float, float]]:
-        for name in names:
-            known = self.columns[name][np.isfinite(self.columns[name])]
-            yield name, *((float(known.min()), float(known.max())) if len(known) else (math.nan, math.nan))
+        known = {name: self.columns[name][np.isfinite(self.columns[name])] for name in names}
+        spans = [f"{name} goes from {one.min():.6g} to {one.max():.6g}" for name, one in known.items() if len(one)]
+        row = first + self.first_row
+        raise SceneError(f"{self.path}, row {row}: {came}{more}, {expected}. {'; '.join(spans)}; correct the table")
 
 
 def _filled(values: Floats, valid: NDArray[np.bool_]) -> Floats:
@@ -321,7 +290,10 @@ def load_played_vector(path: Path, mounting: Mounting = STRAIGHT) -> PlayedVecto
             raise SceneError(f"{path}: {name} = {value!r}, expected a number{above}; correct it")
     file = path.parent / stated["vector"]
     try:
-        values = np.load(file, allow_pickle=False) if file.suffix == ".npy" else _csv_numbers(file)
+        if file.suffix == ".npy":
+            values = np.load(file, allow_pickle=False)
+        else:  # without a header, (row, column)
+            values = np.loadtxt(re.sub(r"[;\t]", ",", _text(file)).splitlines(), delimiter=",", ndmin=2)
         if values.dtype.kind not in "iuf":
             raise ValueError(f"it holds {values.dtype}")
         positions = mounting.to_model(split_vector(values.astype(np.float64), str(file)))
@@ -333,11 +305,6 @@ def load_played_vector(path: Path, mounting: Mounting = STRAIGHT) -> PlayedVecto
     except (OSError, ValueError, EOFError) as error:
         raise SceneError(f"{file} cannot be read as a vector: {error}; give CSV or .npy with numbers") from error
     return PlayedVector(positions, float(rate_hz), float(start_s))  # type: ignore[arg-type]
-
-
-def _csv_numbers(path: Path) -> Floats:
-    """Numbers of a text file without a header, (row, column)."""
-    return np.loadtxt(_text(path).replace(";", ",").replace("\t", ",").splitlines(), delimiter=",", ndmin=2)
 
 
 def follow_vector(vector: PlayedVector, middle_s: Floats, where: str) -> LinePointing:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 import zipfile
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -18,8 +18,8 @@ from xml.etree import ElementTree
 import numpy as np
 
 from pipeline.errors import SceneError
-from storage.readers.raster_files import Scaling, TiffRows, open_image_rows
-from storage.readers.scene_toml import BandWavelengths
+from storage.readers.cube_sources import Bands, CubeSource
+from storage.readers.image_files import open_image, rescaled
 
 RESOLUTIONS = ("10m", "20m", "60m")
 # bands in the order of their numbers in metadata: resolution, centre and width [nm] as ESA publishes them
@@ -53,16 +53,6 @@ def is_safe_product(path: Path) -> bool:
 
 
 @dataclass(frozen=True)
-class _Radiometry:
-    """What the metadata say of numbers and bands."""
-
-    level: str
-    quantification: float
-    offsets: Mapping[str, float]  # by band
-    centre_nm: Mapping[str, float]  # by band
-
-
-@dataclass(frozen=True)
 class _Product:
     """The files of a product by their names within it, and what opens them."""
 
@@ -72,8 +62,8 @@ class _Product:
     address: Callable[[str], str]  # for GDAL
 
 
-def open_safe_rows(path: Path, resolution: str | None = None) -> TiffRows:
-    """Open the bands of one resolution (``10m``, ``20m`` or ``60m``; 10 m where none is named) as one image.
+def open_safe_cube(path: Path, resolution: str | None = None) -> CubeSource:
+    """Open the bands of one resolution (``10m``, ``20m`` or ``60m``; 10 m where none is named) as one cube.
 
     Values are reflectances with the product's quantification value and offset, NaN where the product has no data.
     Raises SceneError: it is no such product or damaged, has no such resolution, or holds several tiles.
@@ -90,37 +80,29 @@ def open_safe_rows(path: Path, resolution: str | None = None) -> TiffRows:
             f"{path} has no {lacking}; give a Sentinel-2 product of level 1C or 2A as its .SAFE folder or .zip, and"
             " unpack a .zip of anything else"
         )
-    said = _radiometry(product, metadata)
-    opened = [open_image_rows(path, product.address(name)) for name in images.values()]
-    first = opened[0]
-    odd = next((one for one in opened if (one.shape, one.geobox) != (first.shape, first.geobox)), None)
-    if odd is not None or first.shape[2] != 1:
+    quantification, offsets, centres = _radiometry(product, metadata)
+    opened = [open_image(path, product.address(name), scaled=False) for name in images.values()]
+    first, names = opened[0], list(images)
+    if any((one.shape, one.geobox) != (first.shape, first.geobox) for one in opened) or first.shape[2] != 1:
         raise SceneError(f"{path}: its bands of {wanted} are of several sizes or places; copy the product again")
-    names = list(images)
-    scale = np.full(len(names), 1 / said.quantification)
-    offset = np.array([said.offsets.get(name, 0.0) / said.quantification for name in names])
-    scaling = Scaling(scale, offset, NODATA, first.dtype)
-    centres = np.array([said.centre_nm.get(name, _BANDS[name][1]) for name in names])
-    origin = (
-        f"wavelengths from {metadata.rpartition('/')[2]}" if said.centre_nm else "wavelengths as ESA publishes them"
-    )
-    told = f"Sentinel-2 level {said.level}, bands {', '.join(names)} of {wanted}"
+    centre_nm = np.array([centres.get(name, _BANDS[name][1]) for name in names])
+    origin = f"wavelengths from {metadata.rpartition('/')[2]}" if centres else "wavelengths as ESA publishes them"
     others = ", ".join(f":{one}" for one in RESOLUTIONS if one != wanted and _images_of(product, one))
-    more = f"; other resolutions after the name of the product: {others}" if others else ""
-    inside = () if path.is_file() else tuple(path / name for name in (metadata, *images.values()))
-    return replace(
+    level = "1C" if "1C" in metadata.rpartition("/")[2] else "2A"
+    note = f"Sentinel-2 level {level}, bands {', '.join(names)} of {wanted}"
+    note += f"; other resolutions after the name of the product: {others}" if others else ""
+    joined = replace(
         first,
-        path=path,
+        name=path.name,
         shape=(*first.shape[:2], len(names)),
-        dtype=np.dtype(np.float32),
-        bands=tuple((product.address(name), (0,)) for name in images.values()),
-        assumed_nm=None,
-        nodata=None,
-        notes=(told + more, scaling.note, *first.notes),
-        known=BandWavelengths(centres, np.array([_BANDS[name][2] for name in names]), origin),
-        scaling=scaling,
-        files=inside,
+        read=lambda start, stop: np.concatenate([one.read(start, stop) for one in opened], axis=2),
+        files=(path,) if path.is_file() else tuple(path / name for name in (metadata, *images.values())),
+        bands=Bands(centre_nm, np.array([_BANDS[name][2] for name in names]), "nm", origin),
+        notes=(note,),
     )
+    offset = np.array([offsets.get(name, 0.0) / quantification for name in names])
+    source = rescaled(joined, np.full(len(names), 1 / quantification), offset, NODATA)
+    return replace(source, scaling="", notes=(*source.notes, *first.notes))  # the hash of the metadata says the scale
 
 
 def _opened(path: Path) -> _Product:
@@ -158,13 +140,14 @@ def _images_of(product: _Product, resolution: str) -> dict[str, str]:
     return {band: files[band] for files in found.values() for band in _BANDS if band in files}
 
 
-def _radiometry(product: _Product, metadata: str) -> _Radiometry:
+def _radiometry(product: _Product, metadata: str) -> tuple[float, dict[str, float], dict[str, float]]:
+    """Return quantification value, offsets by band and central wavelengths [nm] by band (SceneError: damaged)."""
     try:
         elements = list(ElementTree.fromstring(product.text(metadata)).iter())
     except ElementTree.ParseError as error:
         raise SceneError(f"{product.path}: {metadata} cannot be read as XML: {error}; copy it again") from error
-    numbers = list(_BANDS)
-    quantification, offsets, centres = None, {}, {}
+    numbers, quantification = list(_BANDS), 0.0
+    offsets, centres = dict[str, float](), dict[str, float]()
     try:
         for element in elements:
             tag = element.tag.rpartition("}")[2]
@@ -176,7 +159,6 @@ def _radiometry(product: _Product, metadata: str) -> _Radiometry:
                 centres[numbers[int(element.get("bandId", ""))]] = float(centre)
     except (ValueError, IndexError) as error:
         raise SceneError(f"{product.path}: {metadata} holds what is no number: {error}; copy it again") from error
-    if quantification is None or quantification <= 0:
+    if quantification <= 0:
         raise SceneError(f"{product.path}: {metadata} has no quantification value above 0; copy the product again")
-    found = _METADATA.search(metadata)
-    return _Radiometry("" if found is None else found[1], quantification, offsets, centres)
+    return quantification, offsets, centres

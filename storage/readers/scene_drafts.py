@@ -18,6 +18,7 @@ from storage.readers.cube_sources import CubeSource
 from storage.readers.label_files import (
     Legend,
     MatchedFiles,
+    filled,
     find_label,
     find_legend,
     folders_within,
@@ -26,12 +27,11 @@ from storage.readers.label_files import (
     is_store,
     listed_names,
     match_folder,
+    scene_number,
 )
-from storage.readers.labels import MIXED, MOST_FOUND_CLASSES, load_codes, shown_value, value_of_code
-from storage.readers.polygon_labels import is_polygon_file, load_polygon_labels, polygon_classes
-from storage.readers.raster_files import IMAGE_ENDINGS, ROW_ENDINGS, image_shape, open_tiff_rows, split_variable
-from storage.readers.scan_files import open_cube_source
-from storage.readers.scene_files import scene_number
+from storage.readers.labels import MIXED, MOST_FOUND_CLASSES, colour_of, load_codes, shown_value
+from storage.readers.open_cubes import open_cube, split_variable, with_wavelengths
+from storage.readers.polygons import is_polygon_file, load_polygon_labels, polygon_classes
 from storage.readers.scene_toml import ClassValue, SceneSettings
 
 Report = Callable[[float, str], None]  # how far it is, 0..1, and at which file
@@ -79,15 +79,23 @@ def draft_scene(address: str | Path, report: Report = lambda done, name: None) -
     alone = not path.is_dir() or is_store(path)
     if not path.exists():
         raise SceneError(f"there is no file or folder {path}; check the name (seen from {Path.cwd()})")
-    found = _one_file(path) if alone else match_folder(image_folder(path))
+    if alone:
+        label = None if is_label_name(path) else find_label(path)
+        found = MatchedFiles((path,), {} if label is None else {path: label}, ())
+    else:
+        found = match_folder(image_folder(path))
     if not found.images:
         within = folders_within(path)
         raise SceneError(f"{path} holds no image that is read; give a folder of images, or with images/ in it{within}")
     folder = path.parent if alone else path
-    source = open_cube_source(address if alone else found.images[0])
-    legend = find_legend([folder, *(label.parent for label in found.labels.values())], list(found.labels.values()))
+    first = address if alone else found.images[0]
+    source = with_wavelengths(open_cube(first), first, None)
+    legend = find_legend([folder, *(label.parent for label in found.labels.values())])
     unseen: list[str] = []
-    unseen += _polygons(found)
+    # files that may hold outlines in words that no reader here knows
+    outlines = [one for image in found.bare for one in map(image.with_suffix, (".json", ".xml")) if one.is_file()]
+    if outlines:
+        unseen.append(f"what is in {listed_names(outlines)}: outlines are read as GeoPackage, GeoJSON or shapefile")
     pictures = {image: label for image, label in found.labels.items() if not is_polygon_file(label)}
     if pictures or not found.labels:
         classes = _classes(replace(found, labels=pictures), source.shape, legend, unseen, report)
@@ -111,19 +119,6 @@ def draft_scene(address: str | Path, report: Report = lambda done, name: None) -
     )
 
 
-def _one_file(path: Path) -> MatchedFiles:
-    label = None if is_label_name(path) else find_label(path)
-    return MatchedFiles((path,), {} if label is None else {path: label}, ())
-
-
-def _polygons(found: MatchedFiles) -> list[str]:
-    """Tell of files beside images without labels that may hold outlines in words that no reader here knows."""
-    outlines = [one for image in found.bare for one in map(image.with_suffix, (".json", ".xml")) if one.is_file()]
-    if not outlines:
-        return []
-    return [f"what is in {listed_names(outlines)}: outlines are read as GeoPackage, GeoJSON or shapefile alone"]
-
-
 def _pattern(found: MatchedFiles, folder: Path) -> str | None:
     """The ``labels`` of a scene.toml that tells each image its own file, and others none; None where none does."""
     for image, label in list(found.labels.items())[:1]:
@@ -134,15 +129,11 @@ def _pattern(found: MatchedFiles, folder: Path) -> str | None:
         tried += [label.name] if len(found.images) == 1 else []
         for name in tried:
             pattern = Path(place, name).as_posix()
-            places = {one: (folder / _filled(pattern, one)).resolve() for one in found.images}
+            places = {one: (folder / filled(pattern, one)).resolve() for one in found.images}
             fits = all(places[one] == own.resolve() for one, own in found.labels.items())
             if fits and pattern.isprintable() and not any(places[one].exists() for one in found.bare):
                 return pattern
     return None
-
-
-def _filled(pattern: str, image: Path) -> str:
-    return pattern.replace("{number}", scene_number(image) or "").replace("{name}", image.stem)
 
 
 def _classes(
@@ -156,7 +147,7 @@ def _classes(
         report(number / len(found.labels), label.name)
         try:
             codes, is_colour = load_codes(label, by_number=by_number)
-            size = shape if image == found.images[0] else _shape(image)
+            size = shape if image == found.images[0] else open_cube(image).shape
         except PipelineError as error:
             unseen.append(str(error))
             continue
@@ -172,8 +163,12 @@ def _classes(
         report(1.0, "")
     of_colours = bool(counts)
     counts.update({code * (0x010101 if of_colours else 1): count for code, count in greys.items()})
-    _refuse_many(counts)
-    values_found = [value_of_code(code, is_colour=of_colours) for code in sorted(counts)]
+    if len(counts) > MOST_FOUND_CLASSES:
+        raise SceneError(
+            f"the label files have {len(counts)} different values together, at most {MOST_FOUND_CLASSES} are taken for"
+            f" classes: {MIXED}"
+        )
+    values_found = [colour_of(code) if of_colours else code for code in sorted(counts)]
     every = counts.total()
     classes = []
     for place, (code, value) in enumerate(zip(sorted(counts), values_found, strict=True)):
@@ -192,7 +187,7 @@ def _polygon_classes(found: MatchedFiles, unseen: list[str], report: Report) -> 
     for number, (image, label) in enumerate(found.labels.items()):
         report(number / len(found.labels), label.name)
         try:
-            source = open_cube_source(image)
+            source = open_cube(image)
             labels, _ = load_polygon_labels(label, source.shape[:2], source.geobox, settings=settings)
         except PipelineError as error:
             unseen.append(str(error))
@@ -213,22 +208,6 @@ def _refuse_mixed(label: Path, values: NDArray[np.int64], counts: NDArray[np.int
     what = "colours" if is_colour else "numbers"
     told = f" (most of it: {shown})" if counts[most].sum() > counts.sum() / 2 else ""
     raise SceneError(f"{label} has {len(values)} different {what}{told}: {MIXED}")
-
-
-def _refuse_many(counts: Counter[int]) -> None:
-    if len(counts) > MOST_FOUND_CLASSES:
-        raise SceneError(
-            f"the label files have {len(counts)} different values together, at most {MOST_FOUND_CLASSES} are taken for"
-            f" classes: {MIXED}"
-        )
-
-
-def _shape(image: Path) -> tuple[int, int, int]:
-    """(y, x, band) of an image, by its head where it has one."""
-    if image.suffix.lower() in IMAGE_ENDINGS:
-        return image_shape(image)
-    rows = open_tiff_rows(image) if image.suffix.lower() in ROW_ENDINGS else None
-    return open_cube_source(image).shape if rows is None else rows.shape
 
 
 def _look_at_edge(source: CubeSource) -> tuple[tuple[float, float] | None, float]:

@@ -1,10 +1,9 @@
-"""Scene files: an image or cube with its wavelengths and labels, as a simulated rig looks at it."""
+"""Scene files: an image or cube with its wavelengths and labels, as a survey takes it."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,22 +15,13 @@ from numpy.typing import NDArray
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import UNLABELLED
 from storage.archive.staging import file_hash
-from storage.readers.cube_sources import BLOCK_LINES
-from storage.readers.label_files import find_label
-from storage.readers.labels import Labels, Layout, load_frame_or_raster, load_labels
-from storage.readers.polygon_labels import is_polygon_file, load_polygon_labels
-from storage.readers.raster_files import split_variable
-from storage.readers.scan_files import reader_of
-from storage.readers.scene_rows import SceneRows, ValueCount, as_values, bands_text, load_scan, open_rows
-from storage.readers.scene_toml import (
-    SETTINGS_NAME,
-    BandWavelengths,
-    ClassValue,
-    SceneSettings,
-    find_scene_settings,
-    settle_wavelengths,
-)
-from storage.readers.zone_files import split_layer
+from storage.readers.cube_sources import BLOCK_LINES, Bands, CubeSource, check_memory, scene_lines
+from storage.readers.label_files import label_file
+from storage.readers.labels import Labels, load_labels
+from storage.readers.open_cubes import open_cube, split_variable
+from storage.readers.polygons import is_polygon_file, load_polygon_labels
+from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings, find_scene_settings, settle_wavelengths
+from storage.readers.scene_values import ValueCount, as_values, bands_text
 
 if TYPE_CHECKING:
     from odc.geo.geobox import GeoBox
@@ -106,22 +96,15 @@ def load_scene_file(
     ``path`` may be ``FILE.mat:VARIABLE`` or ``STORE.zarr:ARRAY``, and end in a step of time, ``FILE.npy:STEP``. Axes
     are y, x, band; two axes are one band. What comes in lines with dark and white frames is taken over the white panel.
     What is given here wins over the ``scene.toml`` beside the file, and that over what the file says: a file of class
-    numbers or colours on the same pixels, or of polygons (frames of HyKo2 and RANUS bring their own, others are found
-    by their names), bands to use, counted from 0, and wavelengths [nm], one for each band used or for each of the file.
-    ``classes`` are those of a scene.toml that states none. Labels found by their names that cannot be used are left out
-    with a note where no ``labels_needed``. Raises SceneError: a file is missing, damaged, of a kind or shape that
-    cannot be used, or the labels do not fit. WavelengthError: wavelengths are missing, or their number, unit or range
-    is wrong.
+    numbers or colours on the same pixels, or of polygons (others are found by their names), bands to use, counted from
+    0, and wavelengths [nm], one for each band used or for each of the file. ``classes`` are those of a scene.toml that
+    states none. Labels found by their names that cannot be used are left out with a note where no ``labels_needed``.
+    Raises SceneError: a file is missing, damaged, of a kind or shape that cannot be used, or the labels do not fit.
+    WavelengthError: wavelengths are missing, or their number, unit or range is wrong.
     """
-    file, variable = split_variable(path)
-    raster, layout = load_frame_or_raster(path) if reader_of(path) == "raster" else (load_scan(path), None)
-    cube = raster.three_axes(file)
-    rows = SceneRows.of(raster, cube)
-    stated = _Stated(labels, bands, wavelengths, classes or {}, labels_needed)
-    draft = _Draft.of(file, variable, rows, stated, layout)
-    count = draft.count()
-    values = count.take(cube, draft.gaps)
-    return SceneFile(values=values, **draft.facts(count))
+    facts, _, values, _ = _open(path, labels, bands, wavelengths, classes or {}, labels_needed, keep=True)
+    assert values is not None
+    return SceneFile(values=values, **facts)
 
 
 def open_scene_file(
@@ -136,121 +119,109 @@ def open_scene_file(
     GeoTIFF, ENVI, Zarr and .npy are read some rows at a time; images, .mat and .npz are whole in memory. Labels that
     were found by their names and cannot be used are left out with a note. Raises what `load_scene_file` does.
     """
-    file, variable = split_variable(path)
-    rows, layout = open_rows(path)
-    draft = _Draft.of(file, variable, rows, _Stated(labels, bands, wavelengths, {}, False), layout)
-    count, height = draft.count(), rows.shape[0]
-    for first in range(0, height, BLOCK_LINES):
-        last = min(first + BLOCK_LINES, height)
-        count.take(rows.read(first, last), draft.gaps_of(first, last))
+    facts, read, _, count = _open(path, labels, bands, wavelengths, {}, False, keep=False)
+    return OpenScene(shape=count.missing.shape, read=read, missing=count.missing, filled_px=count.filled_px, **facts)
+
+
+def _open(
+    address: str | Path,
+    labels: str | Path | None,
+    bands: Sequence[int] | None,
+    wavelengths: Sequence[float] | None,
+    classes: Mapping[str, ClassValue],
+    labels_needed: bool,
+    *,
+    keep: bool,
+) -> tuple[dict[str, Any], ReadRows, NDArray[np.float32] | None, ValueCount]:
+    """Return the fields of `SceneFacts`, the reader of rows, all values where they are to be kept, and the counts."""
+    file, variable = split_variable(address)
+    source, settings = open_cube(address), find_scene_settings(file)
+    height, width, count = source.shape
+    calibrated = source.dark is not None and source.white is not None
+    chosen, bad_note = _chosen_bands(bands, settings, count, file, source.bad_bands)
+    _refuse_bands_first(file, source.shape, wavelengths or settings.wavelengths_nm)
+    light = settle_wavelengths(file, chosen, count, stated=wavelengths, settings=settings, known=source.bands)
+    nodata = settings.nodata if settings.nodata is not None or calibrated else source.nodata
+    void = source.void
+    gap_notes: tuple[str, ...] = ()
+    if void is not None:
+        gap_notes = (f"{int(void.sum())} transparent or masked pixels have no value, and no class in a map",)
+        if void.all():
+            void, gap_notes = None, ("every pixel is transparent or masked, which is not believed",)
+
+    def rows(first: int, last: int) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
+        return scene_lines(source, first, last), None if void is None else void[first:last]
 
     def read(first: int, last: int) -> NDArray[np.float32]:
-        return as_values(rows.read(first, last), draft.chosen, draft.nodata, draft.gaps_of(first, last))
+        """Give rows (y, x, band), NaN where the file has no value."""
+        numbers, gaps = rows(first, last)
+        return as_values(numbers, chosen, nodata, gaps)
 
-    facts = draft.facts(count)
-    return OpenScene(shape=rows.shape[:2], read=read, missing=count.missing, filled_px=count.filled_px, **facts)
+    if keep:
+        check_memory(address, 8 * height * width * count)  # as float32, and once more while the scene is made
+    counted = ValueCount(file, chosen, nodata, (height, width))
+    values = _count_values(counted, rows, np.empty((height, width, len(chosen)), np.float32) if keep else None)
+    missing_notes = counted.notes()
+    found, label_note, by_name = _labels_of(
+        file, source.shape[:2], source.geobox, labels, settings, classes, labels_needed
+    )
+    light_hash = _light_hash(file, variable, source, chosen, light, settings.nodata, void)
+    some = () if chosen == list(range(count)) else (f"bands {bands_text(chosen)} of {count}, counted from 0",)
+    over = ("values are over the white panel",) if calibrated else ()
+    of_labels: dict[str, Any] = {
+        "labels": None if found is None else found.index,
+        "class_names": () if found is None else found.names,
+        "class_colours": np.zeros((0, 3), np.uint8) if found is None else found.colours,
+        "class_values": () if found is None else found.values,
+        "labels_found": by_name and found is not None,
+    }
+    labelled = light_hash if found is None else _labelled_hash(light_hash, found.names, found.values, found.index)
+    facts = {
+        "name": file.stem,
+        "path": file,
+        "wavelength_nm": light.wavelength_nm,
+        "fwhm_nm": light.fwhm_nm,
+        "content_hash": labelled,
+        "light_hash": light_hash,
+        "provenance": (*some, *bad_note, *source.notes, *over, light.origin, *gap_notes, *missing_notes, *label_note),
+        "geobox": source.geobox,
+        **of_labels,
+    }
+    return facts, read, values, counted
 
 
-@dataclass(frozen=True)
-class _Stated:
-    """What was given beside the file."""
+def _count_values(
+    counted: ValueCount,
+    rows: Callable[[int, int], tuple[NDArray[Any], NDArray[np.bool_] | None]],
+    values: NDArray[np.float32] | None,
+) -> NDArray[np.float32] | None:
+    """Read all rows once, count what is missing, and fill ``values`` (y, x, band) where they are to be kept."""
+    height = counted.missing.shape[0]
+    for first in range(0, height, BLOCK_LINES):
+        last = min(first + BLOCK_LINES, height)
+        taken = counted.take(*rows(first, last))
+        if values is not None:
+            values[first:last] = taken
+    return values
 
-    labels: str | Path | None
-    bands: Sequence[int] | None
-    wavelengths: Sequence[float] | None
-    classes: Mapping[str, ClassValue]
-    labels_needed: bool
 
-
-@dataclass(frozen=True)
-class _Draft:
-    """A scene file of which all is settled but what its numbers are."""
-
-    file: Path
-    variable: str | None
-    rows: SceneRows
-    stated: _Stated
-    layout: Layout | None
-    settings: SceneSettings
-    chosen: list[int]
-    light: BandWavelengths
-    nodata: float | None
-    gaps: NDArray[np.bool_] | None  # (y, x)
-    notes: tuple[str, ...]
-
-    @staticmethod
-    def of(file: Path, variable: str | None, rows: SceneRows, stated: _Stated, layout: Layout | None) -> _Draft:
-        """Settle bands, wavelengths and gaps. Raises what `load_scene_file` does of these."""
-        settings, about = find_scene_settings(file), rows.about
-        chosen, bad_note = _chosen_bands(stated.bands, settings, rows.shape[2], file, about.bad_bands)
-        _refuse_bands_first(file, rows.shape, stated.wavelengths or settings.wavelengths_nm)
-        light = settle_wavelengths(
-            file,
-            chosen,
-            rows.shape[2],
-            stated=stated.wavelengths,
-            settings=settings,
-            assumed_nm=about.assumed_nm,
-            known=about.known,
-        )
-        nodata = about.nodata if settings.nodata is None else settings.nodata
-        gaps, gap_notes = _gaps(rows.void)
-        count = rows.shape[2]
-        some = () if chosen == list(range(count)) else (f"bands {bands_text(chosen)} of {count}, counted from 0",)
-        notes = (*some, *bad_note, *about.notes, light.origin, *gap_notes)
-        return _Draft(file, variable, rows, stated, layout, settings, chosen, light, nodata, gaps, notes)
-
-    def count(self) -> ValueCount:
-        """Begin to count what is missing."""
-        return ValueCount(self.file, self.chosen, self.nodata, self.rows.shape[:2])
-
-    def gaps_of(self, first: int, last: int) -> NDArray[np.bool_] | None:
-        """Gaps of some rows."""
-        return None if self.gaps is None else self.gaps[first:last]
-
-    def facts(self, count: ValueCount) -> dict[str, Any]:
-        """The fields of `SceneFacts`, once all numbers were counted (SceneError: some cannot be used, or labels)."""
-        notes = count.notes()
-        found, label_note, by_name = self._labels()
-        widths = None if self.light.fwhm_nm is None else self.light.fwhm_nm.tolist()
-        said: tuple[str, ...] = () if self.settings.nodata is None else (f"nodata {self.settings.nodata!r}",)
-        said += () if self.gaps is None else (f"void {hashlib.sha256(np.packbits(self.gaps).tobytes()).hexdigest()}",)
-        said += (self.rows.scaling,) if self.rows.scaling else ()
-        content = _content_hash(self.file, self.rows.files)
-        light_hash = _digest(content, self.variable, self.chosen, self.light.centre_nm.tolist(), widths, *said)
-        content_hash = light_hash
-        if found is not None:
-            content_hash = _labelled_hash(light_hash, found.names, found.values, found.index)
-        return {
-            "name": self.file.stem,
-            "path": self.file,
-            "wavelength_nm": self.light.centre_nm,
-            "fwhm_nm": self.light.fwhm_nm,
-            "labels": None if found is None else found.index,
-            "class_names": () if found is None else found.names,
-            "class_colours": np.zeros((0, 3), np.uint8) if found is None else found.colours,
-            "class_values": () if found is None else found.values,
-            "content_hash": content_hash,
-            "light_hash": light_hash,
-            "provenance": (*self.notes, *notes, *label_note),
-            "geobox": self.rows.about.geobox,
-            "labels_found": by_name and self.layout is None and found is not None,
-        }
-
-    def _labels(self) -> tuple[Labels | None, tuple[str, ...], bool]:
-        """Return labels, a note of them, and whether their file was found by its name alone."""
-        stated, shape = self.stated, self.rows.shape[:2]
-        by_name = stated.labels is None and self.settings.labels is None
-        if self.layout is not None and by_name:
-            return self.layout.labels, (self.layout.label_note,), by_name
-        try:
-            return *_labels(
-                self.file, shape, self.rows.about.geobox, stated.labels, self.settings, stated.classes
-            ), by_name
-        except SceneError as error:
-            if stated.labels_needed or not by_name:
-                raise
-            return None, (f"the labels beside the scene are left out: {error}",), by_name
+def _light_hash(
+    file: Path,
+    variable: str | None,
+    source: CubeSource,
+    chosen: list[int],
+    light: Bands,
+    nodata: float | None,
+    void: NDArray[np.bool_] | None,
+) -> str:
+    """Return the hash of values and wavelengths: of the files, and of all that says what their numbers mean."""
+    assert light.wavelength_nm is not None
+    widths = None if light.fwhm_nm is None else light.fwhm_nm.tolist()
+    stated: tuple[str, ...] = () if nodata is None else (f"nodata {nodata!r}",)
+    stated += () if void is None else (f"void {hashlib.sha256(np.packbits(void).tobytes()).hexdigest()}",)
+    stated += (source.scaling,) if source.scaling else ()
+    content = _content_hash(file, source.files)
+    return _digest(content, variable, chosen, light.wavelength_nm.tolist(), widths, *stated)
 
 
 def _refuse_bands_first(path: Path, shape: tuple[int, ...], wavelengths: Sequence[float] | None) -> None:
@@ -263,23 +234,13 @@ def _refuse_bands_first(path: Path, shape: tuple[int, ...], wavelengths: Sequenc
         )
 
 
-def _content_hash(file: Path, named: tuple[Path, ...]) -> str:
+def _content_hash(file: Path, files: tuple[Path, ...]) -> str:
     """Of all files that the numbers came from; within a folder their names count, too."""
-    files = named or (file,)
     if files == (file,):
         return file_hash(file)
-    is_folder = file.is_dir()
-    inside = [entry.relative_to(file).as_posix() if is_folder and entry.is_relative_to(file) else "" for entry in files]
-    return _digest(*((name, file_hash(entry)) for name, entry in zip(inside, files, strict=True)))
-
-
-def _gaps(void: NDArray[np.bool_] | None) -> tuple[NDArray[np.bool_] | None, tuple[str, ...]]:
-    """(y, x) pixels that are transparent or masked, and a note; None where none is, or all are, which says nothing."""
-    if void is None or not void.any():
-        return None, ()
-    if void.all():
-        return None, ("every pixel is transparent or masked, which is not believed",)
-    return void, (f"{int(void.sum())} transparent or masked pixels have no value, and no class in a map",)
+    within = [file.is_dir() and entry.is_relative_to(file) for entry in files]
+    names = [entry.relative_to(file).as_posix() if inside else "" for entry, inside in zip(files, within, strict=True)]
+    return _digest(*((name, file_hash(entry)) for name, entry in zip(names, files, strict=True)))
 
 
 def _chosen_bands(
@@ -306,47 +267,35 @@ def _chosen_bands(
     return [int(band) for band in chosen], ()
 
 
-def label_file(scene: Path, settings: SceneSettings) -> tuple[Path | None, str]:
-    """Where the labels of a scene lie, by scene.toml or else by their name; and why there are none, if that is told.
-
-    Raises SceneError: scene.toml asks for a number that the scene's name lacks, or several files may be meant.
-    """
-    if settings.labels is None or settings.path is None:
-        return find_label(scene), ""
-    if not settings.labels:
-        return None, ""
-    number = scene_number(scene)
-    if "{number}" in settings.labels and number is None:
-        raise SceneError(
-            f"{scene} has no number in its name, which labels = {settings.labels!r} in scene.toml asks for; write"
-            " {name} for the whole name"
-        )
-    told = settings.labels.replace("{number}", number or "").replace("{name}", scene.stem)
-    address = settings.path.parent / told
-    if told != settings.labels and not split_layer(address)[0].is_file():
-        return None, f"no labels: there is no {address}"
-    return address, ""
-
-
-def _labels(
+def _labels_of(
     scene: Path,
     shape: tuple[int, int],
     geobox: GeoBox | None,
     stated: str | Path | None,
     settings: SceneSettings,
     classes: Mapping[str, ClassValue],
-) -> tuple[Labels | None, tuple[str, ...]]:
-    address, why_none = (stated, "") if stated is not None else label_file(scene, settings)
-    if address is None:
-        return None, (why_none,) if why_none else ()
-    known, notes = settings.classes or classes, tuple[str, ...]()
-    if is_polygon_file(address):
-        found, notes = load_polygon_labels(address, shape, geobox, settings=replace(settings, classes=known))
-    else:
-        found = load_labels(address, shape, classes=known, unlabelled=settings.unlabelled)
-    how = f"classes from {settings.path}" if settings.classes else f"{len(found.names)} classes as found in the file"
-    by_name = "" if stated is not None or settings.labels is not None else ", found by its name"
-    return found, (f"labels from {address}{by_name}, {how}", *notes, *_one_class_note(found))
+    needed: bool,
+) -> tuple[Labels | None, tuple[str, ...], bool]:
+    """Return labels, a note of them, and whether their file was found by its name alone."""
+    by_name = stated is None and settings.labels is None
+    try:
+        address, why_none = (stated, "") if stated is not None else label_file(scene, settings)
+        if address is None:
+            return None, (why_none,) if why_none else (), by_name
+        stated_classes, notes = bool(settings.classes), tuple[str, ...]()
+        known = settings.classes or classes
+        if is_polygon_file(address):
+            settings = settings.model_copy(update={"classes": dict(known)})
+            found, notes = load_polygon_labels(address, shape, geobox, settings=settings)
+        else:
+            found = load_labels(address, shape, classes=known, unlabelled=settings.unlabelled)
+    except SceneError as error:
+        if needed or not by_name:
+            raise
+        return None, (f"the labels beside the scene are left out: {error}",), by_name
+    how = f"classes from {settings.path}" if stated_classes else f"{len(found.names)} classes as found in the file"
+    note = f"labels from {address}{', found by its name' if by_name else ''}, {how}"
+    return found, (note, *notes, *_one_class_note(found)), by_name
 
 
 def load_field_labels(address: str | Path, shape: tuple[int, int]) -> tuple[Labels, tuple[str, ...]]:
@@ -355,7 +304,7 @@ def load_field_labels(address: str | Path, shape: tuple[int, int]) -> tuple[Labe
     Raises SceneError: they cannot be read, or do not fit.
     """
     file, _ = split_variable(address)
-    found, notes = _labels(file, shape, None, address, find_scene_settings(file), {})
+    found, notes, _ = _labels_of(file, shape, None, address, find_scene_settings(file), {}, True)
     assert found is not None
     return found, notes
 
@@ -371,12 +320,6 @@ def _one_class_note(found: Labels) -> tuple[str, ...]:
         f"all labels are {name}: if {told} in the label file stands for no class, write unlabelled = {told} into a"
         f" {SETTINGS_NAME}",
     )
-
-
-def scene_number(path: Path) -> str | None:
-    """``059_image.png`` -> ``059``: the first digits of the file's name."""
-    digits = re.search(r"\d+", path.stem)
-    return None if digits is None else digits.group()
 
 
 def _labelled_hash(

@@ -2,43 +2,68 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, fields
 from pathlib import Path
-from types import UnionType
-from typing import Any
+from typing import Annotated, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, StrictInt, StrictStr, ValidationError, model_validator
 
 from pipeline.errors import SceneError, WavelengthError
 from storage.archive.staging import read_toml
+from storage.readers.cube_sources import Bands
 
 SETTINGS_NAME = "scene.toml"
 IMAGE_FOLDERS = ("images", "image", "imgs", "img", "pictures", "photos")  # a scene.toml stands above such a one
 
 Colour = tuple[int, int, int]
 ClassValue = int | Colour
+_Number = Annotated[float, Field(strict=True)]
+_Channel = Annotated[int, Field(strict=True, ge=0, le=255)]
+_Value = StrictInt | tuple[_Channel, _Channel, _Channel]
+_WHOLE, _FILE = "a list of whole numbers such as [0, 1]", "a file name in quotes"
+_EXPECTED = {
+    "bands": _WHOLE,
+    "wavelengths_nm": "a list of numbers such as [660.0, 800.0]",
+    "wavelengths_file": _FILE,
+    "dropped_bands": _WHOLE,
+    "nodata": "a number such as -9999 or 1e30",
+    "labels": _FILE,
+    "unlabelled": "a whole number or a colour [r, g, b] in 0..255",
+    "class_attribute": "the name of an attribute in quotes",
+    "classes": "a table of name = number or name = [r, g, b] in 0..255",
+}
 
 
-@dataclass(frozen=True)
-class SceneSettings:
+class SceneSettings(BaseModel):
     """Content of one ``scene.toml``. Everything is optional; ``path`` is None where there is no such file."""
 
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
     path: Path | None = None
-    bands: tuple[int, ...] | None = None  # of the file, counted from 0
-    wavelengths_nm: tuple[float, ...] | None = None  # of ``bands``, or of all bands of the file
-    wavelengths_file: Path | None = None  # rows of nm and FWHM, all bands of the file and the dropped ones
-    dropped_bands: tuple[int, ...] = ()  # rows of wavelengths_file that the file leaves out, counted from 1
-    nodata: float | None = None  # the number that stands for no value
-    labels: str | None = None  # relative to the folder of scene.toml; may hold {number}, {name}; "": there are none
-    unlabelled: ClassValue | None = None
-    class_attribute: str | None = None  # of labels that are polygons: which attribute says the class
-    classes: Mapping[str, ClassValue] = field(default_factory=dict)
+    bands: tuple[StrictInt, ...] | None = None  # of the file, counted from 0
+    wavelengths_nm: tuple[_Number, ...] | None = None  # of ``bands``, or of all bands of the file
+    wavelengths_file: StrictStr | None = None  # rows of nm and FWHM, all bands of the file and the dropped ones
+    dropped_bands: tuple[StrictInt, ...] = ()  # rows of wavelengths_file that the file leaves out, counted from 1
+    nodata: _Number | None = None  # the number that stands for no value
+    labels: StrictStr | None = None  # beside scene.toml; may hold {number}, {name}; "": there are none
+    unlabelled: _Value | None = None
+    class_attribute: StrictStr | None = None  # of labels that are polygons: which attribute says the class
+    classes: dict[str, _Value] = {}
 
-
-KNOWN_KEYS = tuple(one.name for one in fields(SceneSettings) if one.name != "path")
+    @model_validator(mode="after")
+    def _agree(self) -> Self:
+        if self.wavelengths_nm is not None and self.wavelengths_file is not None:
+            raise ValueError("has both wavelengths_nm and wavelengths_file; keep one")
+        if len({isinstance(value, tuple) for value in self.classes.values()}) > 1:
+            raise ValueError("has some classes that are numbers and some that are colours; use one kind")
+        if len(set(self.classes.values())) < len(self.classes):
+            raise ValueError("has two classes of the same number or colour; give each its own")
+        if len(self.classes) > 255:
+            raise ValueError(f"has {len(self.classes)} classes, at most 255 fit a class map; merge some")
+        return self
 
 
 def find_scene_settings(scene: Path) -> SceneSettings:
@@ -46,15 +71,13 @@ def find_scene_settings(scene: Path) -> SceneSettings:
 
     Raises SceneError: the file is no TOML, has a key that is not known, or a value of the wrong kind.
     """
-    candidates = [scene.parent / SETTINGS_NAME]
-    if is_image_folder(scene.parent):
-        candidates.append(scene.parent.parent / SETTINGS_NAME)
-    found = next((path for path in candidates if path.is_file()), None)
+    folders = [scene.parent, scene.parent.parent] if is_image_folder(scene.parent) else [scene.parent]
+    found = next((path for folder in folders if (path := folder / SETTINGS_NAME).is_file()), None)
     return SceneSettings() if found is None else load_scene_settings(found)
 
 
 def is_image_folder(folder: Path) -> bool:
-    """Whether a folder's name says that images lie in it, and what belongs to them beside it."""
+    """Tell whether a folder's name says that images lie in it, and what belongs to them beside it."""
     return folder.name.lower() in IMAGE_FOLDERS
 
 
@@ -64,72 +87,25 @@ def load_scene_settings(path: Path) -> SceneSettings:
         content = read_toml(path)
     except (FileNotFoundError, ValueError) as error:
         raise SceneError(f"{path} cannot be read as TOML: {error}; correct it or take it away") from error
-    unknown = sorted(set(content) - set(KNOWN_KEYS))
+    unknown = sorted(set(content) - set(_EXPECTED))
     if unknown:
-        raise SceneError(f"{path} has the unknown key {', '.join(unknown)}; known are {', '.join(KNOWN_KEYS)}")
-    if "wavelengths_nm" in content and "wavelengths_file" in content:
-        raise SceneError(f"{path} has both wavelengths_nm and wavelengths_file; keep one")
-    file_name = _value(path, content, "wavelengths_file", str, "a file name in quotes", many=False)
-    whole, number = "a list of whole numbers such as [0, 1]", "a number such as -9999 or 1e30"
-    listed = _value(path, content, "wavelengths_nm", int | float, "a list of numbers such as [660.0, 800.0]", many=True)
-    nodata = _value(path, content, "nodata", int | float, number, many=False)
-    return SceneSettings(
-        path=path,
-        bands=_value(path, content, "bands", int, whole, many=True),
-        wavelengths_nm=None if listed is None else tuple(map(float, listed)),
-        wavelengths_file=None if file_name is None else path.parent / file_name,
-        dropped_bands=_value(path, content, "dropped_bands", int, whole, many=True) or (),
-        nodata=None if nodata is None else float(nodata),
-        labels=_value(path, content, "labels", str, "a file name in quotes", many=False),
-        class_attribute=_value(path, content, "class_attribute", str, "the name of an attribute in quotes", many=False),
-        unlabelled=None if "unlabelled" not in content else _class_value(path, "unlabelled", content["unlabelled"]),
-        classes=_classes(path, content.get("classes", {})),
-    )
-
-
-def _value(path: Path, content: Mapping[str, Any], key: str, of: type | UnionType, expected: str, *, many: bool) -> Any:
-    """A value of ``scene.toml``, or all of a list; None where it is not there."""
-    value = content.get(key)
-    listed: Any = value if many else [value]
-    if value is not None and not (
-        isinstance(listed, list) and all(isinstance(one, of) and not isinstance(one, bool) for one in listed)
-    ):
-        raise SceneError(f"{path}: {key} must be {expected}, got {value!r}")
-    return tuple(listed) if many and value is not None else value
-
-
-def _class_value(path: Path, name: str, value: object) -> ClassValue:
-    if isinstance(value, int) and not isinstance(value, bool):
-        return value
-    if isinstance(value, list) and len(value) == 3 and all(isinstance(v, int) and 0 <= v <= 255 for v in value):
-        return value[0], value[1], value[2]
-    raise SceneError(f"{path}: {name} must be a whole number or a colour [r, g, b] in 0..255, got {value!r}")
-
-
-def _classes(path: Path, value: object) -> dict[str, ClassValue]:
-    if not isinstance(value, dict):
-        raise SceneError(f"{path}: classes must be a table of name = number or name = [r, g, b], got {value!r}")
-    classes = {name: _class_value(path, f"class {name}", entry) for name, entry in value.items()}
-    if len({isinstance(entry, tuple) for entry in classes.values()}) > 1:
-        raise SceneError(f"{path}: some classes are numbers and some are colours; use one kind")
-    if len(set(classes.values())) < len(classes):
-        raise SceneError(f"{path}: two classes have the same number or colour; give each its own")
-    if len(classes) > 255:
-        raise SceneError(f"{path}: {len(classes)} classes, at most 255 fit a class map; merge some")
-    return classes
+        raise SceneError(f"{path} has the unknown key {', '.join(unknown)}; known are {', '.join(_EXPECTED)}")
+    try:
+        return SceneSettings.model_validate({**content, "path": path})
+    except ValidationError as error:
+        first = error.errors()[0]
+        if not first["loc"]:
+            raise SceneError(f"{path} {first['msg'].removeprefix('Value error, ')}") from None
+        key = str(first["loc"][0])
+        value, name = content[key], key
+        if key == "classes" and len(first["loc"]) > 1:
+            name, key = f"class {first['loc'][1]}", "unlabelled"
+            value = content["classes"][first["loc"][1]]
+        raise SceneError(f"{path}: {name} must be {_EXPECTED[key]}, got {value!r}") from None
 
 
 RANGE_NM = (200.0, 3000.0)
 MICROMETRES = (0.2, 5.0)
-
-
-@dataclass(frozen=True)
-class BandWavelengths:
-    """Centres and widths of the chosen bands [nm], and one sentence on their origin."""
-
-    centre_nm: NDArray[np.float64]
-    fwhm_nm: NDArray[np.float64] | None
-    origin: str
 
 
 def check_wavelengths(wavelengths: Sequence[float] | NDArray[np.float64], where: str) -> NDArray[np.float64]:
@@ -160,33 +136,29 @@ def settle_wavelengths(
     *,
     stated: Sequence[float] | None,
     settings: SceneSettings,
-    assumed_nm: Sequence[float] | None,
-    known: BandWavelengths | None = None,
-) -> BandWavelengths:
-    """Wavelengths of the chosen bands: the flag first, then ``scene.toml``, then the file, then its colours.
+    known: Bands,
+) -> Bands:
+    """Return wavelengths of the chosen bands: the flag first, then ``scene.toml``, then the file or its colours.
 
     ``bands`` are counted from 0, of ``file_bands``. The flag has one for each of them or for each band of the file;
-    what the file says (``known``), or its colours let assume, is of every band. [nm] Raises WavelengthError: nothing
-    says them, or their number, unit or range is wrong.
+    what the file says (``known``) is of every band. [nm] Raises WavelengthError: nothing says them, or their number,
+    unit or range is wrong.
     """
     chosen = list(bands)
     if stated is not None:
         values = check_wavelengths(stated, "--wavelengths")
         fitting = _fit(values, chosen, file_bands, chosen, f"--wavelengths for {path}")
-        return BandWavelengths(fitting, None, f"wavelengths stated: {_listed(fitting)} nm")
+        return Bands(fitting, None, "nm", f"wavelengths stated: {_listed(fitting)} nm")
     if settings.wavelengths_nm is not None:
         values = check_wavelengths(settings.wavelengths_nm, f"{settings.path}: wavelengths_nm")
         own = list(range(file_bands)) if settings.bands is None else list(settings.bands)
         fitting = _fit(values, chosen, file_bands, own, f"{settings.path}: wavelengths_nm for {path}")
-        return BandWavelengths(fitting, None, f"wavelengths from {settings.path}")
-    if settings.wavelengths_file is not None:
-        return _from_file(settings.wavelengths_file, settings.dropped_bands, chosen, file_bands)
-    if known is not None and len(known.centre_nm) == file_bands:
-        centre = check_wavelengths(known.centre_nm, str(path))[chosen]
-        return BandWavelengths(centre, None if known.fwhm_nm is None else known.fwhm_nm[chosen], known.origin)
-    if assumed_nm is not None and len(assumed_nm) == file_bands:
-        centre = np.asarray(assumed_nm, np.float64)[chosen]
-        return BandWavelengths(centre, None, f"wavelengths assumed from the file's colours: {_listed(centre)} nm")
+        return Bands(fitting, None, "nm", f"wavelengths from {settings.path}")
+    if settings.wavelengths_file is not None and settings.path is not None:
+        return _from_file(settings.path.parent / settings.wavelengths_file, settings.dropped_bands, chosen, file_bands)
+    if known.wavelength_nm is not None and len(known.wavelength_nm) == file_bands:
+        centre = check_wavelengths(known.wavelength_nm, str(path))[chosen]
+        return Bands(centre, None if known.fwhm_nm is None else known.fwhm_nm[chosen], known.units, known.origin)
     raise WavelengthError(
         f"{path} has {file_bands} bands and nothing says their wavelengths; give --wavelengths in nm, or write "
         f"wavelengths_nm or wavelengths_file into a scene.toml beside it (axes are y, x, band)"
@@ -208,7 +180,7 @@ def _fit(
     return np.array([known[band] for band in chosen], np.float64)
 
 
-def _from_file(path: Path, dropped: Sequence[int], chosen: list[int], file_bands: int) -> BandWavelengths:
+def _from_file(path: Path, dropped: Sequence[int], chosen: list[int], file_bands: int) -> Bands:
     """Rows of nm and FWHM, less the dropped ones (counted from 1)."""
     table = _table(path)
     bad = [row for row in dropped if not 1 <= row <= len(table)]
@@ -223,7 +195,8 @@ def _from_file(path: Path, dropped: Sequence[int], chosen: list[int], file_bands
     centre = check_wavelengths(kept[:, 0], str(path))[chosen]
     widths = kept[:, 1] if kept.shape[1] > 1 else None
     known = widths is not None and bool((np.isfinite(widths) & (widths > 0)).all())
-    return BandWavelengths(centre, widths[chosen] if known and widths is not None else None, f"wavelengths from {path}")
+    fwhm = widths[chosen] if known and widths is not None else None
+    return Bands(centre, fwhm, "nm", f"wavelengths from {path}")
 
 
 def _table(path: Path) -> NDArray[np.float64]:

@@ -20,7 +20,7 @@ from PIL import Image
 
 from pipeline.errors import PipelineError
 from storage.export.image_files import EnviFile, write_envi
-from storage.readers.scan_files import open_cube_source
+from storage.readers.open_cubes import open_cube
 
 SHAPE = (20, 12, 5)
 LONGEST_S = 30  # then it counts as hanging
@@ -32,18 +32,18 @@ def _cube() -> Any:
 
 def _envi(folder: Path) -> str:
     wavelengths = np.linspace(400, 800, SHAPE[2])
-    write_envi(folder / "a.hdr", EnviFile(SHAPE, "<u2", "bil", wavelengths), [(0, _cube())])
+    write_envi(folder / "a.hdr", EnviFile(SHAPE, "u2", wavelengths), [(0, _cube())])
     return "a.hdr"
 
 
 def _headwall(folder: Path) -> str:
     for first in (0, 10):
-        write_envi(folder / "part.hdr", EnviFile((10, *SHAPE[1:]), "<u2"), [(0, _cube()[first : first + 10])])
+        write_envi(folder / "part.hdr", EnviFile((10, *SHAPE[1:]), "u2"), [(0, _cube()[first : first + 10])])
         (folder / "part.hdr").rename(folder / f"raw_{first}.hdr")
         (folder / "part.img").rename(folder / f"raw_{first}")
         rows = "".join(f"{frame}\t{1000 + 10 * frame}\n" for frame in range(first, first + 10))
         (folder / f"frameIndex_{first}.txt").write_text("Frame#\tTimestamp\n" + rows)
-    write_envi(folder / "darkReference.hdr", EnviFile((1, *SHAPE[1:]), "<u2"), [(0, _cube()[:1] // 8)])
+    write_envi(folder / "darkReference.hdr", EnviFile((1, *SHAPE[1:]), "u2"), [(0, _cube()[:1] // 8)])
     return "."
 
 
@@ -199,7 +199,7 @@ def try_reading(address: Path) -> Reading:
     begun, refused, wrong = time.monotonic(), None, None
     try:
         with at_most(LONGEST_S):
-            source = open_cube_source(address)
+            source = open_cube(address)
             held = source.shape[0] - source.lost_lines
             source.read(0, min(held, 64))
             source.read(max(held - 64, 0), held)

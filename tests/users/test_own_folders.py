@@ -20,7 +20,7 @@ from pipeline.errors import SceneError
 from pipeline.geometry.camera import LineCamera
 from pipeline.readings import edge_fill
 from storage.readers.datasets import load_data_set
-from storage.readers.label_files import find_legend, read_legend
+from storage.readers.label_files import read_legend
 from storage.readers.scene_files import load_scene_file
 from storage.readers.scene_toml import load_scene_settings
 from tests.flows.conftest import command_line
@@ -110,43 +110,25 @@ LEGENDS = {
     "name,r,g,b\nsoil,0,0,0\ncrop,0,255,0\n": {(0, 0, 0): "soil", (0, 255, 0): "crop"},
     "0 0 0\tsoil\n0 255 0\tcrop\n": {(0, 0, 0): "soil", (0, 255, 0): "crop"},
     "#000000 soil\n#00ff00 crop\n": {(0, 0, 0): "soil", (0, 255, 0): "crop"},
-    '{"0": "soil", "1": "crop"}': {0: "soil", 1: "crop"},
-    '{"soil": [0, 0, 0], "crop": [0, 255, 0]}': {(0, 0, 0): "soil", (0, 255, 0): "crop"},
-    '{"classes": [{"name": "soil", "id": 3}, {"name": "crop", "color": "#00ff00"}]}': {3: "soil", (0, 255, 0): "crop"},
 }
 
 
 @pytest.mark.parametrize("text", LEGENDS)
 def test_legends_are_read_as_people_write_them(text: str, tmp_path: Path) -> None:
     """Numbers or colours before or after the name, in text, CSV or JSON."""
-    path = tmp_path / ("legend.json" if text.startswith("{") else "legend.txt")
+    path = tmp_path / "legend.txt"
     path.write_text(text)
     legend = read_legend(path)
     assert legend is not None
     assert legend.names == LEGENDS[text]
 
 
-def test_names_stand_beside_label_files_too(tmp_path: Path) -> None:
-    """GDAL's categories, QGIS's style and ENVI's header name the numbers of a label file."""
-    category = "<PAMDataset><PAMRasterBand band='1'><CategoryNames><Category>soil</Category><Category>crop</Category>"
-    (tmp_path / "a.tif.aux.xml").write_text(category + "</CategoryNames></PAMRasterBand></PAMDataset>")
-    (tmp_path / "b.qml").write_text("<qgis><paletteEntry value='7' label='weed' color='#ff0000'/></qgis>")
-    header = "ENVI\nsamples = 2\nlines = 1\nbands = 1\ndata type = 1\nclass names = {soil, crop}\n"
-    (tmp_path / "c.hdr").write_text(header)
-    (tmp_path / "c.img").write_bytes(b"\0\1")
-    found = {name: find_legend([], [tmp_path / name]) for name in ("a.tif", "b.tif", "c.hdr", "none.png")}
-    told = {name: legend and (dict(legend.names), legend.listed) for name, legend in found.items()}
-    listed = ({}, ("soil", "crop"))
-    assert told == {"a.tif": listed, "b.tif": ({7: "weed"}, ()), "c.hdr": listed, "none.png": None}
-
-
 @given(st.binary(max_size=200))
 def test_any_bytes_are_a_legend_or_none(tmp_path_factory: pytest.TempPathFactory, content: bytes) -> None:
     """Whatever lies under such a name, it is read or passed over."""
     folder = tmp_path_factory.getbasetemp()
-    for name in ("legend.txt", "legend.json"):
-        (folder / name).write_bytes(content)
-        assert read_legend(folder / name) is None or read_legend(folder / name)
+    (folder / "legend.txt").write_bytes(content)
+    assert read_legend(folder / "legend.txt") is None or read_legend(folder / "legend.txt")
 
 
 @given(st.integers(0, 40), st.sampled_from([0.0, -9999.0, 1e30]))

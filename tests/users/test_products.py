@@ -32,11 +32,9 @@ from pipeline.ground.view import GroundView, RigPose
 from pipeline.products.crop_rows import CropRows
 from pipeline.products.indices import find_index
 from storage.archive.archive import Archive
-from storage.export.image_files import cog_problems
-from storage.export.stac_items import stac_problems
 from storage.readers.scene_files import load_scene_file
 from tests.remembered_work import without_effects
-from tests.storage.export.stac_rules import extension_problems
+from tests.storage.export.stac_rules import core_problems, extension_problems, is_cog
 from tests.users.test_georeference import SHAPE, TURNED, corners_px, survey, write_geotiff
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
@@ -90,7 +88,7 @@ def posed(tmp_path_factory: pytest.TempPathFactory) -> Products:
 def test_reflectance_lies_on_the_map_with_its_wavelengths(posed: Products) -> None:
     """A COG in the map's CRS: the mosaic, resampled as the ground map is; bands named as GDAL does; NaN is nodata."""
     ground, mosaic = posed.store("ground_map"), posed.store("mosaic")
-    assert cog_problems(posed.file("reflectance")) == []
+    assert is_cog(posed.file("reflectance"))
     scene, about = posed.store("class_map"), posed.store("class_map").attrs["angular_grid"]
     fine, factor = ground_grid(GroundView(POSE, about["ifov_rad"]), scene["classes"].shape), 4
     grid = grid_of_map(fine.frame.view, fine.scene_shape, fine.geobox.zoom_out(factor))
@@ -245,7 +243,7 @@ def test_a_table_of_areas_adds_up(posed: Products) -> None:
 def test_the_catalogue_names_every_product(posed: Products) -> None:
     """A valid item whose assets are there: products, their styles, and the sheet of areas."""
     item = json.loads(Path(posed.answer["item"]).read_text())
-    assert stac_problems(item) == []
+    assert core_problems(Path(posed.answer["item"])) == []
     assert extension_problems(item) == []
     wanted = {"reflectance", "NDVI", "SAVI", "polygons", "polygons_geojson", "prescription", "task_data", "areas"}
     assert wanted | {f"{name}_style" for name in ("class_map", "NDVI", "reflectance")} <= set(item["assets"])

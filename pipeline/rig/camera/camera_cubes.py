@@ -1,7 +1,7 @@
 """Bytes of a capture's files to lines with their frames' numbers and times, and of its references to mean frames.
 
 What the camera itself writes is read strictly here, for the loop that waits for it; folders from anywhere are read by
-``storage.readers.headwall_folders``.
+``storage.readers.envi_files``.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 A header is ``key = value`` lines after the word ENVI; values in braces may run over lines and be nested. Headwall adds
 lines that begin with ``;``, some of which hold settings of their own. What a header must say is for whoever reads it:
-files from anywhere (``storage.readers.envi_cubes``), or a camera's own (``camera_cubes``).
+files from anywhere (``storage.readers.envi_files``), or a camera's own (``camera_cubes``).
 
 ``frameIndex_<n>.txt`` lies beside ``raw_<n>``: a heading, then a line a frame with its number and its time in
 microseconds. Versions of the camera's program differ in what stands between the two (a tab or spaces) and in the line

@@ -20,9 +20,9 @@ from flows.publish.run_folder import Published
 from flows.publish.survey_command import run_survey
 from flows.settings.load import load_settings
 from pipeline.ground.view import RigPose
-from storage.export.image_files import cog_problems
 from tests.conftest import RGB_NM, patchy_scene
 from tests.remembered_work import without_effects
+from tests.storage.export.stac_rules import is_cog
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 POSE = RigPose(lon_deg=9.5, lat_deg=52.1, heading_deg=25.0, tilt_deg=50.0, height_m=14.0)
@@ -110,7 +110,7 @@ def test_images_are_the_stores_numbers(visited: Visited) -> None:
     posed = "ground_map" in visited.runs[1].receipt["products"]
     store = visited.store("ground_map" if posed else "belief")
     for key in MEMORY:
-        assert cog_problems(visited.file(key)) == []
+        assert is_cog(visited.file(key))
         np.testing.assert_array_equal(visited.image(key), store[key].values)
     assert {0.0, 3.0} == set(np.unique(store["age"].values[np.isfinite(store["age"].values)]).tolist())
     assert (store["changed_from"].values != 255).any()

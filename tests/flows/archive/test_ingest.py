@@ -25,7 +25,7 @@ from flows.archive.ingest_command import run_ingest
 from pipeline.errors import ArchiveError, SceneError, WavelengthError
 from storage.archive.archive import Archive
 from storage.readers.cube_sources import CubeSource
-from storage.readers.scan_files import open_cube_source
+from storage.readers.open_cubes import open_cube
 from storage.readers.scene_files import load_scene_file
 from storage.remote.opening import verify_archive
 
@@ -193,12 +193,12 @@ def test_a_source_that_fails_half_way(tmp_path: Path, raw: NDArray[np.uint16], m
     header = write_envi(tmp_path / "a.img", raw)
 
     def torn(path: str, **references: Any) -> CubeSource:
-        source = open_cube_source(path, **references)
+        source = open_cube(path, **references)
         object.__setattr__(source, "read", lambda start, stop: _raise() if start else raw[start:stop])
         return source
 
     with monkeypatch.context() as patch:
-        patch.setattr(flows.archive.ingest_command, "open_cube_source", torn)
+        patch.setattr(flows.archive.ingest_command, "open_cube", torn)
         with pytest.raises(SceneError, match="torn"):
             ingest(header, tmp_path / "archive")
     archive = Archive.open(tmp_path / "archive")

@@ -28,7 +28,7 @@ from pipeline.errors import PipelineError, SceneError, SettingsError
 from storage.archive.archive import Archive
 from storage.arrays.layout import KEPT_BITS
 from storage.arrays.mosaics import load_mosaic, open_patches
-from storage.rasters.raster_fields import open_raster
+from storage.readers.raster_fields import open_raster
 from storage.remote.opening import verify_archive
 from tests.conftest import RGB_NM, Survey, WeightsMaker, patchy_scene
 

@@ -21,7 +21,7 @@ from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
 from storage.archive.manifests import listed_bytes, manifest_sha256, read_manifest, write_manifest
 from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
-from storage.readers.scan_files import open_cube_source
+from storage.readers.open_cubes import open_cube
 from storage.remote.opening import verify_archive
 from tests.storage.small_archive import flip
 
@@ -101,7 +101,7 @@ def _cube(archive: Archive) -> Path:
 def test_packed_lines_are_read_where_pcodec_is_installed(archive: Archive) -> None:
     """The numbers are those of before; neither verify nor the run that knew the old manifest finds anything wrong."""
     np.testing.assert_array_equal(open_raw_cube(_cube(archive)).read(), LINES)
-    np.testing.assert_array_equal(open_cube_source(str(_cube(archive))).read(0, 37), LINES)
+    np.testing.assert_array_equal(open_cube(str(_cube(archive))).read(0, 37), LINES)
     assert [one.problem for one in verify_archive(archive)] == [None, None]
     (ref,) = archive.refs()
     manifest = archive.manifest(ref)
@@ -114,7 +114,7 @@ def test_without_pcodec_reading_says_what_is_missing(archive: Archive) -> None:
     with pytest.raises(IncompleteStoreError, match=f"dn {WORDS}"):
         open_raw_cube(_cube(archive)).read(0, 1)
     with pytest.raises(SceneError, match=f"fine-0.zarr {WORDS}"):
-        open_cube_source(str(_cube(archive))).read(0, 1)
+        open_cube(str(_cube(archive))).read(0, 1)
 
 
 @pytest.mark.usefixtures("without_pcodec")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import json
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 import pystac
 import pytest
+import shapely
 from odc.geo.geobox import GeoBox
 
 from pipeline.errors import ArchiveError
@@ -18,24 +18,21 @@ from storage.export.stac_items import (
     COG,
     COLLECTION,
     ZARR,
-    Collection,
     Item,
     angular,
-    bounds,
     classes,
     clean_id,
     footprint,
     projection,
     spectral_bands,
-    stac_problems,
     wavelengths,
     write_stac,
 )
-from tests.storage.export.stac_rules import extension_problems
+from tests.storage.export.stac_rules import core_problems, extension_problems
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use `@` matmul:PendingDeprecationWarning")  # odc-geo on affine 3
 BOX = GeoBox.from_bbox((500000, 5770000, 500050, 5770040), crs="EPSG:32632", resolution=0.5)
-ABOUT = Collection("field-a", "Surveys of field-a", "Surveys")
+ABOUT = "field-a"
 LEGEND = ClassNames(("sugar beet", "???"), np.array([[10, 200, 30], [255, 0, 7]], np.uint8))
 WAVE = np.array([444.5, 550.0, 800.0])
 
@@ -73,8 +70,8 @@ def read(path: Path) -> dict[str, Any]:
 @pytest.mark.parametrize("placed", [True, False])
 def test_item_and_collection_fit_the_schemas(tmp_path: Path, placed: bool) -> None:
     """STAC's core schemas and the extensions' rules find nothing, and pystac reads both as what they are."""
-    paths = write_stac(tmp_path, ABOUT, item("r1", placed=placed))
-    assert [stac_problems(read(path)) for path in paths] == [[], []]
+    paths = write_stac(tmp_path, ABOUT, "Surveys", item("r1", placed=placed))
+    assert [core_problems(path) for path in paths] == [[], []]
     assert extension_problems(read(paths[0])) == []
     json.dumps(read(paths[0]), allow_nan=False)
     collection = pystac.Collection.from_file(str(tmp_path / COLLECTION))
@@ -85,18 +82,9 @@ def test_item_and_collection_fit_the_schemas(tmp_path: Path, placed: bool) -> No
     assert found.datetime.isoformat() == "2026-05-01T10:00:00+00:00"
 
 
-def test_the_schemas_find_what_is_wrong(tmp_path: Path) -> None:
-    """A missing time, a bounding box without a geometry and a bad type of band are refused, the last by its place."""
-    good = read(write_stac(tmp_path, ABOUT, item("r1", placed=False))[0])
-    assert stac_problems(good | {"properties": {}})
-    assert stac_problems(good | {"bbox": [0, 0, 1, 1]})
-    good["assets"]["class_map"]["bands"][0]["data_type"] = "u1"
-    assert any("data_type" in text for text in stac_problems(good))
-
-
 def test_without_a_place_there_is_no_geometry(tmp_path: Path) -> None:
     """Geometry is null, there is no bbox and no CRS; the collection's extent is the whole earth."""
-    path, collection = write_stac(tmp_path, ABOUT, item("r1", placed=False))
+    path, collection = write_stac(tmp_path, ABOUT, "Surveys", item("r1", placed=False))
     content = read(path)
     assert content["geometry"] is None
     assert "bbox" not in content
@@ -107,35 +95,33 @@ def test_without_a_place_there_is_no_geometry(tmp_path: Path) -> None:
 
 def test_every_prefix_used_is_declared_and_no_other(tmp_path: Path) -> None:
     """Extensions are those of the fields in properties, assets and bands."""
-    content = read(write_stac(tmp_path, ABOUT, item("r1"))[0])
+    content = read(write_stac(tmp_path, ABOUT, "Surveys", item("r1"))[0])
     names = [uri.split("/")[3] for uri in content["stac_extensions"]]
     assert names == ["projection", "processing", "hsi", "classification", "eo"]
     plain = Item("r2", "2026-05-01T10:00:00Z", "2026-05-01T11:00:00Z", {}, {"a": {"href": "a.tif", "type": COG}})
-    assert read(write_stac(tmp_path, ABOUT, plain)[0])["stac_extensions"] == []
+    assert read(write_stac(tmp_path, ABOUT, "Surveys", plain)[0])["stac_extensions"] == []
 
 
 def test_items_of_one_folder_are_one_collection(tmp_path: Path) -> None:
     """Items come in order of time, those of before stay as they are, and the extents hold them all."""
-    first, _ = write_stac(tmp_path, ABOUT, item("r2", day=2))
+    first, _ = write_stac(tmp_path, ABOUT, "Surveys", item("r2", day=2))
     before = first.read_bytes()
-    write_stac(tmp_path, ABOUT, item("r1", day=1, placed=False))
-    write_stac(tmp_path, ABOUT, item("r3", day=3))
+    write_stac(tmp_path, ABOUT, "Surveys", item("r1", day=1, placed=False))
+    write_stac(tmp_path, ABOUT, "Surveys", item("r3", day=3))
     assert first.read_bytes() == before
     content = read(tmp_path / COLLECTION)
     links = [link["href"] for link in content["links"] if link["rel"] == "item"]
     assert links == ["./r1/r1.json", "./r2/r2.json", "./r3/r3.json"]
     assert content["extent"]["temporal"]["interval"] == [["2026-05-01T10:00:00Z", "2026-05-03T11:00:00Z"]]
     assert content["extent"]["spatial"]["bbox"] == [read(first)["bbox"]]
-    assert content["summaries"]["proj:code"] == ["EPSG:32632"]
-    assert content["summaries"]["hsi:wavelength_max"] == {"minimum": 0.8, "maximum": 0.8}
     assert sorted(path.name for path in tmp_path.iterdir()) == [COLLECTION, "r1", "r2", "r3"]
 
 
 def test_links_are_relative(tmp_path: Path) -> None:
     """The folder can be moved: no link and no asset holds a path of this machine, none says where it lies itself."""
-    paths = write_stac(tmp_path, ABOUT, item("r1"))
+    paths = write_stac(tmp_path, ABOUT, "Surveys", item("r1"))
     texts = [path.read_bytes() for path in paths]
-    assert [path.read_bytes() for path in write_stac(tmp_path, ABOUT, item("r1"))] == texts  # nothing of the clock
+    assert [path.read_bytes() for path in write_stac(tmp_path, ABOUT, "Surveys", item("r1"))] == texts  # no clock
     for path in paths:
         content = read(path)
         hrefs = [about["href"] for about in (*content["links"], *content.get("assets", {}).values())]
@@ -156,7 +142,7 @@ def test_the_footprint_holds_what_is_seen(tmp_path: Path) -> None:
     assert area > 0
     metres = np.cos(np.deg2rad(ring[0, 1])) * 111_300**2
     assert area * metres == pytest.approx(mask.sum() / 4, rel=0.03)
-    west, south, east, north = bounds(found)
+    west, south, east, north = shapely.geometry.shape(found).bounds
     assert 9 <= west < east < 9.001
     assert 52 < south < north < 52.1
     assert footprint(BOX, [(0, np.zeros_like(mask))]) is None
@@ -194,10 +180,10 @@ def test_classes_have_names_that_the_extension_allows() -> None:
 
 def test_a_folder_of_another_archive_is_refused(tmp_path: Path) -> None:
     """Its collection stays, and nothing is written."""
-    write_stac(tmp_path, ABOUT, item("r1"))
+    write_stac(tmp_path, ABOUT, "Surveys", item("r1"))
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(ArchiveError, match="collection 'field-a' of another archive, expected 'field-b'"):
-        write_stac(tmp_path, Collection("field-b", "", "Surveys"), item("r2"))
+        write_stac(tmp_path, "field-b", "Surveys", item("r2"))
     assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -207,44 +193,4 @@ def test_a_damaged_item_of_before_is_named(tmp_path: Path, text: str) -> None:
     (tmp_path / "r1").mkdir()
     (tmp_path / "r1" / "r1.json").write_text(text)
     with pytest.raises(ArchiveError, match=r"r1\.json .*remove"):
-        write_stac(tmp_path, ABOUT, item("r2"))
-
-
-@pytest.fixture
-def content(tmp_path: Path) -> dict[str, Any]:
-    """An item with every extension in it."""
-    found: dict[str, Any] = json.loads(write_stac(tmp_path, ABOUT, item("r1"))[0].read_text())
-    return found
-
-
-@pytest.mark.parametrize(
-    ("place", "value", "words"),
-    [
-        (("properties", "proj:code"), 32632, "is not of type 'string'"),
-        (("properties", "proj:code"), "32632", "does not match"),
-        (("properties", "proj:epsg"), 32632, "no field that is known"),
-        (("properties", "hsi:wavelength_min"), 444.5, "greater than the maximum"),
-        (("properties", "hsi:wavelength_min"), 0.9, "go from 0.9 to 0.8"),
-        (("properties", "processing:level"), "4", "is not one of"),
-        (("properties", "processing:software"), {"a": 1}, "is not of type 'string'"),
-        (("assets", "class_map", "proj:shape"), [80, 100, 1], "is too long"),
-        (("assets", "class_map", "proj:shape"), [100, 80], "is not that of transform and shape"),
-        (("assets", "class_map", "proj:transform"), [0.5, 0, 0, 0, -0.5], "is not valid under any"),
-        (("assets", "class_map", "hsi:wavelength_min"), 0.4, "does not belong there"),
-        (("assets", "mosaic", "bands", 0, "eo:center_wavelength"), 0, "less than or equal"),
-        (("assets", "class_map", "classification:classes", 0, "name"), "sugar beet", "does not match"),
-        (("assets", "class_map", "classification:classes", 0, "color_hint"), "#0AC81E", "does not match"),
-        (("assets", "class_map", "classification:classes", 0, "value"), 1, "two classes have one value"),
-        (("stac_extensions",), [], "stac_extensions names"),
-    ],
-)
-def test_what_the_extensions_do_not_allow_is_found(
-    content: dict[str, Any], place: tuple[Any, ...], value: Any, words: str
-) -> None:
-    """Each rule has a field that breaks it."""
-    broken = copy.deepcopy(content)
-    part: Any = broken
-    for name in place[:-1]:
-        part = part[name]
-    part[place[-1]] = value
-    assert any(words in text for text in extension_problems(broken))
+        write_stac(tmp_path, ABOUT, "Surveys", item("r2"))

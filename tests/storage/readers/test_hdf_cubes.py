@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError, WavelengthError
 from storage.readers.cube_sources import read_by_chunks
-from storage.readers.scan_files import open_cube_source
+from storage.readers.open_cubes import open_cube
 from storage.readers.scene_files import load_scene_file
 
 pytestmark = pytest.mark.filterwarnings(
@@ -52,7 +52,7 @@ def emit_file(path: Path) -> NDArray[np.float32]:
 def test_emit_reflectance(tmp_path: Path) -> None:
     """Values, wavelengths, widths and bad bands as EMIT says them; a note says that there is no map grid."""
     values = emit_file(tmp_path / "emit.nc")
-    source = open_cube_source(tmp_path / "emit.nc")
+    source = open_cube(tmp_path / "emit.nc")
     assert (source.shape, source.nodata, source.bad_bands) == ((7, 6, 5), -9999.0, (2,))
     scene = load_scene_file(tmp_path / "emit.nc")
     np.testing.assert_array_equal(scene.wavelength_nm, NM[[0, 1, 3, 4]])
@@ -301,10 +301,3 @@ def test_an_array_that_claims_more_than_it_holds(tmp_path: Path) -> None:
         file["wavelength"] = NM
     with pytest.raises(SceneError, match=r"claims .* bytes of numbers"):
         load_scene_file(tmp_path / "huge.h5")
-
-
-def test_a_packed_cube_is_never_a_label_file(tmp_path: Path) -> None:
-    """The message says in which formats labels are read."""
-    neon_file(tmp_path / "a.h5")
-    with pytest.raises(SceneError, match=r"is read as a scene alone; write labels"):
-        load_scene_file(tmp_path / "a.h5", labels=tmp_path / "a.h5")

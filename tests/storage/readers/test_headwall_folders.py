@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from pipeline.errors import SceneError
 from pipeline.rectify.detector import find_bad_elements
 from pipeline.rig.camera.camera_texts import times_of_lines
-from storage.readers.headwall_folders import load_frame_index
-from storage.readers.scan_files import open_cube_source
+from storage.readers.envi_files import load_frame_index
+from storage.readers.open_cubes import open_cube
 
 NM = "wavelength units = nm\nwavelength = {\n400.0\n,500.0\n,600.0\n}\n"
 
@@ -45,7 +45,7 @@ def test_parts_in_order_of_their_frames(tmp_path: Path, lines: NDArray[np.uint16
         write_part(tmp_path, f"raw_{first}", lines[first:last])
         rows = [f"{frame}{between}{1000 + 10 * frame}" for frame in range(first, last)]
         (tmp_path / f"frameIndex_{first}.txt").write_text("\r\n".join([f"Frame#{between}Timestamp", *rows]))
-    source = open_cube_source(tmp_path)
+    source = open_cube(tmp_path)
     assert (source.shape, source.dtype, source.lost_lines, source.notes) == ((30, 4, 3), np.uint16, 0, ())
     np.testing.assert_array_equal(source.read(0, 30), lines)
     np.testing.assert_array_equal(source.read(6, 22), lines[6:22])
@@ -62,7 +62,7 @@ def test_lines_in_no_file_are_flagged(tmp_path: Path, lines: NDArray[np.uint16])
     """A part that is cut off, or not there, leaves lines between; the last one's lost lines stand at the end."""
     write_part(tmp_path, "raw_0", lines[:6], lines=10)
     write_part(tmp_path, "raw_10", lines[10:20], lines=12)
-    source = open_cube_source(tmp_path)
+    source = open_cube(tmp_path)
     missing = [6, 7, 8, 9, 20, 21]
     assert source.shape[0] == 22
     assert np.flatnonzero(~source.lines.valid).tolist() == missing
@@ -76,7 +76,7 @@ def test_an_empty_part_is_left_out(tmp_path: Path, lines: NDArray[np.uint16]) ->
     write_part(tmp_path, "raw_0", lines[:6])
     write_part(tmp_path, "raw_6", lines[:0], lines=10)
     for name in ("raw_6", "raw_6.bin"):  # whatever its data file is called
-        source = open_cube_source(tmp_path)
+        source = open_cube(tmp_path)
         assert (source.shape[0], source.notes) == (6, (f"{name} is empty and left out",))
         (tmp_path / "raw_6").rename(tmp_path / "raw_6.bin") if name == "raw_6" else None
 
@@ -86,12 +86,12 @@ def test_references_found_by_name(tmp_path: Path, lines: NDArray[np.uint16]) -> 
     write_part(tmp_path, "raw_0", lines)
     write_part(tmp_path, "darkReference", np.stack([lines[0], lines[2]]), more="")
     write_part(tmp_path, "WhiteReference_01", lines[5:6], more="")
-    source = open_cube_source(tmp_path)
+    source = open_cube(tmp_path)
     np.testing.assert_array_equal(source.dark, lines[1])
     np.testing.assert_array_equal(source.white, lines[5])
     assert source.notes == ("dark frame from darkReference.hdr", "white frame from WhiteReference_01.hdr")
     np.save(tmp_path / "d.npy", lines[9])
-    np.testing.assert_array_equal(open_cube_source(tmp_path, dark=tmp_path / "d.npy").dark, lines[9])
+    np.testing.assert_array_equal(open_cube(tmp_path, dark=tmp_path / "d.npy").dark, lines[9])
 
 
 def test_references_of_another_size_or_several(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
@@ -99,11 +99,11 @@ def test_references_of_another_size_or_several(tmp_path: Path, lines: NDArray[np
     write_part(tmp_path, "raw_0", lines)
     write_part(tmp_path, "darkReference", lines[:1, :2], more="")
     with pytest.raises(SceneError, match=r"dark frame is \(2, 3\) \(sample, band\), .* is \(4, 3\)"):
-        open_cube_source(tmp_path)
+        open_cube(tmp_path)
     write_part(tmp_path, "darkReference_2", lines[:1], more="")
     with pytest.raises(SceneError, match=r"several dark frames .* name one with --dark"):
-        open_cube_source(tmp_path)
-    assert open_cube_source(tmp_path, dark=tmp_path / "darkReference_2.hdr").dark is not None
+        open_cube(tmp_path)
+    assert open_cube(tmp_path, dark=tmp_path / "darkReference_2.hdr").dark is not None
 
 
 def test_parts_that_do_not_fit(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
@@ -120,7 +120,7 @@ def test_parts_that_do_not_fit(tmp_path: Path, lines: NDArray[np.uint16]) -> Non
         ("far", "are in no file, more than"),
     ):
         with pytest.raises(SceneError, match=words):
-            open_cube_source(tmp_path / name)
+            open_cube(tmp_path / name)
 
 
 def test_folders_that_are_none(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
@@ -128,19 +128,19 @@ def test_folders_that_are_none(tmp_path: Path, lines: NDArray[np.uint16]) -> Non
     with pytest.raises(
         SceneError, match="is a folder, expected a file, a Zarr store, or a folder with raw_<frame> files"
     ):
-        open_cube_source(tmp_path)
+        open_cube(tmp_path)
     write_part(tmp_path, "raw_0", lines[:0])
     with pytest.raises(SceneError, match=r"every part of .* is empty"):
-        open_cube_source(tmp_path)
+        open_cube(tmp_path)
     (tmp_path / "raw_0.hdr").unlink()
     with pytest.raises(SceneError, match=r"expected one header raw_0\.hdr, found raw_0"):
-        open_cube_source(tmp_path)
+        open_cube(tmp_path)
 
 
 def test_real_references(real_data: Path) -> None:
     """The frames of a real MV.X are found by their names, dark as integers, white as floats; 197 elements are hot."""
-    dark = open_cube_source(real_data / "headwall_references" / "darkReference.bin")
-    white = open_cube_source(real_data / "headwall_references" / "whiteReference.hdr")
+    dark = open_cube(real_data / "headwall_references" / "darkReference.bin")
+    white = open_cube(real_data / "headwall_references" / "whiteReference.hdr")
     assert dark.shape == white.shape == (1, 1020, 301)
     assert (dark.dtype, white.dtype) == (np.uint16, np.float32)
     np.testing.assert_allclose(dark.lines.exposure_ms, [100.0033437])
@@ -156,7 +156,7 @@ def test_times_of_a_part_that_is_cut_off(tmp_path: Path, lines: NDArray[np.uint1
     write_part(tmp_path, "raw_0", lines[:6], lines=8)
     frames = [0, 1, 4, 5, 6, 7, 8, 9]
     (tmp_path / "frameIndex_0.txt").write_text("f\tt\n" + "".join(f"{frame}\t{10 * frame}\n" for frame in frames))
-    source = open_cube_source(tmp_path)
+    source = open_cube(tmp_path)
     assert source.lines.frame is not None
     assert source.lines.frame.tolist() == [0, 1, 4, 5, 6, 7, -1, -1]
 
@@ -166,12 +166,12 @@ def test_numbers_in_names_count_where_lines_follow_from_them(tmp_path: Path, lin
     for folder, names in (("whole", (0, 5, 10)), ("early", (0, 7, 12)), ("late", (0, 5, 12))):
         for number, first in zip(names, (0, 5, 10), strict=True):
             write_part(tmp_path / folder, f"raw_{number}", lines[first : first + 5])
-    found = {name: open_cube_source(tmp_path / name) for name in ("whole", "early", "late")}
+    found = {name: open_cube(tmp_path / name) for name in ("whole", "early", "late")}
     assert found["whole"].by_names == ()
     assert found["early"].shape == found["late"].shape
     assert found["early"].by_names != found["late"].by_names
     (tmp_path / "whole" / "frameIndex_5.txt").write_text("f\tt\n" + "".join(f"{n}\t{n}\n" for n in range(5)))
-    assert open_cube_source(tmp_path / "whole").by_names == ((0, 5, 10), (5,))
+    assert open_cube(tmp_path / "whole").by_names == ((0, 5, 10), (5,))
 
 
 def test_what_is_no_file_is_no_part(tmp_path: Path, lines: NDArray[np.uint16]) -> None:
@@ -179,11 +179,11 @@ def test_what_is_no_file_is_no_part(tmp_path: Path, lines: NDArray[np.uint16]) -
     write_part(tmp_path, "raw_0", lines[:5])
     (tmp_path / "raw_5").mkdir()
     os.mkfifo(tmp_path / "frameIndex_0.txt")
-    assert open_cube_source(tmp_path).shape[0] == 5
+    assert open_cube(tmp_path).shape[0] == 5
     os.mkfifo(tmp_path / "pipe.hdr")
     (tmp_path / "pipe").touch()
     with pytest.raises(SceneError, match="is no file; name an ENVI header"):
-        open_cube_source(tmp_path / "pipe.hdr")
+        open_cube(tmp_path / "pipe.hdr")
 
 
 def _index(folder: Path, text: str) -> Path:

@@ -18,10 +18,11 @@ from rasterio.control import GroundControlPoint
 
 from pipeline.errors import SceneError
 from pipeline.setting_fields import numbers_of
-from storage.readers.raster_tags import bad_bands
-from storage.readers.scan_files import open_cube_source, write_ingested_cube
+from storage.readers.image_files import bad_bands
+from storage.readers.ingested_cubes import write_ingested_cube
+from storage.readers.open_cubes import open_cube
 from storage.readers.scene_files import load_scene_file
-from storage.readers.scene_rows import bands_text
+from storage.readers.scene_values import bands_text
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:Use `@` matmul:PendingDeprecationWarning", "ignore:Dataset has no geotransform"
@@ -161,7 +162,7 @@ def test_an_ingested_cube_keeps_place_gaps_and_bad_bands(tmp_path: Path) -> None
         say_in_a_list(file)
         file.update_tags(bbl="1 1 0 1")
         file.write_mask(np.where(np.arange(42).reshape(6, 7) < 9, 0, 255).astype(np.uint8))
-    write_ingested_cube(tmp_path / "stored", open_cube_source(tmp_path / "a.tif"), [], name="a")
+    write_ingested_cube(tmp_path / "stored", open_cube(tmp_path / "a.tif"), [], name="a")
     scene, cube = load_scene_file(tmp_path / "a.tif"), load_scene_file(tmp_path / "stored")
     assert cube.geobox == scene.geobox is not None
     np.testing.assert_array_equal(cube.values, scene.values)

@@ -11,7 +11,7 @@ import pytest
 import shapely
 
 from pipeline.errors import ZoneError
-from storage.readers.zone_files import read_zones
+from storage.readers.polygons import read_zones
 
 SQUARE, OTHER = shapely.box(0, 0, 10, 10), shapely.box(20, 0, 25, 10)
 BOWTIE = shapely.Polygon([(0, 0), (10, 10), (10, 0), (0, 10)])

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import base64
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from pipeline.errors import SceneError
 from pipeline.rig.camera.camera_texts import MICROMETRES, NANOMETRES, UNSAID
 from storage.arrays.georeference import find_geobox
 from storage.readers.array_files import split_step
-from storage.readers.cube_sources import Bands, CubeSource, ReadLines, unpacked
+from storage.readers.cube_sources import Bands, CubeSource, unpacked
 
 ROWS = ("y", "line", "lines", "row", "rows", "lat", "latitude", "northing", "downtrack", "along_track")
 _ACROSS = ("crosstrack", "across_track")
@@ -29,35 +29,20 @@ COLUMNS = ("x", "sample", "samples", "column", "columns", "col", "lon", "longitu
 BANDS = ("band", "bands", "wavelength", "wavelengths", "channel", "channels", "spectral")
 TIMES = ("time", "t", "date", "dates", "step", "visit")
 WAVELENGTHS = ("wavelength", "wavelengths", "radiation_wavelength")
-WIDTHS = ("fwhm",)
 METRES = {"m", "meter", "meters", "metre", "metres"}
 
 Arrays = Mapping[str, Any]  # by name, or by path within a file; each has shape, ndim, dtype, attrs and [...]
 
 
 @dataclass(frozen=True)
-class Moment:
-    """One step of an axis of time."""
-
-    axis: int
-    step: int
-
-
-@dataclass(frozen=True)
 class ArrayCube:
-    """An array that is a cube, and what its axes are."""
+    """An array that is a cube, with its axes of rows, columns and, where there are some, bands."""
 
     name: str
     array: Any
-    order: tuple[int, ...]  # axes of rows, columns and, where there are some, bands
-    moment: Moment | None
+    order: tuple[int, ...]
+    moment: tuple[int, int] | None  # axis of time, and the step on it
     notes: tuple[str, ...] = ()
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """(y, x, band); one band where the array has none."""
-        sizes = tuple(int(self.array.shape[axis]) for axis in self.order)
-        return sizes[0], sizes[1], sizes[2] if len(sizes) == 3 else 1
 
     @property
     def dims(self) -> list[str]:
@@ -73,35 +58,37 @@ def find_cube(arrays: Arrays, variable: str | None, path: Path) -> ArrayCube:
     """
     named, step = split_step(variable, arrays)
     name, notes = _chosen(arrays, named, path, series=step is not None)
-    moment = _moment(arrays[name], step, path, name)
+    moment = _moment(arrays[name], step, f"{path}:{name}" if name else str(path))
     order, more = _axes(arrays, name, path, moment)
     return ArrayCube(name, arrays[name], order, moment, (*notes, *more))
 
 
-def spectral_names(arrays: Arrays) -> set[str]:
-    """Names of the arrays that may say wavelengths or widths."""
-    return {name for name in arrays if _word(name) in (*WAVELENGTHS, *WIDTHS)}
+def names_beside(arrays: Arrays) -> set[str]:
+    """Return names of the arrays that may say wavelengths or widths."""
+    return {name for name in arrays if _word(name) in (*WAVELENGTHS, "fwhm")}
 
 
 def dims_of(array: Any) -> list[str]:
-    """Names of an array's axes as Zarr v3 or xarray's v2 keeps them, those of files with groups as paths; or none."""
-    metadata = getattr(array, "metadata", None)
-    named = getattr(metadata, "dimension_names", None) or array.attrs.get("_ARRAY_DIMENSIONS")
+    """Return names of an array's axes as Zarr v3 or xarray's v2 keeps them, or none."""
+    named = getattr(getattr(array, "metadata", None), "dimension_names", None) or array.attrs.get("_ARRAY_DIMENSIONS")
     return ["" if name is None else str(name) for name in named] if isinstance(named, list | tuple) else []
 
 
-def line_reader(
-    cube: ArrayCube, guard: Callable[[], AbstractContextManager[None]]
-) -> tuple[ReadLines, np.dtype[Any], float | None]:
-    """Return what reads lines, their type, and the number that stands for no value.
+def cube_source(
+    path: Path,
+    cube: ArrayCube,
+    arrays: Arrays,
+    attributes: Mapping[str, Any],
+    guard: Callable[[], AbstractContextManager[None]],
+) -> CubeSource:
+    """Return the cube with its lines, bands and place; reading happens within ``guard``, which names the errors.
 
-    Lines of an array with scale or offset are float32, NaN where there is no value. Reading happens within ``guard``,
-    which names the errors.
+    Lines of an array with scale or offset are float32, NaN where there is no value.
     """
     array, order, moment = cube.array, cube.order, cube.moment
     scale, offset = (_number(array.attrs.get(name)) for name in ("scale_factor", "add_offset"))
     plain = scale in (None, 1.0) and offset in (None, 0.0)
-    fill = _fill(array)
+    fill, sizes = _fill(array), [int(array.shape[axis]) for axis in order]
 
     def read(start: int, stop: int) -> NDArray[Any]:
         """Give some lines (line, sample, band)."""
@@ -109,22 +96,34 @@ def line_reader(
         selection[order[0]] = slice(start, stop)
         left = order
         if moment is not None:
-            selection[moment.axis] = moment.step
-            left = tuple(axis - (axis > moment.axis) for axis in order)
+            selection[moment[0]] = moment[1]
+            left = tuple(axis - (axis > moment[0]) for axis in order)
         with guard():
             block = np.transpose(np.asarray(array[tuple(selection)]), left)
         native = np.ascontiguousarray(block, block.dtype.newbyteorder("="))
-        if native.ndim == 2:
-            native = native[..., None]
-        if plain:
-            return native
-        return unpacked(native, 1.0 if scale is None else scale, 0.0 if offset is None else offset, fill)
+        native = native[..., None] if native.ndim == 2 else native
+        return native if plain else unpacked(native, 1.0 if scale is None else scale, offset or 0.0, fill)
 
-    return read, np.dtype(array.dtype.newbyteorder("=") if plain else np.float32), fill if plain else None
+    notes, geobox = cube.notes, None
+    try:
+        geobox = find_geobox(attributes, arrays, (sizes[0], sizes[1]), (cube.dims[order[0]], cube.dims[order[1]]))
+    except Exception as error:  # attributes of anyone's may hold anything
+        notes = (*notes, f"its place on the earth cannot be read: {error}")
+    return CubeSource(
+        name=path.name,
+        shape=(sizes[0], sizes[1], sizes[2] if len(sizes) == 3 else 1),
+        dtype=np.dtype(array.dtype.newbyteorder("=") if plain else np.float32),
+        read=read,
+        files=(path,),
+        bands=_bands_of(cube, arrays, sizes[2] if len(sizes) == 3 else 1),
+        nodata=fill if plain else None,
+        geobox=geobox,
+        notes=notes,
+    )
 
 
 def _fill(array: Any) -> float | None:
-    """The number that stands for no value, wherever xarray has put it; in Zarr v3 floats are in base64."""
+    """Return the number that stands for no value, wherever xarray has put it; in Zarr v3 floats are in base64."""
     stated = array.attrs.get("_FillValue", array.attrs.get("missing_value"))
     if isinstance(stated, str) and array.dtype.kind == "f":
         return float(struct.unpack("<d", base64.standard_b64decode(stated))[0])
@@ -134,11 +133,10 @@ def _fill(array: Any) -> float | None:
     return _number(stated)
 
 
-def bands_of(cube: ArrayCube, arrays: Arrays) -> Bands:
-    """Wavelengths and widths of the arrays that say them, in nm; none in another unit than one of length."""
-    count = cube.shape[2]
+def _bands_of(cube: ArrayCube, arrays: Arrays, count: int) -> Bands:
+    """Return wavelengths and widths of the arrays that say them, in nm; none in another unit than one of length."""
     axis = cube.dims[cube.order[2]] if len(cube.order) == 3 and len(cube.dims) == cube.array.ndim else ""
-    found = next(_vectors(arrays, WAVELENGTHS, count), None)
+    found = _vector(arrays, WAVELENGTHS, count)
     if found is None and _is_line(arrays, axis, count) and _is_spectral(arrays[axis]):
         found = axis
     if found is None:
@@ -148,24 +146,14 @@ def bands_of(cube: ArrayCube, arrays: Arrays) -> Bands:
     scale = _scale(unit, float(centres.max()))
     if scale is None or not (np.isfinite(centres) & (centres > 0)).all():
         return Bands(units=unit)
-    said = f"in {unit}" if unit not in UNSAID else "without a unit, read by their size"
-    beside = next(_vectors(arrays, WIDTHS, count), None)
-    widths = None if beside is None else np.asarray(arrays[beside][...], np.float64)
-    if widths is not None and beside is not None:
+    stated = f"in {unit}" if unit not in UNSAID else "without a unit, read by their size"
+    beside, widths = _vector(arrays, ("fwhm",), count), None
+    if beside is not None:
         own = _unit(arrays[beside].attrs)
+        widths = np.asarray(arrays[beside][...], np.float64)
         widths = widths * (scale if own in UNSAID else _scale(own, 0.0) or np.nan)
         widths = widths if (widths > 0).all() else None
-    return Bands(centres * scale, widths, unit, f"wavelengths from the array {found}, {said}")
-
-
-def placed(source: CubeSource, cube: ArrayCube, arrays: Arrays, attributes: Mapping[str, Any]) -> CubeSource:
-    """Return the same cube with its place on the earth, where the arrays say it; a note where it cannot be read."""
-    dims = cube.dims
-    try:
-        geobox = find_geobox(attributes, arrays, source.shape[:2], (dims[cube.order[0]], dims[cube.order[1]]))
-    except Exception as error:  # attributes of anyone's may hold anything
-        return replace(source, notes=(*source.notes, f"its place on the earth cannot be read: {error}"))
-    return replace(source, geobox=geobox)
+    return Bands(centres * scale, widths, unit, f"wavelengths from the array {found}, {stated}")
 
 
 def _chosen(arrays: Arrays, variable: str | None, path: Path, *, series: bool) -> tuple[str, tuple[str, ...]]:
@@ -193,13 +181,12 @@ def _chosen(arrays: Arrays, variable: str | None, path: Path, *, series: bool) -
     raise SceneError(f"{path} has no array of numbers with the axes y, x and band; it has {listing}")
 
 
-def _moment(array: Any, step: int | None, path: Path, name: str) -> Moment | None:
-    """The step that is meant, of an array with an axis of time (SceneError: none is named, or one that it lacks)."""
+def _moment(array: Any, step: int | None, address: str) -> tuple[int, int] | None:
+    """Return axis and step of an array with an axis of time (SceneError: none is named, or one that it lacks)."""
     words = [_word(dim) for dim in dims_of(array)]
     unnamed = 0 if array.ndim == 4 and not any(words) else None
     known = set(words) & set(ROWS) and set(words) & set(COLUMNS)
     axis = next((at for at, word in enumerate(words) if known and word in TIMES), unnamed)
-    address = f"{path}:{name}" if name else str(path)
     if axis is None:
         if step is not None:
             raise SceneError(f"{address} has the shape {array.shape} and no axis of time; leave :{step} out")
@@ -209,13 +196,15 @@ def _moment(array: Any, step: int | None, path: Path, name: str) -> Moment | Non
         raise SceneError(f"{address} has {steps} steps of time; name one, {address}:0 to {address}:{steps - 1}")
     if step is not None and step >= steps:
         raise SceneError(f"{address} has {steps} steps of time, counted from 0; got :{step}")
-    return Moment(axis, step or 0)
+    return axis, step or 0
 
 
-def _axes(arrays: Arrays, name: str, path: Path, moment: Moment | None) -> tuple[tuple[int, ...], tuple[str, ...]]:
-    """Which axes of the array are rows, columns and (where there are some) bands; and notes."""
+def _axes(
+    arrays: Arrays, name: str, path: Path, moment: tuple[int, int] | None
+) -> tuple[tuple[int, ...], tuple[str, ...]]:
+    """Return the axes of rows, columns and (where there are some) bands; and notes."""
     array = arrays[name]
-    named, own = dims_of(array), [axis for axis in range(array.ndim) if moment is None or axis != moment.axis]
+    named, own = dims_of(array), [axis for axis in range(array.ndim) if moment is None or axis != moment[0]]
     if len(own) not in (2, 3):
         raise SceneError(f"{path} holds shape {array.shape}; expected y, x and band; store one time or level")
     if not any(_word(dim) in (*ROWS, *COLUMNS, *BANDS, *TIMES) or dim in arrays for dim in named):
@@ -233,23 +222,23 @@ def _axes(arrays: Arrays, name: str, path: Path, moment: Moment | None) -> tuple
 
 
 def _spectral_axes(arrays: Arrays, array: Any) -> list[int]:
-    """Axes of an array that are as long as the wavelengths: one, unless sizes are alike by chance."""
+    """Return the axes of an array that are as long as the wavelengths: one, unless sizes are alike by chance."""
     lengths = {arrays[name].shape[0] for name in arrays if _word(name) in WAVELENGTHS and arrays[name].ndim == 1}
-    named = dims_of(array)
-    by_name = [axis for axis, dim in enumerate(named) if _is_spectral(arrays.get(dim))]
+    by_name = [axis for axis, dim in enumerate(dims_of(array)) if _is_spectral(arrays.get(dim))]
     return by_name or [axis for axis, size in enumerate(array.shape) if size in lengths]
 
 
 def _is_spectral(coordinate: Any) -> bool:
-    """Whether a coordinate says wavelengths: by its standard name or its unit."""
+    """Tell whether a coordinate says wavelengths: by its standard name or its unit."""
     if coordinate is None or coordinate.ndim != 1:
         return False
     return coordinate.attrs.get("standard_name") in WAVELENGTHS or _unit(coordinate.attrs) in NANOMETRES | MICROMETRES
 
 
-def _vectors(arrays: Arrays, words: tuple[str, ...], count: int) -> Iterator[str]:
-    """Names of the arrays of ``count`` numbers that are called by one of the words, in the words' order."""
-    return (name for word in words for name in arrays if _word(name) == word and _is_line(arrays, name, count))
+def _vector(arrays: Arrays, words: tuple[str, ...], count: int) -> str | None:
+    """Return the first array of ``count`` numbers that is called by one of the words, in the words' order."""
+    found = (name for word in words for name in arrays if _word(name) == word and _is_line(arrays, name, count))
+    return next(found, None)
 
 
 def _is_line(arrays: Arrays, name: str, count: int) -> bool:
@@ -269,7 +258,7 @@ def _number(value: object) -> float | None:
 
 
 def _scale(unit: str, largest: float) -> float | None:
-    """What one of the unit is in nm; where none is said, micrometres or nm by the size; None of other units."""
+    """Return one of the unit in nm; where none is said, micrometres or nm by the size; None of other units."""
     if unit in UNSAID:
         return 1000.0 if largest <= 20 else 1.0
     return 1.0 if unit in NANOMETRES else 1000.0 if unit in MICROMETRES else 1e9 if unit in METRES else None

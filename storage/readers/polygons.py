@@ -1,4 +1,4 @@
-"""Labels that are polygons: GeoPackage, GeoJSON and shapefile, burnt onto the pixels of a scene.
+"""Polygons out of GeoJSON, GeoPackage and shapefile: zones with names, and labels burnt onto the pixels of a scene.
 
 A pixel has the class of the polygon that its centre lies in, of the later one in the file where several do, and none
 outside. On a scene with a place polygons lie where their CRS says; on one without, they are in pixels, x to the right
@@ -7,9 +7,12 @@ and y down from the upper left corner.
 
 from __future__ import annotations
 
+import json
+from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,20 +25,149 @@ from pipeline.ground.zones import on_field
 from pipeline.lazy import deferred
 from storage.readers.labels import MOST_FOUND_CLASSES, Labels, default_colour
 from storage.readers.scene_toml import SETTINGS_NAME, ClassValue, SceneSettings
-from storage.readers.zone_files import GEOJSON, PolygonLayer, polygons_of, read_polygons, split_layer, word_of
 
 if TYPE_CHECKING:
+    import pyogrio
     import pyproj
     import rasterio.features as rasterio_features
+    import shapely
     from odc.geo.geobox import GeoBox
     from shapely.geometry.base import BaseGeometry
-else:
+else:  # two seconds to import, for surveys with polygons alone
+    pyogrio = deferred("pyogrio")
     pyproj = deferred("pyproj")
     rasterio_features = deferred("rasterio.features")
+    shapely = deferred("shapely")
 
-POLYGON_ENDINGS = (".gpkg", ".geojson", ".shp")  # a .json is a list of names
+GEOJSON = (".geojson", ".json")
+ZONE_ENDINGS = (*GEOJSON, ".gpkg", ".shp")
+POLYGON_ENDINGS = (".gpkg", ".geojson", ".shp")  # of labels: a .json is a list of names
+USUAL_NAMES = ("name", "plot", "plot_name", "plot_id", "plotid", "id", "label")
 _OF_CROPS = ("crop", "crop_type", "species", "category", "land_cover", "landcover", "cover", "type", "code", "name")
 CLASS_ATTRIBUTES = ("class", "class_name", "classname", "class_id", "label", *_OF_CROPS)  # in the order tried
+POLYGONS = ("Polygon", "MultiPolygon")
+
+
+@dataclass(frozen=True)
+class PolygonLayer:
+    """Polygons of one layer, in its order, and their attributes."""
+
+    crs: pyproj.CRS | None  # None where the file names none
+    shapes: list[BaseGeometry]  # x before y, longitude before latitude
+    rows: list[int]  # of the layer, from 0, that the polygons stand in
+    fields: dict[str, NDArray[Any]]  # attributes by name, one value a polygon
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class ZoneFile:
+    """Polygons of one file, those of one name together, and what was mended of them."""
+
+    path: str
+    crs: pyproj.CRS | None  # None where the file names none
+    shapes: dict[str, BaseGeometry]  # by name, in the order of the file; x before y, longitude before latitude
+    notes: tuple[str, ...] = ()
+
+
+def read_zones(source: str, *, named_by: str | None = None) -> ZoneFile:
+    """Read the polygons of ``FILE`` or ``FILE.gpkg:LAYER``, named by the attribute ``named_by``.
+
+    None takes the first of name, plot, plot_id, id and label that there is, else numbers from 1. Polygons of one name
+    are one zone. Those whose borders cross or touch themselves are mended, and a note says so. Raises ZoneError: no
+    such file, layer or attribute, a file that cannot be read, or one with anything but polygons.
+    """
+    layer = read_polygons(source)
+    called = _names(layer, named_by, source)
+    shapes: dict[str, BaseGeometry] = {}
+    for name, shape in zip(called, layer.shapes, strict=True):
+        shapes[name] = shape if name not in shapes else shapely.union(shapes[name], shape)
+    return ZoneFile(source, layer.crs, shapes, layer.notes)
+
+
+def read_polygons(source: str) -> PolygonLayer:
+    """Read the polygons of ``FILE`` or ``FILE.gpkg:LAYER`` with their attributes; ZoneError as for `read_zones`.
+
+    Polygons whose borders cross or touch themselves are mended, and a note says so; empty ones are left out.
+    """
+    path, layer = split_layer(source)
+    if path.suffix.lower() not in ZONE_ENDINGS:
+        raise ZoneError(f"{source}: expected polygons as {', '.join(ZONE_ENDINGS)}; save the layer as one of them")
+    if not path.is_file():
+        raise ZoneError(f"there is no file {path}; give the path of a file with polygons, or leave it out")
+    try:
+        if path.suffix.lower() == ".gpkg":
+            layer = _layer_of(path, layer)
+        about, _, found, values = pyogrio.raw.read(path, layer=layer)
+        # GDAL takes WGS 84 for granted in GeoJSON; whether that is meant is the survey's to say
+        known = about["crs"] is not None and (path.suffix.lower() not in GEOJSON or _names_crs(path))
+        crs = pyproj.CRS.from_user_input(about["crs"]) if known else None
+    except (OSError, ValueError, RuntimeError, pyproj.exceptions.CRSError) as error:  # GDAL's are RuntimeErrors
+        raise ZoneError(f"cannot read {source} as polygons: {error}; save it anew from a map program") from None
+    geometry = [None if one is None else shapely.from_wkb(one) for one in (() if found is None else found)]
+    rows = [number for number, one in enumerate(geometry) if one is not None and not one.is_empty]
+    kinds = Counter(one.geom_type for one in geometry if one is not None and one.geom_type not in POLYGONS)
+    if kinds or not rows:
+        came = " and ".join(f"{count} {kind}" for kind, count in kinds.items()) or "none"
+        raise ZoneError(f"{source}: expected polygons, got {came}; draw areas, zones and plots as closed polygons")
+    shapes = [shapely.force_2d(geometry[number]) for number in rows]
+    crossed = sum(not shape.is_valid for shape in shapes)
+    shapes = [shape if shape.is_valid else polygons_of(shapely.make_valid(shape)) for shape in shapes]
+    told = f"{source}: the borders of {crossed} of {len(rows)} polygons cross or touch themselves and were mended"
+    fields = {str(name): column[rows] for name, column in zip(about["fields"], values, strict=True)}
+    return PolygonLayer(crs, shapes, rows, fields, (told,) if crossed else ())
+
+
+def polygons_of(shape: BaseGeometry) -> BaseGeometry:
+    """What of a geometry has an area, as one polygon or several; lines and points that mending left are dropped."""
+    parts = [one for one in shapely.get_parts(shape) if one.geom_type in POLYGONS]
+    inner = [polygons_of(one) for one in shapely.get_parts(shape) if one.geom_type == "GeometryCollection"]
+    return shapely.union_all([*parts, *inner]) if len(parts) + len(inner) != 1 else (parts + inner)[0]
+
+
+def split_layer(source: str | Path) -> tuple[Path, str | None]:
+    """``FILE.gpkg:LAYER`` -> path and layer; None where none is named."""
+    head, mark, layer = str(source).rpartition(".gpkg:")
+    return Path(f"{head}.gpkg" if mark else source), layer if mark else None
+
+
+def _layer_of(path: Path, layer: str | None) -> str | None:
+    layers = [str(one) for one in pyogrio.list_layers(path)[:, 0]]
+    if layer is None and len(layers) == 1:
+        return layers[0]
+    if layer is None or layer not in layers:
+        asked = "has several layers" if layer is None else f"has no layer {layer!r}"
+        raise ZoneError(f"{path} {asked}; name one of {', '.join(layers)}: {path}:{layers[0] if layers else 'LAYER'}")
+    return layer
+
+
+def _names_crs(path: Path) -> bool:
+    content = json.loads(path.read_text(encoding="utf-8-sig"))
+    return isinstance(content, dict) and content.get("crs") is not None
+
+
+def _names(content: PolygonLayer, named_by: str | None, source: str) -> list[str]:
+    """What each polygon is called."""
+    numbers = [str(row + 1) for row in content.rows]
+    by_word = {name.lower(): name for name in reversed(content.fields)}
+    if named_by is not None and named_by not in content.fields:
+        known = ", ".join(content.fields) or "no attribute"
+        raise ZoneError(f"{source}: expected an attribute {named_by!r} to name plots by, got {known}")
+    found = named_by or next((by_word[word] for word in USUAL_NAMES if word in by_word), None)
+    if found is None:
+        return numbers
+    return [word_of(value) or number for value, number in zip(content.fields[found], numbers, strict=True)]
+
+
+def word_of(value: object) -> str:
+    """An attribute as a name; empty where it says nothing."""
+    if value is None or (isinstance(value, float | np.floating) and np.isnan(value)):
+        return ""
+    if isinstance(value, float | np.floating) and float(value).is_integer():
+        return str(int(value))
+    return str(value).strip()
+
+
+# --- labels -----------------------------------------------------------------------------------------------------------
 
 
 def is_polygon_file(address: str | Path) -> bool:
@@ -52,7 +184,7 @@ def load_polygon_labels(
     SceneError: there is no such file, layer or attribute, no polygon, none on the scene, no CRS where one is needed
     or one where none is known, or a class that the settings lack.
     """
-    layer = _read(address)
+    layer = _labels_in(address)
     attribute, said = _classes_said(layer, address, settings)
     classes = dict(settings.classes) or _named(said, settings.unlabelled, str(address))
     codes = [_index_of(word, classes, settings.unlabelled) for word in said]
@@ -95,11 +227,11 @@ def polygon_classes(addresses: Iterable[str | Path], settings: SceneSettings) ->
     """
     said: list[str] = []
     for address in addresses:
-        said += _classes_said(_read(address), address, settings)[1]
+        said += _classes_said(_labels_in(address), address, settings)[1]
     return _named(said, settings.unlabelled, "of several files")
 
 
-def _read(address: str | Path) -> PolygonLayer:
+def _labels_in(address: str | Path) -> PolygonLayer:
     try:
         return read_polygons(str(address))
     except ZoneError as error:
@@ -159,7 +291,7 @@ def _moved(layer: PolygonLayer, place: FieldPlace, address: str | Path) -> list[
             raise SceneError(f"labels {address} do not say their CRS; save them with one (a shapefile has a .prj)")
         crs = pyproj.CRS.from_epsg(WGS84)
     moved = [polygons_of(on_field(shape, crs, place)) for shape in layer.shapes]
-    if all(one.is_empty or not one.intersects(_outline(place)) for one in moved):
+    if all(one.is_empty or not one.intersects(NoPlace(place.shape).outline) for one in moved):
         given = np.array([shape.bounds for shape in layer.shapes])
         west, south = given[:, :2].min(axis=0)
         east, north = given[:, 2:].max(axis=0)
@@ -170,10 +302,6 @@ def _moved(layer: PolygonLayer, place: FieldPlace, address: str | Path) -> list[
             f" {north:g} {there}, off its {size}; are they of this scene, and is their CRS right?"
         )
     return moved
-
-
-def _outline(place: FieldPlace) -> BaseGeometry:
-    return NoPlace(place.shape).outline
 
 
 def _burn(polygons: Sequence[tuple[BaseGeometry, int | None]], shape: tuple[int, int]) -> NDArray[np.uint8]:

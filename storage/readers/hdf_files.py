@@ -23,12 +23,11 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SceneError
 from pipeline.lazy import deferred
-from storage.readers.cf_cubes import ArrayCube, bands_of, find_cube, line_reader, placed, spectral_names
+from storage.readers.array_cubes import ArrayCube, cube_source, find_cube, names_beside
 from storage.readers.cube_sources import (
     BLOCK_LINES,
     Bands,
     CubeSource,
-    LineFacts,
     check_claim,
     check_memory,
     read_by_chunks,
@@ -50,16 +49,13 @@ GOOD_BANDS = ("good_wavelengths", "good_bands", "bbl")  # 0 marks a bad band
 NO_UNIT = ("", "1", "unitless", "none", "dimensionless")
 _CLASSIC = b"CDF"  # how NetCDF files of version 3 begin
 _ONLY_A_DIMENSION = "This is a netCDF dimension but not a netCDF variable"
-_NEON_SCALES = ("Scale_Factor", "Scale Factor")  # what values are divided by, where CF's scale_factor multiplies
-_NEON_VOID = ("Data_Ignore_Value", "data ignore value")
 _PRISMA = "HDFEOS/SWATHS/PRS_L2{}_HCO/Data Fields/{}_Cube"
-_PRISMA_LEVELS, _PRISMA_PARTS = "DCB", ("Vnir", "Swir")
 _PRISMA_TOP = 65535  # the number that stands for the greatest value
 
 
 @dataclass(frozen=True)
 class FileArray:
-    """One array of a file: its axes, attributes, and what reads a part of it."""
+    """One array of a file: its axes, attributes, and the function that reads a part of it."""
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
@@ -83,8 +79,10 @@ def open_hdf_cube(path: Path, variable: str | None = None) -> CubeSource:
     y, x and band.
     """
     with _named(path):
-        arrays, attributes = _classic_arrays(path) if _is_classic(path) else _hdf_arrays(path)
-        level = next((one for one in _PRISMA_LEVELS if _PRISMA.format(one, "VNIR") in arrays), None)
+        with path.open("rb") as file:
+            classic = file.read(3) == _CLASSIC
+        arrays, attributes = _classic_arrays(path) if classic else _hdf_arrays(path)
+        level = next((one for one in "DCB" if _PRISMA.format(one, "VNIR") in arrays), None)
         if level is not None and variable is None:
             return _prisma_cube(path, level, arrays, attributes)
         if any(name.startswith("HDFEOS/SWATHS/PRS_") for name in arrays):
@@ -95,35 +93,22 @@ def open_hdf_cube(path: Path, variable: str | None = None) -> CubeSource:
             )
         cube = find_cube(arrays, variable, path)
         near = _in_scope(arrays, cube.name)
-        for name in spectral_names(arrays) | {dim for dim in cube.dims if dim in near}:
+        for name in names_beside(arrays) | {dim for dim in cube.dims if dim in near}:
             _check_array(path, name, (arrays | near)[name], lines=None)
-        return _array_source(path, cube, near, {**attributes, **cube.array.attrs})
-
-
-def _array_source(path: Path, cube: ArrayCube, arrays: Mapping[str, Any], about: Mapping[str, Any]) -> CubeSource:
-    """A cube as lines, with all that the arrays beside it say."""
-    lines, _, count = cube.shape
-    chunk = 1 if cube.array.chunks is None else cube.array.chunks[cube.order[0]]
-    _check_array(path, cube.name, cube.array, lines=(cube.order[0], max(chunk, BLOCK_LINES)))
-    read, kind, fill = line_reader(cube, lambda: _named(path))
-    unit = str(about.get("units", "")).strip()
-    source = CubeSource(
-        name=path.name,
-        shape=cube.shape,
-        dtype=kind,
-        read=read_by_chunks(read, lines, chunk),
-        files=(path,),
-        lines=LineFacts(np.ones(lines, np.bool_)),
-        bands=bands_of(cube, arrays),
-        nodata=fill,
-        bad_bands=_bad_bands(arrays, count),
-        notes=(*cube.notes, *([] if unit.lower() in NO_UNIT else [f"values are in {unit}"])),
-    )
-    source = placed(source, cube, arrays, about)
-    if source.geobox is None:
-        geobox, notes = _neon_place(arrays, cube)
-        return replace(source, geobox=geobox, notes=(*source.notes, *notes))
-    return source
+        chunk = 1 if cube.array.chunks is None else cube.array.chunks[cube.order[0]]
+        _check_array(path, cube.name, cube.array, lines=(cube.order[0], max(chunk, BLOCK_LINES)))
+        about = {**attributes, **cube.array.attrs}
+        source = cube_source(path, cube, near, about, lambda: _named(path))
+        unit, (lines, _, count) = str(about.get("units", "")).strip(), source.shape
+        notes = (*cube.notes, *([] if unit.lower() in NO_UNIT else [f"values are in {unit}"]))
+        geobox, where = (source.geobox, ()) if source.geobox is not None else _other_place(near, cube, source.shape)
+        return replace(
+            source,
+            read=read_by_chunks(source.read, lines, chunk),
+            bad_bands=_bad_bands(near, count),
+            geobox=geobox,
+            notes=(*notes, *source.notes[len(cube.notes) :], *where),
+        )
 
 
 def _bad_bands(arrays: Mapping[str, Any], count: int) -> tuple[int, ...]:
@@ -134,19 +119,23 @@ def _bad_bands(arrays: Mapping[str, Any], count: int) -> tuple[int, ...]:
     return ()
 
 
-def _neon_place(arrays: Mapping[str, Any], cube: ArrayCube) -> tuple[GeoBox | None, tuple[str, ...]]:
-    """The place by NEON's map info and EPSG code; else a note where the file has a place that is not read."""
-    rows, columns, _ = cube.shape
+def _other_place(
+    arrays: Mapping[str, Any], cube: ArrayCube, shape: tuple[int, int, int]
+) -> tuple[GeoBox | None, tuple[str, ...]]:
+    """Return the place by NEON's map info and EPSG code; else a note where the file has a place that is not read."""
     folder = f"{cube.name.rpartition('/')[0]}/Metadata/Coordinate_System"
     if f"{folder}/Map_Info" in arrays and f"{folder}/EPSG Code" in arrays:
-        told = [_text(arrays[f"{folder}/{name}"][()]) for name in ("Map_Info", "EPSG Code")]
+        told = [
+            np.asarray(arrays[f"{folder}/{name}"][()]).astype(np.str_).reshape(-1)[0]
+            for name in ("Map_Info", "EPSG Code")
+        ]
         try:
             words = [word.strip() for word in told[0].split(",")]
             x, y, east, north, wide, high = map(float, words[1:7])
             if any(word.lower().startswith("rotation") and float(word.partition("=")[2]) for word in words):
                 raise ValueError("it is turned")
             corner = Affine(wide, 0, east - (x - 1) * wide, 0, -high, north + (y - 1) * high)
-            return odc_geobox.GeoBox((rows, columns), corner, f"EPSG:{int(told[1])}"), ()
+            return odc_geobox.GeoBox(shape[:2], corner, f"EPSG:{int(told[1])}"), ()
         except Exception as error:  # of PROJ, too
             return None, (f"its place on the earth cannot be read: map info {told[0]!r}: {error}",)
     names = {name.rpartition("/")[2].lower() for name, array in arrays.items() if array.ndim == 2}
@@ -169,7 +158,7 @@ def _prisma_cube(path: Path, level: str, arrays: Mapping[str, FileArray], about:
     centres: list[float] = []
     widths: list[float] = []
     used: list[NDArray[np.bool_]] = []
-    for part in _PRISMA_PARTS:
+    for part in ("Vnir", "Swir"):
         array = arrays[_PRISMA.format(level, part.upper())]
         _check_array(path, f"{part}_Cube", array, lines=(0, (array.chunks or (1,))[0]))
         told = [np.asarray(about[f"List_{word}_{part}"], np.float64).ravel() for word in ("Cw", "Fwhm")]
@@ -207,7 +196,6 @@ def _prisma_cube(path: Path, level: str, arrays: Mapping[str, FileArray], about:
         dtype=np.dtype(np.float32),
         read=read_by_chunks(read, lines, chunk),
         files=(path,),
-        lines=LineFacts(np.ones(lines, np.bool_)),
         bands=Bands(np.array(centres)[order], np.array(widths)[order], "nm", "wavelengths from List_Cw of the file"),
         geobox=geobox,
         notes=(f"a PRISMA product of level 2{level}; {unused} bands without a wavelength are left out", *notes),
@@ -266,11 +254,6 @@ def _check_array(path: Path, name: str, array: FileArray, *, lines: tuple[int, i
     check_memory(path, part + math.prod(array.chunks or ()) * array.dtype.itemsize)
 
 
-def _is_classic(path: Path) -> bool:
-    with path.open("rb") as file:
-        return file.read(3) == _CLASSIC
-
-
 def _classic_arrays(path: Path) -> tuple[dict[str, FileArray], dict[str, Any]]:
     """Arrays and attributes of a NetCDF file of version 3, which is no HDF5.
 
@@ -325,8 +308,8 @@ def _words(about: Mapping[str, Any], item: Any) -> dict[str, Any]:
     """What an array says in other words than CF's: names of its axes, NEON's scale, no-data value and units."""
     dims = [dim[0].name.removeprefix("/") if len(dim) else dim.label for dim in item.dims]
     words: dict[str, Any] = {"_ARRAY_DIMENSIONS": dims} if any(dims) else {}
-    scale = next((about[name] for name in _NEON_SCALES if about.get(name)), None)
-    void = next((about[name] for name in _NEON_VOID if name in about), None)
+    scale = about.get("Scale_Factor") or about.get("Scale Factor")  # divides values, where CF's scale_factor multiplies
+    void = about.get("Data_Ignore_Value", about.get("data ignore value"))
     unit = about.get("units", about.get("Units"))
     words |= {} if scale is None else {"scale_factor": 1 / float(scale)}
     words |= {} if void is None else {"_FillValue": float(void)}
@@ -346,8 +329,3 @@ def _plain(attributes: Any) -> dict[str, Any]:
             value = value.item() if isinstance(value, np.generic) else value
         found[str(name)] = value.decode("utf-8", "replace") if isinstance(value, bytes) else value
     return found
-
-
-def _text(value: Any) -> str:
-    one = np.asarray(value).reshape(-1)[0]
-    return one.decode("utf-8", "replace") if isinstance(one, bytes) else str(one)

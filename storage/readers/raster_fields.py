@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pipeline.errors import SceneError
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.lazy import deferred
-from storage.readers.headwall_folders import is_headwall_folder
+from storage.readers.envi_files import is_headwall_folder
 from storage.readers.label_files import (
     folders_within,
     image_folder,
@@ -26,8 +26,7 @@ from storage.readers.label_files import (
     scene_entries,
 )
 from storage.readers.labels import Labels, load_labels
-from storage.readers.raster_files import split_variable
-from storage.readers.scan_files import reader_of
+from storage.readers.open_cubes import reader_of, split_variable
 from storage.readers.scene_files import OpenScene, open_scene_file
 from storage.readers.scene_toml import find_scene_settings
 
@@ -127,7 +126,11 @@ def _side_by_side(address: Path, opened: Sequence[OpenScene], labels: str | Path
     notes += [f"of {shared} pixels that several tiles show, the first by name wins"] if shared else []
     notes += [f"{beside} pixels lie between the tiles and have no value"] if beside else []
     notes += list(dict.fromkeys(note for one in opened for note in one.provenance))
-    found = _merged_labels(tiles, shape, notes) if labels is None else _stated_labels(labels, shape, first)
+    if labels is None:
+        found = _merged_labels(tiles, shape, notes)
+    else:  # on the pixels of the whole field
+        settings = find_scene_settings(first.path)
+        found = load_labels(labels, shape, classes=settings.classes, unlabelled=settings.unlabelled)
     places = [(tile.scene.light_hash, tile.row, tile.column) for tile in tiles]
     light_hash = hashlib.sha256(json.dumps(places).encode()).hexdigest()
     told = "" if found is None else hashlib.sha256(found.index.tobytes()).hexdigest()
@@ -135,8 +138,9 @@ def _side_by_side(address: Path, opened: Sequence[OpenScene], labels: str | Path
     def read(start: int, stop: int) -> NDArray[np.float32]:
         return _rows_of(tiles, shape[1], len(first.wavelength_nm), start, stop)
 
+    folder = address.parent if is_glob(address) else address
     return OpenScene(
-        name=_name_of(address),
+        name="tiles" if is_glob(folder) else folder.resolve().name or "tiles",
         path=address,
         wavelength_nm=first.wavelength_nm,
         fwhm_nm=first.fwhm_nm,
@@ -244,15 +248,3 @@ def _merged_labels(tiles: Sequence[_Tile], shape: tuple[int, int], notes: list[s
             index[tile.place][there] = tile.scene.labels[there]
         free[tile.place] &= ~there
     return Labels(index, like.class_names, like.class_values, like.class_colours)
-
-
-def _stated_labels(address: str | Path, shape: tuple[int, int], first: OpenScene) -> Labels:
-    """Read labels on the pixels of the whole field (SceneError: they do not fit)."""
-    settings = find_scene_settings(first.path)
-    return load_labels(address, shape, classes=settings.classes or {}, unlabelled=settings.unlabelled)
-
-
-def _name_of(address: Path) -> str:
-    """Call a field by its folder."""
-    folder = address.parent if is_glob(address) else address
-    return "tiles" if is_glob(folder) else folder.resolve().name or "tiles"

@@ -1,0 +1,443 @@
+"""ENVI cubes: one file, or the parts of one cube in a folder of a Headwall camera.
+
+::
+
+    raw_0  raw_0.hdr  raw_2000  raw_2000.hdr     parts of one cube, each named by its first frame
+    frameIndex_0.txt  frameIndex_2000.txt        when each frame was taken
+    darkReference(.hdr)  whiteReference(.hdr)    found by how their names begin, whatever their endings
+
+Headers are read leniently and refused where they say too little; the numbers stay in their file until a part of the
+view is read. The layout of folders is that of the Nano-Hyperspec. Tested on small folders made in it, and on the
+references of a real MV.X.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import SceneError
+from pipeline.rig.camera.camera_texts import (
+    FRAME_INDEX,
+    LONGEST_LINE,
+    FrameIndex,
+    LineTimes,
+    finite_number,
+    listed_numbers,
+    parse_frame_index,
+    split_header,
+    times_of_lines,
+    wavelengths_nm,
+)
+from storage.readers.cube_sources import MOST_MISSING, Bands, CubeSource, LineFacts
+from storage.readers.image_files import bad_bands, place_of_envi
+
+LARGEST_HEADER = 1 << 22  # bytes; the largest seen holds 33 thousand
+INTERLEAVES = ("bil", "bip", "bsq")
+# data type codes of the format's description
+_CODES = (1, 2, 3, 4, 5, 6, 9, 12, 13, 14, 15)
+DATA_TYPES = dict(zip(_CODES, ("u1", "i2", "i4", "f4", "f8", "c8", "c16", "u2", "u4", "i8", "u8"), strict=True))
+# of these a header describes another kind of file than plain numbers
+OTHER_FILES = ("tiff", "jpeg", "jp2", "png", "bmp", "hdf", "netcdf", "nitf", "virtual", "meta")
+# where a data file's name may differ from its header's
+DATA_ENDINGS = ("", ".bin", ".dat", ".img", ".raw", ".bil", ".bip", ".bsq", ".cube")
+_PART = re.compile(r"raw_(\d{1,12})(\.[A-Za-z]{1,4})?", re.IGNORECASE)
+_EXPOSURE = "exposure (ms)"  # a setting in the comments of Headwall's headers
+
+
+@dataclass(frozen=True)
+class EnviHeader:
+    """The content of one header; what it leaves out is None."""
+
+    samples: int
+    lines: int | None  # None: as many as the data file holds
+    bands: int
+    dtype: np.dtype[np.generic]  # with its byte order
+    interleave: str  # bil, bip or bsq
+    offset: int  # bytes before the numbers
+    kind: str  # file type, such as ENVI Standard or ENVI Spectral Library
+    wavelength_nm: NDArray[np.float64] | None  # (band,)
+    fwhm_nm: NDArray[np.float64] | None  # (band,)
+    nodata: float | None
+    fields: Mapping[str, str]  # all of them as written, keys in lower case, the outer braces taken off
+    settings: Mapping[str, str]  # of the lines that begin with ;
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class EnviCube:
+    """An ENVI cube, opened. ``values`` is a read-only view of the file, (line, sample, band) in the file's type."""
+
+    header_path: Path
+    path: Path
+    header: EnviHeader
+    values: NDArray[Any]
+    lost_lines: int  # that the header promises and the file does not hold whole
+    notes: tuple[str, ...]
+
+
+def open_envi_cube(path: str | Path) -> EnviCube:
+    """Open a cube by its header or its data file, of any interleave, type, byte order and header offset.
+
+    A file that is cut off keeps the lines that are whole in all bands, and ``lost_lines`` and a note say so. Raises
+    SceneError: header or data are missing or cannot be used, or no line is whole.
+    """
+    header_path, data_path = find_envi_pair(Path(path))
+    header = load_envi_header(header_path)
+    if "spectral library" in header.kind.lower():
+        raise SceneError(f"{header_path} describes a spectral library, expected a cube (line, sample, band)")
+    size, item = data_path.stat().st_size - header.offset, header.dtype.itemsize
+    samples, bands, line_bytes = header.samples, header.bands, header.samples * header.bands * item
+    promised = size // line_bytes if header.lines is None else header.lines
+    whole = size // line_bytes
+    if header.interleave == "bsq":  # band after band: the last one says how far all of them reach
+        whole = max(size - (bands - 1) * promised * samples * item, 0) // (samples * item)
+    held = min(promised, max(whole, 0))
+    if held < 1:
+        raise SceneError(
+            f"{data_path} holds {max(size, 0)} bytes after an offset of {header.offset}, no whole line of "
+            f"{samples} samples x {bands} bands x {item} bytes in all bands; copy it again"
+        )
+    notes = list(header.notes)
+    if header.lines is None:
+        notes.append(f"the header does not say how many lines there are; the file holds {held}")
+    if held < promised:
+        notes.append(f"{data_path.name} is cut off: {held} of {promised} lines are whole")
+    elif size > promised * line_bytes:
+        notes.append(f"{data_path.name} holds {size - promised * line_bytes} bytes more than its header says")
+    strides = {
+        "bil": (bands * samples * item, item, samples * item),
+        "bip": (samples * bands * item, bands * item, item),
+        "bsq": (samples * item, item, promised * samples * item if bands > 1 else item),  # lines may be any promise
+    }[header.interleave]
+    content = np.memmap(data_path, np.uint8, mode="r")
+    values: NDArray[Any] = np.ndarray((held, samples, bands), header.dtype, content, header.offset, strides)
+    return EnviCube(header_path, data_path, header, values, promised - held, tuple(notes))
+
+
+def find_envi_pair(path: Path) -> tuple[Path, Path]:
+    """Return header and data file of an address that names either (SceneError: one of them is missing)."""
+    if not path.exists() or (path.suffix.lower() != ".hdr" and not path.is_file()):
+        raise SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
+    if path.suffix.lower() == ".hdr":
+        stem = path.with_suffix("")
+        endings = (ending for name in DATA_ENDINGS for ending in {name: None, name.upper(): None})
+        data = next((file for file in (stem.with_name(stem.name + end) for end in endings) if file.is_file()), None)
+        if data is None:
+            raise SceneError(
+                f"no data file beside {path}; expected {stem.name} or {stem.name}.bin, .dat, .img, .raw, ..."
+            )
+        return path, data
+    names = [path.name + ".hdr", path.stem + ".hdr", path.name + ".HDR", path.stem + ".HDR"]
+    header = next((file for file in map(path.with_name, names) if file.is_file()), None)
+    if header is None:
+        wanted = " or ".join(dict.fromkeys(names[:2]))
+        raise SceneError(f"no header beside {path}; expected {wanted}, or the ending of another kind in its name")
+    return header, path
+
+
+def load_envi_header(path: Path) -> EnviHeader:
+    """Read one header file (SceneError: there is no such file, or it is no ENVI header that can be used)."""
+    try:
+        if path.exists() and not path.is_file():
+            raise SceneError(f"{path} is no file; name an ENVI header")
+        if path.stat().st_size > LARGEST_HEADER:
+            raise SceneError(f"{path} has {path.stat().st_size} bytes, too many for a header; name the .hdr file")
+        content = path.read_bytes()
+    except OSError as error:
+        raise SceneError(f"{path} cannot be read: {error}; name an ENVI header") from error
+    if b"\0" in content:
+        raise SceneError(f"{path} holds binary data, expected the text of an ENVI header; name the .hdr file")
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = content.decode("latin-1")
+    return parse_envi_header(text, str(path))
+
+
+def parse_envi_header(text: str, where: str = "the header") -> EnviHeader:
+    """Read a header's text; messages call it ``where``.
+
+    Wavelengths come out in nm. Without a unit they are read as nm or micrometres by their size, and a note says so;
+    wavelengths that do not fit the bands are left out with a note. Raises SceneError: it does not begin with ENVI
+    (ArcGIS headers do not), a size, type or interleave is missing or impossible, or it says that its file holds more
+    than plain numbers (compressed, with bytes between frames).
+    """
+    notes: list[str] = []
+    fields, settings = split_header(text, where, notes)
+    samples, bands = (_whole(fields, key, where, least=1) for key in ("samples", "bands"))
+    kind = fields.get("file type", "ENVI Standard")
+    _refuse_layouts(fields, kind, where)
+    channels = samples if "spectral library" in kind.lower() else bands
+    wavelength, scale = wavelengths_nm(fields, channels, notes)
+    code = _whole(fields, "data type", where, least=1)
+    if code not in DATA_TYPES:
+        raise SceneError(f"{where}: data type = {code} is none of ENVI's {', '.join(map(str, DATA_TYPES))}; correct it")
+    if "byte order" not in fields and np.dtype(DATA_TYPES[code]).itemsize > 1:
+        notes.append("the byte order is not said, taken as little endian")
+    order = _whole(fields, "byte order", where, least=0, otherwise=0)
+    if order > 1:
+        raise SceneError(f"{where}: byte order = {order}, expected 0 (little endian) or 1 (big endian); correct it")
+    interleave = fields.get("interleave", "").strip().lower()
+    if "interleave" not in fields and bands == 1:
+        notes.append("the interleave is not said, and with one band does not matter")
+        interleave = "bsq"
+    if interleave not in INTERLEAVES:
+        says = f"interleave = {interleave!r}" if interleave else "no interleave"
+        raise SceneError(f"{where}: {says}, expected one of {', '.join(INTERLEAVES)}; correct it")
+    widths = None if wavelength is None else listed_numbers(fields, "fwhm", channels, notes)
+    return EnviHeader(
+        samples=samples,
+        lines=_whole(fields, "lines", where, least=0) if "lines" in fields else None,
+        bands=bands,
+        dtype=np.dtype(("<", ">")[order] + DATA_TYPES[code]),
+        interleave=interleave,
+        offset=_whole(fields, "header offset", where, least=0, otherwise=0),
+        kind=kind,
+        wavelength_nm=wavelength,
+        fwhm_nm=None if widths is None or not (widths > 0).all() else widths * scale,
+        nodata=finite_number(fields.get("data ignore value", "")),
+        fields=fields,
+        settings=settings,
+        notes=tuple(notes),
+    )
+
+
+def _whole(fields: Mapping[str, str], key: str, where: str, *, least: int, otherwise: int | None = None) -> int:
+    if key not in fields and otherwise is not None:
+        return otherwise
+    if key not in fields:
+        raise SceneError(f"{where} does not say {key}; add the line '{key} = ...'")
+    number = finite_number(fields[key])
+    if number is None or number != int(number) or number < least:
+        raise SceneError(f"{where}: {key} = {fields[key]!r}, expected a whole number from {least}; correct it")
+    return int(number)
+
+
+def _refuse_layouts(fields: Mapping[str, str], kind: str, where: str) -> None:
+    """Refuse files whose numbers do not simply follow each other: they would be read as other numbers (SceneError)."""
+    if finite_number(fields.get("file compression", "0")) != 0:
+        raise SceneError(f"{where}: file compression = {fields['file compression']!r}, expected 0; unpack the file")
+    for key in ("major frame offsets", "minor frame offsets"):
+        words = [word for word in re.split(r"[,\s]+", fields.get(key, "")) if word]
+        if any(finite_number(word) != 0 for word in words):
+            raise SceneError(
+                f"{where}: {key} = {fields[key]!r} puts bytes between frames, which is not read; store them without"
+            )
+    if any(word in kind.lower() for word in OTHER_FILES):
+        raise SceneError(f"{where}: file type = {kind!r}, expected plain numbers (ENVI Standard); name the file itself")
+
+
+# --- cubes of one file or several -------------------------------------------------------------------------------------
+
+
+def is_headwall_folder(folder: Path) -> bool:
+    """Tell whether a folder holds parts of a cube as a Headwall camera names them."""
+    return any(_PART.fullmatch(entry.name) is not None for entry in folder.iterdir())
+
+
+def open_envi_source(path: Path) -> CubeSource:
+    """Open one ENVI cube by its header or data file; the lines that it lost are its last (SceneError as there)."""
+    cube = open_envi_cube(path)
+    source = _joined(cube.path.name, {0: cube}, list(cube.notes))
+    geobox, where = place_of_envi(cube.header.fields, cube.path, source.shape[:2])
+    return replace(source, geobox=geobox, notes=(*source.notes, *where))
+
+
+def open_headwall_cube(folder: Path) -> CubeSource:
+    """Open the parts of a folder as one cube, in the order of their frames.
+
+    A part whose name says a later frame than where the one before it ends leaves lines between them that no file holds;
+    so does a file that is cut off. A part without any byte is left out. Raises SceneError: a part cannot be used, parts
+    differ in their frames, or too many lines between them are missing.
+    """
+    headers, notes = _headers(folder), list[str]()
+    if not headers:
+        raise SceneError(
+            f"{folder} is a folder, expected a file, a Zarr store, or a folder with raw_<frame> files of a Headwall "
+            "camera; name one of the files in it"
+        )
+    opened: dict[int, EnviCube] = {}
+    for number, header in headers.items():
+        _, data = find_envi_pair(header)
+        if data.stat().st_size == 0:
+            notes.append(f"{data.name} is empty and left out")
+        else:
+            opened[number] = open_envi_cube(header)
+    if not opened:
+        raise SceneError(f"every part of {folder} is empty; copy the folder again")
+    parts = _placed(opened, notes)
+    source = _joined(folder.resolve().name, parts, notes)
+    found = {
+        int(match[1]): file
+        for file in folder.iterdir()
+        if file.is_file() and (match := FRAME_INDEX.fullmatch(file.name))
+    }
+    used = {number: found[number] for number in opened if number in found}
+    by_name = any(before + len(one.values) != after for (before, one), (after, _) in pairwise(parts.items()))
+    if not used:
+        return replace(source, by_names=(tuple(opened), ()) if by_name else ())
+    nothing = np.full(source.shape[0], -1)
+    times, more = LineTimes(nothing, nothing.copy(), np.full(source.shape[0], np.nan), ()), list[str]()
+    for number, (start, cube) in zip(opened, parts.items(), strict=True):
+        if number not in used:
+            more.append(f"there is no frame index for {cube.path.name}")
+            continue
+        index, lines = load_frame_index(used[number]), len(cube.values)
+        own = times_of_lines(index, number, lines, cube.lost_lines)
+        by_name = by_name or len(index.frame) != lines
+        for name in ("frame", "stamp_us", "exposure_ms"):
+            getattr(times, name)[start : start + lines] = getattr(own, name)
+        more.extend((*index.notes, *(f"{used[number].name}: {note}" for note in own.notes)))
+    by_name = by_name or len(used) < len(opened)
+    return replace(
+        source,
+        files=(*source.files, *used.values()),
+        lines=_timed(source.lines, times),
+        notes=(*source.notes, *more),
+        by_names=(tuple(opened), tuple(used)) if by_name else (),
+    )
+
+
+def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeSource:
+    """Return files by their first lines as one cube; lines that are in none of them are 0 and not valid."""
+    cubes = list(parts.values())
+    last, cube = list(parts.items())[-1]
+    lost = cube.lost_lines if cube.lost_lines <= MOST_MISSING else 0
+    if lost < cube.lost_lines:
+        notes.append(f"the {cube.lost_lines} lines that {cube.path.name} lacks are not filled up")
+    first, (_, samples, count) = cubes[0].header, cubes[0].values.shape
+    height, native = last + len(cube.values) + lost, cubes[0].values.dtype.newbyteorder("=")
+    valid, exposure = np.zeros(height, np.bool_), np.full(height, np.nan)
+    for start, part in parts.items():
+        valid[start : start + len(part.values)] = True
+        known = finite_number(part.header.settings.get(_EXPOSURE, ""))
+        exposure[start : start + len(part.values)] = np.nan if known is None else known
+    with_bands = next((one for one in cubes if one.header.wavelength_nm is not None), None)
+    bands = Bands()
+    if with_bands is not None:
+        header = with_bands.header
+        units, origin = header.fields.get("wavelength units", ""), f"wavelengths from {with_bands.header_path.name}"
+        bands = Bands(header.wavelength_nm, header.fwhm_nm, units, origin)
+
+    def read(start: int, stop: int) -> NDArray[Any]:
+        """Give some lines (line, sample, band)."""
+        block = np.zeros((stop - start, samples, count), native)
+        for begin, part in parts.items():
+            low, high = max(start, begin), min(stop, begin + len(part.values))
+            if low < high:
+                block[low - start : high - start] = part.values[low - begin : high - begin]
+        return block
+
+    return CubeSource(
+        name=name,
+        shape=(height, samples, count),
+        dtype=native,
+        read=read,
+        files=tuple(file for one in cubes for file in (one.header_path, one.path)),
+        lines=LineFacts(valid, exposure_ms=None if np.isnan(exposure).all() else exposure),
+        bands=bands,
+        nodata=first.nodata,
+        bad_bands=bad_bands(first.fields.get("bbl"), count),
+        headers={one.header_path.name: one.header_path.read_bytes().decode("utf-8", errors="replace") for one in cubes},
+        notes=tuple(notes),
+    )
+
+
+def _timed(lines: LineFacts, times: LineTimes) -> LineFacts:
+    """Add what frame indices say; their exposures count before those of the headers."""
+    of_header = np.nan if lines.exposure_ms is None else lines.exposure_ms
+    exposure = np.where(np.isnan(times.exposure_ms), of_header, times.exposure_ms)
+    lines = replace(lines, exposure_ms=None if np.isnan(exposure).all() else exposure, frame=times.frame)
+    known = times.stamp_us >= 0
+    if not known.any():
+        return lines
+    first = int(times.stamp_us[known][0])
+    time_s = np.where(known, (times.stamp_us - first) * 1e-6, np.nan)
+    return replace(lines, time_s=time_s, first_stamp_us=first)
+
+
+def find_reference(folder: Path, kind: str) -> Path | None:
+    """Return the header of the ``dark`` or ``white`` frame in a folder, by how its name begins.
+
+    Raises SceneError: there are several; name one.
+    """
+    headers = (entry for entry in sorted(folder.iterdir()) if entry.suffix.lower() == ".hdr")
+    found = [entry for entry in headers if entry.name.lower().startswith(kind)]
+    if len(found) > 1:
+        names = ", ".join(entry.name for entry in found)
+        raise SceneError(f"{folder} has several {kind} frames ({names}); name one with --{kind}")
+    return found[0] if found else None
+
+
+def load_frame_index(path: Path) -> FrameIndex:
+    """Read one index. Lines that are no frame are passed over and counted; of a frame listed twice the first counts.
+
+    Raises SceneError: the file cannot be read, or no line of it is a frame.
+    """
+    try:
+        with path.open(encoding="utf-8-sig", errors="replace") as file:
+            return parse_frame_index(iter(lambda: file.readline(LONGEST_LINE), ""), path.name, str(path))
+    except OSError as error:
+        raise SceneError(f"{path} cannot be read: {error}; take it away to go on without times") from error
+
+
+def _headers(folder: Path) -> dict[int, Path]:
+    """Return first frame -> header of each part, in order (SceneError: a part has not one header)."""
+    found: dict[int, list[Path]] = {}
+    for entry in folder.iterdir():
+        match = _PART.fullmatch(entry.name)
+        if match is not None and entry.is_file():
+            found.setdefault(int(match[1]), []).append(entry)
+    headers: dict[int, Path] = {}
+    for number, files in sorted(found.items()):
+        named = [file for file in files if file.suffix.lower() == ".hdr"]
+        if len(named) != 1:
+            listed = ", ".join(sorted(file.name for file in files))
+            raise SceneError(f"frame {number} of {folder}: expected one header raw_{number}.hdr, found {listed}")
+        headers[number] = named[0]
+    return headers
+
+
+def _placed(opened: Mapping[int, EnviCube], notes: list[str]) -> dict[int, EnviCube]:
+    """Return the parts by their first lines (SceneError: they are not alike, or too many lines are in none)."""
+    parts: dict[int, EnviCube] = {}
+    end = missing = 0
+    first: EnviCube | None = None
+    for number, cube in opened.items():
+        first = first or cube
+        _check_alike(first, cube)
+        start = number - min(opened)
+        if start < end:
+            notes.append(f"{cube.path.name} begins {end - start} frames before the part before it ends")
+        elif start > end:
+            missing += start - end
+            notes.append(f"{start - end} lines before {cube.path.name} are in no file")
+        if missing > MOST_MISSING:
+            raise SceneError(
+                f"{missing} lines before {cube.path} are in no file, more than {MOST_MISSING}; ingest the parts by "
+                "themselves"
+            )
+        parts[max(start, end)] = cube
+        end = max(start, end) + len(cube.values)
+        notes.extend(cube.notes)
+    return parts
+
+
+def _check_alike(first: EnviCube, cube: EnviCube) -> None:
+    """Refuse parts of several frame sizes, types or sets of wavelengths (SceneError)."""
+    if cube.values.shape[1:] != first.values.shape[1:] or cube.values.dtype != first.values.dtype:
+        raise SceneError(
+            f"{cube.path} has frames of {cube.values.shape[1:]} (sample, band) {cube.values.dtype}, "
+            f"{first.path.name} of {first.values.shape[1:]} {first.values.dtype}; ingest them by themselves"
+        )
+    ours, theirs = first.header.wavelength_nm, cube.header.wavelength_nm
+    if ours is not None and theirs is not None and not np.array_equal(ours, theirs):
+        raise SceneError(f"{cube.path} has other wavelengths than {first.path.name}; ingest them by themselves")

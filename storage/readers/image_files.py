@@ -1,0 +1,356 @@
+"""Images as cubes: GeoTIFF and JPEG 2000 some rows at a time, PNG, JPEG and BMP as a whole, all through rasterio.
+
+Several images of one size in a TIFF are its bands, in their order: so cameras that know no bands write cubes.
+Transparent and masked pixels have no value. Places, wavelengths and bad bands are read from the tags that GDAL's
+drivers of ENVI and GeoTIFF write, and from band names.
+"""
+
+from __future__ import annotations
+
+import importlib
+import math
+import re
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import cache, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import SceneError
+from pipeline.lazy import deferred
+from pipeline.rig.camera.camera_texts import finite_number, wavelengths_nm
+from storage.readers.cube_sources import (
+    BLOCK_LINES,
+    DEFLATE_RATIO,
+    MOST_RATIO,
+    Bands,
+    CubeSource,
+    ReadLines,
+    check_claim,
+    check_memory,
+    read_by_chunks,
+    unpacked,
+)
+
+if TYPE_CHECKING:  # half a second to import, for files with a place alone
+    import odc.geo.crs as odc_crs
+    import odc.geo.geobox as odc_geobox
+    import pyproj
+    from odc.geo.geobox import GeoBox
+else:
+    odc_crs = deferred("odc.geo.crs")
+    odc_geobox = deferred("odc.geo.geobox")
+    pyproj = deferred("pyproj")
+
+PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp")  # of files that are read as a whole
+JPEG2000_ENDINGS = (".jp2", ".j2k")
+IMAGE_ENDINGS = (*PICTURE_ENDINGS, ".tif", ".tiff", *JPEG2000_ENDINGS)
+# Other formats of GDAL's may name any file or server: a file is opened as its ending says and as nothing else.
+_DRIVERS = dict.fromkeys(JPEG2000_ENDINGS, "JP2OpenJPEG") | {".png": "PNG", ".bmp": "BMP"}
+_DRIVERS |= dict.fromkeys((".jpg", ".jpeg"), "JPEG") | dict.fromkeys((".tif", ".tiff"), "GTiff")
+_STRICT = {"GDAL_ERROR_ON_LIBJPEG_WARNING": True, "GDAL_PNG_WHOLE_IMAGE_OPTIM": False}  # cut off files are refused
+_CALLED = {"GTiff": "TIFF", "JP2OpenJPEG": "JPEG 2000"}  # in messages
+ALPHA_NOTE = "its alpha channel says where there are pixels, and is no band"
+NO_MASK_NOTE = (
+    "its channel called alpha holds what no mask does, and is taken as a band: programs call the fourth band of a file "
+    "alpha where nothing says what it is"
+)
+RGB_NM, NEAR_INFRARED_NM, GREY_NM = (640.0, 550.0, 460.0), 800.0, 550.0
+_COLOURS_NM: Mapping[tuple[str, ...], tuple[float, ...]] = {
+    ("gray",): (GREY_NM,),
+    ("palette",): (GREY_NM,),
+    ("red", "green", "blue"): RGB_NM,
+    ("red", "green", "blue", "undefined"): (*RGB_NM, NEAR_INFRARED_NM),
+    ("red", "green", "blue", "nir"): (*RGB_NM, NEAR_INFRARED_NM),
+}
+SAMPLED_PX, MOST_BETWEEN = 256, 0.1  # a mask is recognised by so many pixels a side, of which so many are half there
+
+
+def open_image(path: Path, name: str | None = None, *, scaled: bool = True, palette: bool = False) -> CubeSource:
+    """Open an image, (y, x, band), without its alpha channel.
+
+    ``name`` is what GDAL calls an image within the file or folder ``path``. Scale and offset of the file are applied,
+    unless not ``scaled``; ``palette`` keeps the numbers of a picture's colours. Raises SceneError: there is no such
+    file, it is damaged, or claims more than its bytes can mean.
+    """
+    if name is None and not path.is_file():
+        raise SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
+    image = name or str(path)
+    driver = _driver(image)
+    with _opened(path, image) as file:
+        pages, notes = _pages(path, image, file)
+        block, item = max(file.block_shapes), max(np.dtype(one).itemsize for one in file.dtypes)
+        claimed = (file.height, file.width, file.count * len(pages))
+        _check_size(path, image, driver, claimed, item, math.prod(block) * file.count)  # before any of it is read
+        kinds = [kind.name for kind in file.colorinterp]
+        if driver in _CALLED and "alpha" in kinds and not _is_mask(file, kinds.index("alpha")):
+            kinds, notes = ["undefined" if kind == "alpha" else kind for kind in kinds], [*notes, NO_MASK_NOTE]
+        alpha = kinds.index("alpha") if "alpha" in kinds else None
+        keep = [band for band in range(file.count) if band != alpha]
+        kind = np.result_type(*(np.dtype(file.dtypes[band]) for band in keep or [0]))
+        height, width, count = file.height, file.width, len(keep) * len(pages)
+        void = _void(file, alpha)
+        geobox, where = place_of_file(file)
+        known, of_bands = (
+            (Bands(), ()) if len(pages) > 1 else _bands_of(file, keep, [kinds[band] for band in keep], path)
+        )
+        notes = [*notes, *([] if alpha is None else [ALPHA_NOTE]), *where, *of_bands]
+        scale, offset = (np.tile([of[band] for band in keep], len(pages)) for of in (file.scales, file.offsets))
+        picture, colours = driver not in _CALLED, None
+        if picture and kinds == ["palette"] and not palette:
+            colours, count = np.zeros((256, 3), np.uint8), 3
+            for number, colour in file.colormap(1).items():
+                colours[number] = colour[:3]
+            known, notes = _of_colours(RGB_NM), ["colours looked up in the image's palette"]
+
+        read = _reader(path, pages, [band + 1 for band in keep], (height, width), kind, picture, colours)
+        source = CubeSource(
+            name=path.name,
+            shape=(height, width, count),
+            dtype=kind,
+            read=read,
+            files=(path,),
+            bands=known,
+            nodata=file.nodata,
+            geobox=geobox,
+            bad_bands=_bad_bands_of(file, keep) if len(pages) == 1 else (),
+            void=void,
+            notes=tuple(notes),
+        )
+    if scaled and void is not None and not void.all():
+        source = replace(source, dtype=np.dtype(np.float32), read=partial(_with_gaps, read, void))
+    if scaled and not ((scale == 1).all() and (offset == 0).all()):
+        source = rescaled(source, scale, offset, source.nodata)
+    return replace(source, read=read_by_chunks(source.read, height, block[0] if driver == "JP2OpenJPEG" else 1))
+
+
+def _reader(
+    path: Path,
+    pages: Sequence[str],
+    bands: list[int],
+    shape: tuple[int, int],
+    kind: np.dtype[Any],
+    picture: bool,
+    colours: NDArray[np.uint8] | None,
+) -> ReadLines:
+    """Return what reads rows of some bands, from 1, of all pages; a picture is read once, as a whole."""
+
+    def read_window(first: int, last: int) -> NDArray[Any]:
+        planes = []
+        for page in pages:
+            with _opened(path, page) as opened:
+                planes.append(opened.read(bands, window=((first, last), (0, shape[1]))))
+        return np.ascontiguousarray(np.moveaxis(np.concatenate(planes), 0, -1), kind)
+
+    whole = cache(lambda: read_window(0, shape[0]))
+
+    def read(first: int, last: int) -> NDArray[Any]:
+        """Give some rows, (y, x, band) (SceneError: they are damaged)."""
+        numbers = whole()[first:last] if picture else read_window(first, last)
+        return numbers if colours is None else colours[numbers[..., 0]]
+
+    return read
+
+
+def _with_gaps(read: ReadLines, void: NDArray[np.bool_], first: int, last: int) -> NDArray[np.float32]:
+    return np.where(void[first:last, :, None], np.float32(np.nan), read(first, last).astype(np.float32))
+
+
+def rescaled(
+    source: CubeSource, scale: NDArray[np.float64], offset: NDArray[np.float64], nodata: float | None
+) -> CubeSource:
+    """Return the cube with ``number * scale + offset`` as its values, (band,) each, NaN where a number is no data."""
+    pairs = sorted(set(zip(scale.tolist(), offset.tolist(), strict=True)))
+    others = "" if len(pairs) == 1 else ", or others by the band"
+    return replace(
+        source,
+        dtype=np.dtype(np.float32),
+        read=lambda first, last: unpacked(source.read(first, last), scale, offset, nodata),
+        nodata=None,
+        scaling=f"scale {scale.tolist()} offset {offset.tolist()}",
+        notes=(
+            *source.notes,
+            f"values are the file's numbers times {pairs[0][0]:g} plus {pairs[0][1]:g}{others}, as it says",
+        ),
+    )
+
+
+def _driver(image: str) -> str:
+    return _DRIVERS[Path(image).suffix.lower()]
+
+
+@contextmanager
+def _opened(path: Path, image: str) -> Iterator[Any]:
+    """Open one image of a file (SceneError: it is damaged, or no image of its ending)."""
+    rasterio = importlib.import_module("rasterio")
+    driver = _driver(image)
+    with warnings.catch_warnings(), rasterio.Env(**_STRICT):
+        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)  # a scene lies on the camera's grid
+        try:
+            with rasterio.open(image, driver=driver) as file:
+                yield file
+        except SceneError:
+            raise
+        except Exception as error:  # decoders raise anything at all on damaged bytes
+            kind, why = _CALLED.get(driver, path.suffix.lower()), error.__cause__ or error
+            raise SceneError(
+                f"{path} cannot be read as {kind}: {why}; is it damaged? Copy it again, or save it as PNG or TIFF"
+            ) from error
+
+
+def _pages(path: Path, image: str, first: Any) -> tuple[list[str], list[str]]:
+    """Return names of the images that are bands of one cube, and notes; the first alone where others differ."""
+    names = list(first.subdatasets)
+    if len(names) < 2:
+        return [image], []
+    for name in names:
+        with _opened(path, name) as other:
+            if (other.shape, other.dtypes) != (first.shape, first.dtypes):
+                return [image], [f"the first of {len(names)} images in the file, which are of several kinds"]
+    return names, [f"{len(names)} images of one size in the file are taken as its bands"]
+
+
+def _check_size(path: Path, image: str, driver: str, shape: tuple[int, int, int], item: int, block: int) -> None:
+    """Refuse more than the file's bytes can mean, or the memory can hold (SceneError)."""
+    stored = Path(image).stat().st_size if Path(image).is_file() else path.stat().st_size
+    claimed = math.prod(shape) * item
+    if driver != "JPEG":  # which may say that blocks without end are alike
+        check_claim(path, claimed, stored, MOST_RATIO if driver in _CALLED else DEFLATE_RATIO)
+    check_memory(path, claimed * 3 if driver not in _CALLED else block * item + claimed // shape[0] * BLOCK_LINES)
+
+
+def _is_mask(file: Any, channel: int) -> bool:
+    """Tell whether nearly all values of a channel are 0 or its greatest, in the middle of the image.
+
+    Programs call the fourth band of a file alpha where nothing says what it is.
+    """
+    high, wide = min(file.height, SAMPLED_PX), min(file.width, SAMPLED_PX)
+    top, left = (file.height - high) // 2, (file.width - wide) // 2
+    values = file.read(channel + 1, window=((top, top + high), (left, left + wide)))
+    return bool(np.mean((values > 0) & (values < values.max())) <= MOST_BETWEEN)
+
+
+def _void(file: Any, alpha: int | None) -> NDArray[np.bool_] | None:
+    """Return (y, x) pixels that alpha or the file's mask says are not there; None where it has neither."""
+    kinds, flags = importlib.import_module("rasterio").enums.MaskFlags, file.mask_flag_enums[0]
+    if alpha is None and (kinds.per_dataset not in flags or kinds.alpha in flags):
+        return None
+    parts = []
+    for first in range(0, file.height, BLOCK_LINES):
+        window = ((first, min(first + BLOCK_LINES, file.height)), (0, file.width))
+        seen = file.read_masks(1, window=window) if alpha is None else file.read(alpha + 1, window=window)
+        parts.append(seen == 0)
+    found = np.concatenate(parts)
+    return found if found.any() else None
+
+
+def place_of_file(file: Any) -> tuple[GeoBox | None, tuple[str, ...]]:
+    """Return where an opened rasterio file lies; None with a note where it does not say so as a grid."""
+    if file.transform.is_identity:
+        other = " and ".join([*(["ground control points"] if file.gcps[0] else []), *(["RPCs"] if file.rpcs else [])])
+        return None, (f"its place is given by {other}, which are not read; warp it first (gdalwarp)",) if other else ()
+    if file.crs is None or not file.transform.determinant:
+        lacks = "a transform and no CRS (gdal_edit -a_srs)" if file.crs is None else "a transform that is no grid"
+        return None, (f"it has {lacks}, so that its place on the earth is not known",)
+    try:
+        crs = pyproj.CRS.from_wkt(file.crs.to_wkt())
+    except Exception as error:  # of PROJ and of GDAL
+        return None, (f"its CRS cannot be read ({error}); its place on the earth is not known",)
+    if not (crs.is_projected or crs.is_geographic):
+        return None, (f"its CRS, {crs.name!r}, is none of the earth; its place is not known",)
+    code = crs.to_epsg()  # the same CRS by whichever words a file has it
+    return odc_geobox.GeoBox(file.shape, file.transform, odc_crs.CRS(crs.to_wkt() if code is None else code)), ()
+
+
+def place_of_envi(
+    header: Mapping[str, str], data: Path, shape: tuple[int, int]
+) -> tuple[GeoBox | None, tuple[str, ...]]:
+    """Return where an ENVI file of (line, sample) ``shape`` lies, by its ``map info``, as GDAL reads it."""
+    if "map info" not in header:
+        return None, ()
+    rasterio = importlib.import_module("rasterio")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+            with rasterio.open(data, driver="ENVI") as file:
+                found, notes = place_of_file(file)
+    except Exception as error:  # GDAL raises anything at all on damaged headers
+        return None, (f"its map info cannot be read: {error}",)
+    return (None if found is None else odc_geobox.GeoBox(shape, found.affine, found.crs)), notes
+
+
+# --- bands ------------------------------------------------------------------------------------------------------------
+
+_CENTRES = ("wavelength", "wavelength_nm", "center_wavelength", "centre_wavelength", "central_wavelength")
+_UNITS = ("wavelength_units", "wavelengthunits", "wavelength_unit", "units")
+_LENGTHS = r"nm|nanomet(?:er|re)s?|µm|um|micromet(?:er|re)s?"
+_DESCRIBED = re.compile(rf"(?<![\w.])(\d+(?:\.\d+)?)\s*({_LENGTHS})\b", re.IGNORECASE)  # Band 12 (660.5 Nanometers)
+
+
+def _of_colours(colours_nm: Sequence[float]) -> Bands:
+    listed = ", ".join(f"{nm:g}" for nm in colours_nm)
+    return Bands(np.array(colours_nm), None, "nm", f"wavelengths assumed from the file's colours: {listed} nm")
+
+
+def _bands_of(file: Any, keep: Sequence[int], kinds: Sequence[str], path: Path) -> tuple[Bands, tuple[str, ...]]:
+    """Return wavelengths and widths by the tags of an opened file, else its band names, else its colours; and notes."""
+    notes: list[str] = []
+    of_file, of_bands = _lower(file.tags()) | _lower(file.tags(ns="ENVI")), [_band_tags(file, band) for band in keep]
+    fields = {}
+    for key, names in (("wavelength", _CENTRES), ("fwhm", ("fwhm", "fwhm_nm"))):
+        values = [_first(tags, names) for tags in of_bands]
+        if all(values):
+            fields[key] = ", ".join(str(value) for value in values)
+        elif (listed := _first(of_file, names)) is not None:
+            words = [word for word in re.split(r"[,\s{}]+", listed) if word]
+            fields[key] = ", ".join([words[band] for band in keep] if len(words) == file.count else words)
+    unit = _first(of_bands[0], _UNITS) or _first(of_file, _UNITS) if keep else None
+    fields["wavelength units"] = unit or ("nm" if any("wavelength_nm" in tags for tags in of_bands) else "")
+    centres, scale = wavelengths_nm(fields, len(keep), notes)
+    if centres is not None:
+        widths = [finite_number(word) for word in re.split(r"[,\s]+", fields.get("fwhm", "")) if word]
+        known = len(widths) == len(keep) and all(width is not None and width > 0 for width in widths)
+        fwhm = np.array(widths, np.float64) * scale if known else None
+        return Bands(centres, fwhm, "nm", f"wavelengths from the tags of {path}"), tuple(notes)
+    named = [_DESCRIBED.search(file.descriptions[band] or "") for band in keep]
+    if named and None not in named:
+        nm = [float(one[1]) * (1.0 if one[2].lower().startswith("n") else 1000.0) for one in named if one is not None]
+        return Bands(np.array(nm), None, "nm", f"wavelengths from the band names of {path}"), tuple(notes)
+    colours_nm = _COLOURS_NM.get(tuple(kinds))
+    return Bands() if colours_nm is None else _of_colours(colours_nm), tuple(notes)
+
+
+def bad_bands(listed: str | None, count: int) -> tuple[int, ...]:
+    """Return bands, from 0, that a list of bad bands marks by 0 (``{1, 1, 0}``); none where it is not of ``count``."""
+    flags = [finite_number(word) for word in re.split(r"[,\s{}]+", listed or "") if word]
+    return tuple(band for band, flag in enumerate(flags) if flag == 0) if len(flags) == count else ()
+
+
+def _bad_bands_of(file: Any, keep: Sequence[int]) -> tuple[int, ...]:
+    """Return bands of an opened file that it calls bad, by their places in ``keep``."""
+    listed = _first(_lower(file.tags(ns="ENVI")) | _lower(file.tags()), ("bbl", "bad_bands", "bad_band_list"))
+    bad = set(bad_bands(listed, file.count))
+    bad |= {band for band in keep if _first(_band_tags(file, band), ("bbl", "bad_band")) in ("0", "0.0")}
+    return tuple(place for place, band in enumerate(keep) if band in bad)
+
+
+def _band_tags(file: Any, band: int) -> dict[str, str]:
+    """Return the tags of one band, counted from 0; GDAL's own in micrometres count first."""
+    tags, imagery = _lower(file.tags(band + 1)), file.tags(band + 1, ns="IMAGERY")
+    if "CENTRAL_WAVELENGTH_UM" in imagery:
+        tags |= {"wavelength": imagery["CENTRAL_WAVELENGTH_UM"], "wavelength_units": "um"}
+        tags |= {"fwhm": imagery["FWHM_UM"]} if "FWHM_UM" in imagery else {}
+    return tags
+
+
+def _lower(tags: Mapping[str, str]) -> dict[str, str]:
+    return {"_".join(name.lower().split()): value for name, value in tags.items()}
+
+
+def _first(tags: Mapping[str, str], names: Sequence[str]) -> str | None:
+    return next((tags[name] for name in names if tags.get(name)), None)

@@ -1,0 +1,215 @@
+"""Anything that holds a cube, opened to be read some lines at a time, by whichever reader knows it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import SceneError
+from storage.readers.array_files import ARRAY_ENDINGS, check_picture, load_array
+from storage.readers.cube_sources import Bands, CubeSource, check_cube_source
+from storage.readers.envi_files import (
+    DATA_ENDINGS,
+    find_envi_pair,
+    find_reference,
+    open_envi_cube,
+    open_envi_source,
+    open_headwall_cube,
+)
+from storage.readers.hdf_files import HDF_ENDINGS, open_hdf_cube
+from storage.readers.image_files import IMAGE_ENDINGS, JPEG2000_ENDINGS, open_image
+from storage.readers.safe_products import is_safe_product, open_safe_cube
+from storage.readers.scene_toml import SceneSettings, find_scene_settings, settle_wavelengths
+from storage.readers.zarr_files import find_zarr_store, open_zarr_cube
+
+Reader = Literal["zarr", "headwall", "envi", "hdf", "safe", "image", "array", "none"]
+CUBE_ENDINGS = (*IMAGE_ENDINGS, *ARRAY_ENDINGS, ".hdr", *HDF_ENDINGS)
+_WITH_VARIABLE = re.compile(
+    r"^(?P<path>.+\.(?:mat|npz|zarr|npy|safe|zip)):(?P<variable>[^/\\:]+(?::\d+)?)$"
+    r"|^(?P<path2>.+\.(?:nc4?|h5|hdf5|he5)):(?P<variable2>[^:]+(?::\d+)?)$",
+    re.IGNORECASE | re.DOTALL,
+)
+_BEGINNINGS = {  # of files, and the endings that go with them
+    b"\x89PNG": (".png",),
+    b"\xff\xd8\xff": (".jpg", ".jpeg"),
+    b"II*\0": (".tif", ".tiff"),
+    b"MM\0*": (".tif", ".tiff"),
+    b"\0\0\0\x0cjP": JPEG2000_ENDINGS,
+    b"\xff\x4f\xff\x51": JPEG2000_ENDINGS,
+    b"\x93NUMPY": (".npy",),
+    b"PK\x03\x04": (".npz",),
+    b"\x89HDF": (".mat", *HDF_ENDINGS),
+    b"MATLAB": (".mat",),
+}
+
+
+def split_variable(address: str | Path) -> tuple[Path, str | None]:
+    """``scene.mat:cube`` -> path and variable, with the step of time in ``cube:3``; None where none is named.
+
+    The variable of a NetCDF or HDF5 file may begin with its groups: ``scene.h5:SERC/Reflectance/Reflectance_Data``.
+    """
+    found = _WITH_VARIABLE.match(str(address))
+    if found is None:
+        return Path(address), None
+    return Path(found["path"] or found["path2"]), found["variable"] or found["variable2"]
+
+
+def reader_of(address: str | Path) -> Reader:
+    """Tell which reader takes an address; none where there is no such file, or one of a kind that is not read.
+
+    A folder is a Sentinel-2 product, a Zarr store or a Headwall camera's, an ENVI cube is named by its header or its
+    data file.
+    """
+    path, _ = split_variable(address)
+    ending = path.suffix.lower()
+    if is_safe_product(path):
+        return "safe"
+    if path.is_dir():
+        return "headwall" if find_zarr_store(path) is None else "zarr"
+    if ending == ".hdr":
+        return "envi"
+    if not path.is_file():
+        return "none"
+    if ending in CUBE_ENDINGS:
+        return "hdf" if ending in HDF_ENDINGS else "image" if ending in IMAGE_ENDINGS else "array"
+    beside = {path.with_name(path.name + ".hdr").name.lower(), path.with_suffix(".hdr").name.lower()}
+    of_envi = ending in DATA_ENDINGS or any(one.name.lower() in beside for one in path.parent.iterdir())
+    return "envi" if of_envi else "none"
+
+
+def open_cube(
+    address: str | Path, *, dark: str | Path | None = None, white: str | Path | None = None, labels: bool = False
+) -> CubeSource:
+    """Open whatever holds a cube; nothing of its numbers is read yet but pictures, .mat and .npz, which are whole.
+
+    ``address`` may name an array and a step of time: ``STORE:ARRAY:3``. ``dark`` and ``white`` are ENVI or .npy files
+    of reference frames, averaged over their lines; they win over those in a Headwall folder. Of ``labels`` numbers are
+    those that stand in the file: no scale is applied, and of several arrays that with two axes is meant. Raises
+    SceneError: there is no such thing, it is damaged, or not of a kind or shape that can be used.
+    """
+    path, variable = split_variable(address)
+    frames: list[tuple[str, str | Path | None]] = [("dark", dark), ("white", white)]
+    match reader_of(address):
+        case "zarr":
+            source = open_zarr_cube(path, variable)
+        case "headwall":
+            source = open_headwall_cube(path)
+            frames = [(kind, frame or find_reference(path, kind)) for kind, frame in frames]
+        case "envi":
+            source = open_envi_source(path)
+        case "hdf":
+            source = open_hdf_cube(path, variable)
+        case "safe":
+            source = open_safe_cube(path, variable)
+        case "image":
+            _check_content(path)
+            source = open_image(path, scaled=not labels)
+        case "array":
+            source = _array_source(address, path, variable, dims=2 if labels else 3)
+        case "none":
+            raise _refusal(path)
+    for kind, named in frames:
+        if named is not None:
+            values, more = load_frame(named)
+            notes = (*source.notes, f"{kind} frame from {Path(named).name}")
+            source = replace(source, **{kind: values}, files=(*source.files, *more), notes=notes)  # type: ignore[arg-type]
+    check_cube_source(source)
+    return source
+
+
+def load_labels_array(address: str | Path, *, by_number: bool = False) -> NDArray[Any]:
+    """Read a file of labels or a mask as it stands, (y, x, band).
+
+    ``by_number`` keeps the numbers of a picture with a palette. Raises SceneError: as `open_cube`.
+    """
+    path, _ = split_variable(address)
+    if reader_of(address) == "image":
+        _check_content(path)
+        source = open_image(path, scaled=False, palette=by_number)
+    else:
+        source = open_cube(address, labels=True)
+    return source.read(0, source.shape[0])
+
+
+def load_frame(address: str | Path) -> tuple[NDArray[np.float32], tuple[Path, ...]]:
+    """Read one reference frame, (sample, band), the mean of its lines, and the files that it stands in.
+
+    Raises SceneError: the file cannot be read or holds no real numbers.
+    """
+    path, variable = split_variable(address)
+    kind = reader_of(address)
+    if kind in ("zarr", "headwall", "safe"):
+        raise SceneError(f"{path} is a folder, expected a reference frame (ENVI or .npy); name the file")
+    files: tuple[Path, ...] = (path,)
+    if kind == "array":
+        values = load_array(path, variable, dims=3).values
+    elif kind == "envi":
+        files, values = find_envi_pair(path), open_envi_cube(path).values
+    else:
+        source = open_cube(address)
+        values = source.read(0, source.shape[0])
+    if values.dtype.kind not in "uif":
+        raise SceneError(f"{path} holds {values.dtype}, expected the real numbers of a reference frame")
+    frame = values[None] if values.ndim == 2 else values
+    return np.asarray(frame.mean(axis=0, dtype=np.float64), np.float32), files
+
+
+def with_wavelengths(source: CubeSource, address: str | Path, stated: Sequence[float] | None) -> CubeSource:
+    """Return the cube with wavelengths as a flag says them [nm], one a band, else the ``scene.toml`` beside it.
+
+    Raises WavelengthError: they do not fit.
+    """
+    path, count = split_variable(address)[0], source.shape[2]
+    settings = SceneSettings() if stated is not None else find_scene_settings(path)
+    if settings.bands is not None and settings.wavelengths_nm is not None and len(settings.wavelengths_nm) != count:
+        settings = SceneSettings()  # stated for some of the bands only
+    if stated is None and settings.wavelengths_nm is None and settings.wavelengths_file is None:
+        return source
+    found = settle_wavelengths(path, range(count), count, stated=stated, settings=settings, known=Bands())
+    folder = "" if settings.path is None else f"{settings.path.parent}/"
+    return replace(source, bands=replace(found, origin=found.origin.replace(folder, "")))
+
+
+def _array_source(address: str | Path, path: Path, variable: str | None, dims: int) -> CubeSource:
+    _check_content(path)
+    found = load_array(path, variable, dims)
+    if dims == 3:
+        check_picture(found.values.shape, address)
+    cube = found.values[..., None] if found.values.ndim == 2 else found.values
+    if cube.ndim != 3:
+        raise SceneError(f"{path} holds shape {cube.shape}; expected (y, x, band), or (y, x) for one band")
+    native = cube.dtype.newbyteorder("=")
+    return CubeSource(
+        name=path.name,
+        shape=(cube.shape[0], cube.shape[1], cube.shape[2]),
+        dtype=native,
+        read=lambda start, stop: np.asarray(cube[start:stop], native),
+        files=(path,),
+        bands=found.bands,
+        notes=found.notes,
+    )
+
+
+def _check_content(path: Path) -> None:
+    """Refuse a file that begins as one of another ending does (SceneError)."""
+    with path.open("rb") as file:
+        head = file.read(8)
+    for begins, endings in _BEGINNINGS.items():
+        if head.startswith(begins) and path.suffix.lower() not in endings:
+            ending = path.suffix.lower()
+            raise SceneError(
+                f"{path} cannot be read as {ending}: it begins as a {endings[0]} file does; give it that ending"
+            )
+
+
+def _refusal(path: Path) -> SceneError:
+    if not path.exists():
+        return SceneError(f"there is no file {path}; check the name (seen from {Path.cwd()})")
+    ending = path.suffix.lower()
+    return SceneError(f"{path} ends in {ending or 'nothing'}, which is not read; use {', '.join(CUBE_ENDINGS)}")

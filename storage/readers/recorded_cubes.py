@@ -1,0 +1,201 @@
+"""Cubes of files that recordings consist of, found in a folder and opened, and their dark and white frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.capture.recorded import sum_references
+from pipeline.errors import SceneError, WavelengthError
+from pipeline.geometry.camera import LineCamera
+from pipeline.rectify.detector import find_bad_elements
+from pipeline.rig.camera.camera_texts import listed_numbers
+from pipeline.source import References
+from storage.readers.cube_sources import CubeSource
+from storage.readers.envi_files import DATA_ENDINGS, INTERLEAVES, find_envi_pair, find_reference, load_envi_header
+from storage.readers.open_cubes import load_frame, open_cube, reader_of, with_wavelengths
+from storage.readers.zarr_files import find_zarr_store
+
+FRAMES = ("dark", "white", "bad", "flat")  # what a cube's name is followed by in those of its frames
+SAMPLED_LINES = 16  # looked at for byte order and bits
+MOST_LINES_OVER = 0.5  # share of numbers above full scale that says the byte order is wrong, if swapped ones fit
+SWAPPED_OVER = 0.01
+
+
+@dataclass(frozen=True)
+class RecordedFile:
+    """One cube of files and what belongs to it."""
+
+    name: str
+    path: Path
+    source: CubeSource
+
+    @property
+    def folder(self) -> Path:
+        """Where its companions lie."""
+        return self.path if self.path.is_dir() and find_zarr_store(self.path) is None else self.path.parent
+
+
+def find_cubes(path: Path) -> list[Path]:
+    """Find the cubes that an address of files stands for: itself, or the ENVI cubes or Zarr stores of a folder.
+
+    Raises SceneError: the folder holds none.
+    """
+    if not path.is_dir() or find_zarr_store(path) is not None:
+        return [path]
+    headers = sorted(entry for entry in path.iterdir() if entry.suffix.lower() == ".hdr" and entry.is_file())
+    if any(entry.name.lower().startswith("raw_") for entry in headers):
+        return [path]  # parts of a Headwall camera's cube
+    stems = [(entry, _stem(entry).lower()) for entry in headers]
+    cubes = [
+        entry
+        for entry, stem in stems
+        if not stem.startswith(("dark", "white")) and stem.rpartition(".")[2] not in FRAMES
+    ]
+    stores = sorted(entry for entry in path.iterdir() if entry.is_dir() and find_zarr_store(entry) == entry)
+    if not cubes and not stores:
+        raise SceneError(f"{path} holds no cube; expected ENVI headers (.hdr), raw_<frame> files or Zarr stores in it")
+    return cubes or stores
+
+
+def _stem(path: Path) -> str:
+    """Name of a cube without the endings of its files."""
+    stem = path.name.removesuffix(path.suffix) if path.suffix.lower() == ".hdr" else path.name
+    ending = Path(stem).suffix
+    return stem.removesuffix(ending) if ending.lower() in (*filter(None, DATA_ENDINGS), ".zarr") else stem
+
+
+def open_recorded_cube(path: Path, wavelengths: Sequence[float] | None) -> RecordedFile:
+    """Open one cube of whole numbers with wavelengths."""
+    source = open_cube(path)
+    if reader_of(path) == "envi":
+        header, data = find_envi_pair(path)
+        said, ending = load_envi_header(header).interleave, data.suffix.lower().removeprefix(".")
+        if ending in INTERLEAVES and ending != said and source.shape[2] > 1:
+            raise SceneError(
+                f"{header} says interleave = {said}, and the name of {data.name} says {ending}; correct the header, or "
+                "rename the file"
+            )
+    if source.dtype not in (np.uint8, np.uint16, np.int16):
+        raise SceneError(
+            f"{path} holds {source.dtype}, expected a camera's own numbers (whole, 8 or 16 bits); a cube of "
+            "reflectance or radiance is no recording: give it as --scene"
+        )
+    if wavelengths is not None:
+        source = with_wavelengths(source, path, wavelengths)
+    if source.bands.wavelength_nm is None:
+        raise WavelengthError(
+            f"{path} has {source.shape[2]} bands and nothing says their wavelengths; give --wavelengths in nm, or "
+            "write a list 'wavelength' into its header"
+        )
+    return RecordedFile(_stem(path), path, source)
+
+
+def with_bits(camera: LineCamera, cubes: Sequence[RecordedFile], notes: list[str]) -> LineCamera:
+    """The camera with as many bits as the numbers have, by some lines of each cube.
+
+    Raises SceneError: most numbers are above full scale, and would not be with their bytes swapped; or some are below
+    0.
+    """
+    bits = camera.bits
+    for cube in cubes:
+        valid = np.flatnonzero(cube.source.valid)
+        chosen = valid[:: max(len(valid) // SAMPLED_LINES, 1)][:SAMPLED_LINES]
+        values = np.concatenate([cube.source.read(int(line), int(line) + 1) for line in chosen])
+        full = camera.full_scale_dn * max(camera.samples // cube.source.shape[1], 1)
+        plain = np.ascontiguousarray(values).astype(np.uint16)
+        other = plain if values.dtype.itemsize == 1 else plain.byteswap()
+        over, swapped = (float((numbers > full).mean()) for numbers in (plain, other))
+        if over > MOST_LINES_OVER and swapped < SWAPPED_OVER:
+            raise SceneError(
+                f"{cube.source.files[0]} has the wrong byte order: {over:.0%} of its numbers are above the camera's "
+                f"full scale of {full}, and {swapped:.0%} are with their bytes swapped. Write the other byte order (0 "
+                "or 1) into the header"
+            )
+        if values.min() < 0:
+            raise SceneError(
+                f"{cube.path} holds the number {values.min()}, expected a camera's own numbers from 0; write data type "
+                "12 (unsigned) into the header if they are unsigned"
+            )
+        if values.max() > full:
+            needed = (int(values.max()) * camera.full_scale_dn // full).bit_length()
+            if needed > bits:
+                bits = needed
+                notes.append(f"{cube.name}: numbers reach {values.max()}, so {bits} bits are taken for camera.bits")
+    return replace(camera, bits=bits)
+
+
+def find_references(
+    source: CubeSource,
+    stem: Path,
+    camera: LineCamera,
+    notes: list[str],
+    *,
+    stated: dict[str, Path | None],
+    panel: NDArray[np.float32],
+    at_rest: bool,
+) -> References:
+    """Return the reference frames of a cube whose companions are called ``stem.dark.hdr`` and the like.
+
+    ``stated`` files come first, then those of the cube's name, then the folder's only dark and white frame. ``panel``
+    is the value of the white reference, one or (band,), where nothing else says it; ``at_rest`` says that the white
+    frame was taken with the mirror at rest. Raises SceneError: a frame has other samples or bands than the cube.
+    """
+    name, frame = stem.name, source.shape[1:]
+    white_dn = camera.full_scale_dn * max(camera.samples // frame[0], 1)
+    files: dict[str, Path | None] = {}
+    for kind in FRAMES:
+        beside = [stem.with_name(f"{name}.{kind}{ending}") for ending in (".hdr", ".npy")]
+        file = stated.get(kind) or next((one for one in beside if one.is_file()), None)
+        files[kind] = find_reference(stem.parent, kind) if file is None and kind in ("dark", "white") else file
+    found = {kind: _load_fitting(file, frame, kind, notes) for kind, file in files.items() if file is not None}
+    dark, white = found.get("dark", source.dark), found.get("white", source.white)
+    measured = dark is not None and white is not None
+    if dark is None:
+        dark = np.zeros(frame, np.float32)
+        notes.append(f"{name} has no dark frame: a dark level of 0 is assumed; give --dark")
+    if white is None:
+        white = np.full(frame, white_dn, np.float32)
+        notes.append(
+            f"{name} has no white frame: full scale ({white_dn} DN) is assumed to be white, and values are relative; "
+            "give --white"
+        )
+    bad = found.get("bad", source.bad)
+    if bad is None and measured and files["bad"] is None:
+        bad = find_bad_elements(dark, white)
+    bands = frame[1]
+    panel = panel if source.panel is None else np.asarray(source.panel, np.float32)
+    if panel.shape not in ((), (bands,)):
+        raise SceneError(
+            f"the white reference has {panel.shape} values, the cube {bands} bands; give one or one a band"
+        )
+    by_mirror, file = at_rest or source.position is not None, files["white"]
+    if file is not None and reader_of(file) == "envi":
+        fields = load_envi_header(find_envi_pair(file)[0]).fields
+        listed = listed_numbers(fields, "panel", bands, [])
+        panel = panel if listed is None else listed.astype(np.float32)
+        by_mirror = by_mirror or fields.get("mirror at rest", "0").strip() == "1"
+    bad = None if bad is None or not np.any(bad) else np.asarray(bad, np.bool_)
+    panel = np.broadcast_to(panel, bands).copy()
+    return References(dark, white, panel, bad, found.get("flat", source.flat), by_mirror)
+
+
+def _load_fitting(file: Path, frame: tuple[int, ...], kind: str, notes: list[str]) -> NDArray[np.float32]:
+    """A frame (sample, band), summed to a cube's binning where it has more samples (SceneError: it does not fit)."""
+    values, _ = load_frame(file)
+    notes.append(f"{kind} frame from {file.name}")
+    parts = values.shape[0] // frame[0]
+    if parts < 1 or values.shape != (parts * frame[0], frame[1]):
+        raise SceneError(
+            f"the {kind} frame {file} is {values.shape} (sample, band), the cube {frame}; give one taken with the "
+            "cube's own samples and bands"
+        )
+    if parts == 1:
+        return values
+    whole = References(values, values, np.ones(frame[1], np.float32), values > 0, values)
+    summed = sum_references(whole, parts)
+    return {"bad": np.asarray(summed.bad, np.float32), "flat": np.asarray(summed.flat)}.get(kind, summed.dark)
