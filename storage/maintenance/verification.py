@@ -16,8 +16,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import zarr
-from numcodecs.errors import UnknownCodecError  # type: ignore[import-untyped]
-from numcodecs.registry import codec_registry  # type: ignore[import-untyped]
 
 from storage.archive.keys import without_manifest
 from storage.archive.lineage import Catalogue
@@ -25,15 +23,12 @@ from storage.archive.manifests import (
     broken_files,
     cleared_from,
     extended_from,
-    is_sealed,
     listed_bytes,
     manifest_sha256,
-    packed_from,
     try_manifest,
 )
 from storage.archive.run_folders import unfinished_extensions
 from storage.archive.staging import MANIFEST_NAME, kind_of, read_plain
-from storage.arrays.layout import missing_codec
 from storage.maintenance.growing_checks import SPOOLS, growing_problems
 
 WORDS = {"y": "rows", "x": "columns", "line": "lines", "sample": "samples", "band": "bands", "patch": "patches"}
@@ -147,20 +142,17 @@ def _inner_chunk(about: dict[str, Any], sizes: list[int]) -> tuple[int, ...]:
 
 
 def _can_be_read(array: zarr.Array[Any], box: tuple[slice, ...]) -> bool:
-    """Whether one chunk decodes. Whatever a decoder says of damaged bytes, the answer is no (no codec: it raises)."""
+    """Whether one chunk decodes. Whatever a decoder says of damaged bytes, the answer is no."""
     if math.prod(part.stop - part.start for part in box) <= 0:
         return True
     try:
         array[box]
-    except UnknownCodecError:
-        raise
     except Exception:
         return False
     return True
 
 
-ASIDE = ".aside"
-Kind = Literal["whole", "broken", "missing", "stray", "growing", "unreadable"]
+Kind = Literal["whole", "broken", "missing", "stray", "growing"]
 Progress = Callable[[str, float], None]  # address of what is being read, how far of all bytes, 0..1
 
 
@@ -170,7 +162,6 @@ class Finding:
 
     ``missing``: something names or rests on a store that is not there. ``stray``: what is no part of the archive.
     ``growing``: something of a spool that cannot be believed; the rest of it is used.
-    ``unreadable``: whole, but in a codec that is not installed.
     """
 
     uri: str
@@ -202,14 +193,8 @@ def verify_everything(
             catalogue = Catalogue.read(root)
             problems = list(read_again(path)) + list(_identity_problems(catalogue, uri))
         found += [Finding(uri, problem, "broken") for problem in problems]
-        if problems:
-            continue
-        store = catalogue.stores.get(uri)  # every byte is as published; whether its numbers can be read?
-        if store is None or not packed_from(store.facts) or "pcodec" in codec_registry:
+        if not problems:
             found.append(Finding(uri, None))
-        else:
-            words = missing_codec("every byte of it is as published, but it", "pcodec")
-            found.append(Finding(uri, words, "unreadable"))
     return [*found, *_misplaced(catalogue, root), *_missing(catalogue), *_broken_off(root), *verify_growing(root)]
 
 
@@ -227,7 +212,7 @@ def verify_growing(root: Path) -> Iterator[Finding]:
 
 def _changed_since(catalogue: Catalogue, uri: str) -> bool:
     """Whether something was added to a run after the catalogue was read."""
-    run = next((run for run in catalogue.runs if run.uri == uri), None)
+    run = None if uri in catalogue.stores else next((run for run in catalogue.runs if run.uri == uri), None)
     return run is not None and extended_from(try_manifest(run.folder)[0]) != extended_from(run.facts)
 
 
@@ -249,14 +234,11 @@ def _identity_problems(catalogue: Catalogue, uri: str) -> Iterator[str]:
     stated = f"stages/{store.facts.get('stage')}/{store.facts.get('key')}"
     if stated != uri:
         yield f"its {MANIFEST_NAME} is that of {stated}; move it back, or take it out of the archive"
-    knowing = [run for run in catalogue.runs if uri in run.recorded]
-    if not knowing:
-        return
-    before = *packed_from(store.facts), *cleared_from(store.facts)
-    own = {manifest_sha256(store.ref.path), *before}
-    anew = is_sealed(store.facts) and all(store.created > run.sealed for run in knowing)
-    if not anew and not any(run.recorded[uri] in own for run in knowing):
-        yield f"its {MANIFEST_NAME} has changed since {knowing[-1].uri} was published (its SHA-256 differs)"
+    knowing = catalogue.recorded_by.get(uri, [])
+    own = {manifest_sha256(store.ref.path), *cleared_from(store.facts)} if knowing else set()
+    anew = all(store.created > run.sealed for run, _ in knowing)
+    if not anew and not any(sha256 in own for _, sha256 in knowing):
+        yield f"its {MANIFEST_NAME} has changed since {knowing[-1][0].uri} was published (its SHA-256 differs)"
 
 
 def _misplaced(catalogue: Catalogue, root: Path) -> Iterator[Finding]:
@@ -290,8 +272,6 @@ def _missing(catalogue: Catalogue) -> Iterator[Finding]:
 
 
 def _broken_off(root: Path) -> Iterator[Finding]:
-    for path in sorted((root / ASIDE).glob("*/*")):
-        yield Finding(path.relative_to(root).as_posix(), "a repair was broken off; run verify --repair again", "stray")
     for part in unfinished_extensions(root):
         words = "what was added to it lacks its last step, a name; any command that writes into the archive gives it"
         yield Finding(f"runs/{part.stem}", words, "stray")

@@ -70,7 +70,7 @@ def test_raw_lines_of_a_rig_go_only_when_asked(archive: Archive) -> None:
 def test_spools_of_published_captures_and_dead_parts_go(tmp_path: Path, archive: Archive) -> None:
     """The spool of a capture that is not published is what its lines will be continued from."""
     small = small_survey(archive)
-    for key in (small.raw.key, f"{small.raw.key}-mosaic", "underway"):  # tiles beside a spool are of earlier versions
+    for key in (small.raw.key, "underway"):
         (archive.spool_folder(key) / "lines.bil").write_bytes(b"x" * 100)
     (tmp_path / "stages" / "rectify" / "dead.part").mkdir()
     (tmp_path / "stages" / "rectify" / "dead.part" / "half").write_bytes(b"y" * 10)
@@ -81,7 +81,6 @@ def test_spools_of_published_captures_and_dead_parts_go(tmp_path: Path, archive:
         assert staged.path.is_dir()
     assert {(one.uri, one.what, one.size) for one in found.removals} == {
         (f"spool/{small.raw.key}", "spool", 100),
-        (f"spool/{small.raw.key}-mosaic", "spool", 100),
         ("stages/rectify/dead.part", "unfinished", 10),
     }
     assert [path.name for path in (tmp_path / "spool").iterdir()] == ["underway"]

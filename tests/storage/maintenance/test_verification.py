@@ -22,7 +22,7 @@ from storage.archive.run_folders import date_of_store
 from storage.arrays.layout import create_group, open_group, read_array, write_image, write_small
 from storage.maintenance.verification import find_shard, name_damage
 from storage.remote.opening import verify_archive
-from tests.storage.small_archive import flip, small_survey
+from tests.storage.small_archive import flip, rewrite, small_survey
 
 FLIPS = 30
 
@@ -137,11 +137,7 @@ def test_a_lost_manifest_and_a_lost_store_are_told(tmp_path: Path, archive: Arch
 def test_another_store_in_its_place_is_told(archive: Archive) -> None:
     """A store moved to another key, and one whose manifest is not that which a run recorded."""
     small = small_survey(archive)
-    path = small.mosaic.path / "manifest.json"
-    content = json.loads(path.read_text())
-    for name in ("seal", "format"):  # as an earlier version would have written it
-        del content[name]
-    path.write_text(json.dumps(content | {"created": "2031-01-01T00:00:00+00:00"}))
+    rewrite(small.mosaic.path / "manifest.json", created="2021-01-01T00:00:00+00:00")
     assert any("has changed since runs/" in one for one in _found(archive)[small.mosaic.uri])
     small.map.path.rename(small.map.path.with_name("another"))
     assert any(f"is that of {small.map.uri}" in one for one in _found(archive)["stages/segment/another"])
