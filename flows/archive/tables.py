@@ -150,7 +150,7 @@ def show_repair(content: dict[str, Any], console: Console) -> None:
     for title, part in (("failed", done["failed"]), ("left as it is", done["hopeless"])):
         for uri, why in part.items():
             console.print(f"[bold yellow]{title}[/] {escape(uri)}: {escape(why)}", soft_wrap=True)
-    left = "nothing broken is left" if done["complete"] else "some is left as it was"
+    left = "nothing broken is left" if done["complete"] else "some could not be made anew"
     _say(console, f"{len(done['remade'])} remade, {len(done['dropped'])} that no run named removed; {left}")
 
 

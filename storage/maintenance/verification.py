@@ -17,6 +17,8 @@ from typing import Any, Literal
 
 import zarr
 
+from pipeline.json_lines import read_checked
+from pipeline.rig.capture import JOURNAL
 from storage.archive.keys import without_manifest
 from storage.archive.lineage import Catalogue
 from storage.archive.manifests import (
@@ -28,11 +30,13 @@ from storage.archive.manifests import (
     try_manifest,
 )
 from storage.archive.run_folders import unfinished_extensions
-from storage.archive.staging import MANIFEST_NAME, kind_of, read_plain
-from storage.maintenance.growing_checks import SPOOLS, growing_problems
+from storage.archive.staging import MANIFEST_NAME, NotPlainError, kind_of, read_plain
+from storage.arrays.fetched_files import SUMS, first_unlike
+from storage.arrays.spool import ENDING, spool_problems
 
 WORDS = {"y": "rows", "x": "columns", "line": "lines", "sample": "samples", "band": "bands", "patch": "patches"}
 MOST_NAMED = 3
+SPOOLS = "spool"
 _NO_ARRAY = (OSError, ValueError, KeyError, TypeError, IndexError, RecursionError)
 
 
@@ -200,7 +204,9 @@ def verify_everything(
 
 def verify_growing(root: Path) -> Iterator[Finding]:
     """Findings about spools and what lies beside them; none where all is as it was written."""
-    yield from (Finding(uri, problem, "growing") for uri, problem in growing_problems(root))
+    for folder in _inside(root / SPOOLS):
+        for problem in _spool_problems(folder):
+            yield Finding(f"{SPOOLS}/{folder.name}", problem, "growing")
     if kind_of(root / SPOOLS) not in (None, "a folder"):
         yield Finding(SPOOLS, f"is {kind_of(root / SPOOLS)}, expected a folder; take it out of the archive", "stray")
     for place, folders, files in os.walk(root / SPOOLS):
@@ -208,6 +214,29 @@ def verify_growing(root: Path) -> Iterator[Finding]:
             if (kind := kind_of(path)) not in (None, "a file", "a folder"):
                 uri = path.relative_to(root).as_posix()
                 yield Finding(uri, f"is {kind}, expected a file; take it out of the archive", "stray")
+
+
+def _spool_problems(folder: Path) -> Iterator[str]:
+    """What is not as it was written in the folder of a capture under way: lines, and the rig's files beside them."""
+    for path in (one for one in (*_inside(folder), *(file for inner in _inside(folder) for file in _inside(inner)))):
+        name = path.relative_to(folder).as_posix()
+        try:
+            if path.suffix == ENDING:
+                yield from spool_problems(path)
+            elif path.name == JOURNAL:
+                changed = [line.number for line in read_checked(read_plain(path)) if line.state == "changed"]
+                yield from (f"{name}: line {number} has changed since it was written" for number in changed)
+            elif name.endswith(SUMS) and (at := first_unlike(path.with_name(path.name.removesuffix(SUMS)))) is not None:
+                where = f"{name.removesuffix(SUMS)} is not as it was fetched from byte {at} on"
+                yield f"{where}; it is asked for again when the capture goes on"
+        except (FileNotFoundError, NotPlainError):
+            continue  # its lines are published; or it is a link and the like, which is told of every such thing
+        except OSError as error:
+            yield f"{name} cannot be read: {error.strerror}"
+
+
+def _inside(folder: Path) -> list[Path]:
+    return sorted(folder.iterdir()) if kind_of(folder) == "a folder" else []
 
 
 def _changed_since(catalogue: Catalogue, uri: str) -> bool:
