@@ -318,5 +318,4 @@ def command(settings: Mapping[str, Any], out: str) -> str:
             words += [f"--{flag}", str(value)]
     tables = [name for name, value in asked.items() if isinstance(value, dict) and value != defaults.get(name)]
     more = [f"with [{'], ['.join(tables)}] as in its receipt"] if tables else []
-    more += ["it had two rounds of detail, which are no more"] if "rounds" in asked else []
     return shlex.join(words) + (f"  ({'; '.join(more)})" if more else "")

@@ -269,12 +269,7 @@ def _hint(full: str, known: Mapping[str, Declared], prefix: str) -> str:
 
 
 def of_this_version(stored: Mapping[str, Any]) -> dict[str, Any]:
-    """A receipt's settings that there are now, in tables too (SettingsError: two rounds of detail, now no more)."""
-    if stored.get("rounds", 1) != 1:
-        raise SettingsError(
-            f"its survey had {stored['rounds']} rounds of detail, which never paid and were removed: survey the "
-            "field by hand, without 'rounds'; what both share is in the archive; take what is damaged out first"
-        )
+    """A receipt's settings that there are now, in tables too."""
     if stored.get("look", LOOK_WHOLE) == LOOK_WHOLE:  # of a first visit that asked for a part
         stored = {key: None if key in OF_A_PART else value for key, value in stored.items()}
     return {

@@ -29,7 +29,7 @@ from tests.faults.small_survey import Subject, problems, stored, words, wrong_af
 from tests.flows.small_fields import write_field, write_weights
 
 GOING_ON = "terminated; the same command goes on from here"
-SYNCS = (2, 60, 110)  # of a survey's files, before which it is stopped
+SYNCS = (2, 60)  # of a survey's files, before which it is stopped
 TAKEN = 9  # lines of a sweep
 CODES = {signal.SIGKILL: -signal.SIGKILL, signal.SIGTERM: TERMINATED}
 BEGUN = ("flows.tasks.stages.accuracy:load_class_map", 1)
@@ -37,13 +37,12 @@ PLACES = {  # function and call before which a survey is stopped that has its ma
     "before the map is looked at": (*BEGUN, signal.SIGTERM),
     "in the controls": ("flows.tasks.stages.accuracy:run_controls", 1, signal.SIGKILL),
     "stored and not added": ("flows.publish.publishing:extend_with_accuracy", 1, signal.SIGKILL),
-    "drawn anew": ("flows.publish.run_folder:draw_quicklook", 1, signal.SIGTERM),
     "after the run has changed": ("storage.archive.run_folders:remove_tree", 2, signal.SIGKILL),
 }
 ADDED = "after the run has changed"
 KILLS = 3
-MOMENTS = [(number + random.Random(number).random()) / KILLS for number in range(KILLS)]  # of the time it takes
-LIVES = (0.5, 0.35, 0.35, 0.35)  # of it too: what was not published begins anew
+MOMENTS = (0.28, 0.98)  # of the time it takes; those between are of runs that die again and again
+LIVES = (0.5, 0.35)  # of it too: what was not published begins anew
 
 
 def told(ended: Ended) -> bool:

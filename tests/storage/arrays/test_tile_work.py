@@ -262,7 +262,7 @@ def test_means_of_a_block_do_not_depend_on_holes_in_others() -> None:
     assert np.isfinite(torn).all()
 
 
-@pytest.mark.parametrize("crew", [ONE, THREE, Crew("processes", 2)])
+@pytest.mark.parametrize("crew", [ONE, Crew("processes", 2)])
 def test_a_mosaic_of_means_is_the_mean_of_the_finer_one(cubes: list[RawCube], tmp_path: Path, crew: Crew) -> None:
     """Whoever makes its tiles: 4 x 4 finer pixels a pixel, those that no line reached left out."""
     fine, coarse = recipe_of(cubes), PixelGrid((-68.5, -418.5), 4, (35, 225))
