@@ -63,7 +63,6 @@ MOST_FILES = 25  # in a folder
 MOST_LINES = 8  # of what is clear without a docstring
 IN_FUNCTIONS = {  # file -> packages that a function of it imports, and why no file's head does
     "flows/publish/publishing.py": ("PIL", "for Prefect's pages alone"),
-    "storage/parallel/cluster_work.py": ("dask", "half a second, for crews of processes alone"),
     "storage/remote/object_stores.py": ("obstore", "an extra: that it is missing is told"),
 }
 

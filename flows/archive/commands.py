@@ -29,9 +29,9 @@ from storage.archive.keys import in_text
 from storage.archive.lineage import Catalogue, changes_between, find_product, version_before
 from storage.archive.records import Run, Store
 from storage.maintenance.garbage import clear_up
-from storage.maintenance.repair import Rerun, plan_repair
+from storage.maintenance.repair import Rerun, plan_repair, repair
 from storage.maintenance.verification import Finding
-from storage.remote.opening import open_archive, put_back_archive, repair_archive, verify_archive
+from storage.remote.opening import open_archive, verify_archive
 
 if TYPE_CHECKING:
     import flows.archive.reprocess_command as reprocess_command
@@ -71,7 +71,7 @@ def verify(archive: ArchiveName, *, repair: Switch = False, as_json: AsJson = Fa
     Parameters
     ----------
     repair
-        Make anew what is broken and what was made of it, by running the surveys again that name it.
+        Take away what is broken and make it anew, by running the surveys again that name it.
     """
     return run_verify(archive, stderr, remake=repair, as_json=as_json)
 
@@ -126,10 +126,6 @@ def run_verify(
 ) -> int:
     """Read an archive again; with ``remake`` have what is broken made anew by ``rerun`` (settings in, a run out)."""
     opened = open_archive(archive, create=False, write=remake)
-    if remake:
-        with opened.in_use(alone=True) as alone:
-            if alone:
-                put_back_archive(opened)
     with StageProgress(console, {"verify": "reading again"}) as bars:
         findings = verify_archive(opened, lambda uri, share: bars.show("verify", share, uri))
         bars.show("verify", 1.0, ended=True)
@@ -144,17 +140,16 @@ def run_verify(
     def survey_again(settings: dict[str, Any]) -> None:
         reprocess_command.survey_as_before(settings, opened.name, console)
 
-    done = repair_archive(opened, bad, rerun or survey_again, versions=versions())
+    done = repair(opened, bad, rerun or survey_again, versions=versions())
     content["repair"] = {
         "remade": done.remade,
         "dropped": done.dropped,
-        "put_back": done.put_back,
         "failed": done.failed,
         "hopeless": done.plan.hopeless,
         "complete": done.complete,
     }
     put_out(content, show_repair, as_json=as_json)
-    stray = any(finding.kind in ("stray", "growing", "unreadable") for finding in bad)
+    stray = any(finding.kind in ("stray", "growing") for finding in bad)
     return DONE if done.complete and not stray else PARTLY if done.remade or done.dropped else FAILED
 
 
@@ -276,7 +271,7 @@ def _took(catalogue: Catalogue, store: Store) -> tuple[float | None, float | Non
 def verdict(archive: Archive, findings: list[Finding]) -> dict[str, Any]:
     """What verification found, and for what is broken what a repair would do."""
     bad = [finding for finding in findings if finding.problem is not None]
-    places = {finding.uri for finding in findings if finding.kind in ("whole", "broken", "unreadable")}
+    places = {finding.uri for finding in findings if finding.kind in ("whole", "broken")}
     broken = {finding.uri for finding in bad if finding.kind == "broken"}
     content: dict[str, Any] = {
         "archive": archive.name,

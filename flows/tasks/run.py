@@ -50,6 +50,7 @@ from pipeline.ground.georeference import georeference_record
 from pipeline.lazy import Once
 from pipeline.rectify.placed import PixelGrid, place
 from pipeline.rectify.region import plan_tiles
+from pipeline.rectify.tiles import MosaicWork
 from pipeline.simulator.effects.pointing import PointingErrors
 from pipeline.simulator.scenes.scene import RasterScene
 from pipeline.simulator.simulated import SimulatedSource, SimulatedSweep
@@ -57,7 +58,7 @@ from pipeline.source import References
 from storage.archive.archive import Archive
 from storage.archive.keys import array_digest
 from storage.arrays.layout import AngularGrid, image_spec
-from storage.arrays.tile_work import MosaicWork, tile_budget
+from storage.arrays.tile_work import tile_budget
 from storage.readers.open_cubes import load_labels_array
 from storage.readers.raster_work import RasterPixels
 from storage.readers.scene_files import OpenScene

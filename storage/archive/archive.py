@@ -5,7 +5,6 @@
     stages/<stage>/<key>/     what a stage made, with manifest.json
     runs/<run id>/            receipt.json, report.html, quicklook.png
     spool/<key>/              lines of a capture under way
-    .aside/<stage>/<key>/     what a repair under way puts back where it cannot be remade
     .locks/                   held while something is made
 
 A folder whose name ends in ``.part`` is not finished: whoever makes the same thing next removes it. An archive in a
@@ -210,11 +209,11 @@ class Archive:
         return read_manifest(self.root / ref.uri)
 
     def stored_bytes(self, ref: StageRef) -> int:
-        """Size of a store's files by its manifest, as they were made: the same before it was packed and after."""
+        """Size of a store's files by its manifest, as they were made: also of those that were cleared away."""
         return made_bytes(self.manifest(ref))
 
     def cost(self, ref: StageRef) -> Cost | None:
-        """What the making of a store took, by its manifest; None for stores of before this was recorded."""
+        """What the making of a store took, by its manifest; None where that does not tell."""
         return cost_of(self.manifest(ref))
 
     def manifest_hash(self, ref: StageRef) -> str:
@@ -230,10 +229,11 @@ class Archive:
         """Every published store (of one stage), by stage and key."""
         return published_stores(self.root, stage)
 
-    def discard(self, ref: StageRef, *, wait: bool = True) -> bool:
+    def discard(self, ref: StageRef, *, wait: bool = True, unnamed: bool = False) -> bool:
         """Take one store away, for good; a key that is asked for again is made again.
 
-        False where another process works on it and ``wait`` is false.
+        False where another process works on it and ``wait`` is false. ``unnamed`` says that no run may name it, which
+        in a bucket is looked after once more: here whoever clears up is alone.
         """
         with refusals(self.root, "remove from the archive"):
             release = take_lock(self._lock_path(f"{ref.stage}-{ref.key}"), wait=wait)
@@ -324,6 +324,15 @@ class Archive:
 
     def drop_leftover(self, uri: str) -> None:
         """Remove one of `leftovers`."""
+
+    def restore(self, uri: str) -> bool:
+        """Whether a broken store or run of a bucket could be written again as it is on this machine."""
+        return False
+
+    def drop_run(self, uri: str) -> None:
+        """Take a damaged run away."""
+        with refusals(self.root, "remove from the archive"):
+            retire(self.root / uri)
 
     # --- runs and spools ----------------------------------------------------------------------------------------------
 

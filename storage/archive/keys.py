@@ -144,7 +144,7 @@ def in_text(text: str) -> str | None:
     return found.group(0)
 
 
-PARTS = ("stages", "runs", "spool", ".aside", ".locks")
+PARTS = ("stages", "runs", "spool", ".locks")
 
 
 def open_folder(path: Path, *, create: bool, write: bool) -> None:

@@ -1,7 +1,7 @@
 """Manifests: the facts of a published folder, the hash and size of every file, and a seal over the manifest itself.
 
 The seal is the SHA-256 of the manifest's text without it, so that a bit that flips in the manifest is found by the
-manifest alone. Manifests of before (no ``format``, no ``seal``) still open; their sizes and hashes count as ever.
+manifest alone.
 """
 
 from __future__ import annotations
@@ -33,7 +33,6 @@ from storage.archive.staging import (
 )
 
 FORMAT = 2
-PACKED = "packed"  # what a store was before an earlier version of this program packed its numbers with pcodec
 CLEARED = "cleared"  # what a store was before its files were cleared away, as they can be made again
 EXTENDED = "extended"  # what a run was before something was added to it
 CURE = "restore it from a copy, or run verify --repair on the archive"
@@ -117,7 +116,7 @@ def parse_manifest(written: bytes) -> tuple[dict[str, Any], str | None]:
         if not isinstance(content, dict) or not isinstance(content.get("files"), dict):
             raise TypeError("it lists no files")
         rest = {name: value for name, value in content.items() if name != "seal"}
-        if is_sealed(content) and (content.get("seal") != _seal(rest) or text != _text(content)):
+        if content.get("seal") != _seal(rest) or text != _text(content):
             raise ValueError("it has changed since it was published: its seal does not fit")
         for name, entry in content["files"].items():
             _check_entry(name, entry)
@@ -126,11 +125,6 @@ def parse_manifest(written: bytes) -> tuple[dict[str, Any], str | None]:
     except (ValueError, TypeError) as error:
         return {}, str(error)
     return content, None
-
-
-def is_sealed(manifest: Mapping[str, Any]) -> bool:
-    """Whether a manifest vouches for itself; those of before do not."""
-    return "seal" in manifest or "format" in manifest
 
 
 def manifest_sha256(folder: Path) -> str:
@@ -166,15 +160,9 @@ def listed_bytes(manifest: Mapping[str, Any]) -> int:
 
 
 def made_bytes(manifest: Mapping[str, Any]) -> int:
-    """Size of all files as they were first published, before they were packed or cleared away."""
-    sizes = (_table(manifest.get(entry)).get("bytes_before") for entry in (PACKED, CLEARED))
-    told = [size for size in sizes if isinstance(size, int) and not isinstance(size, bool)]
-    return max((listed_bytes(manifest), *told))
-
-
-def packed_from(manifest: Mapping[str, Any]) -> list[str]:
-    """SHA-256 of the manifests that a store had before it was packed, oldest first; none where it never was."""
-    return _manifests_before(manifest.get(PACKED))
+    """Size of all files as they were made, also where they were cleared away since."""
+    size = _table(manifest.get(CLEARED)).get("bytes_before")
+    return size if isinstance(size, int) else listed_bytes(manifest)
 
 
 def cleared_facts(before: Mapping[str, Any], sha256: str) -> dict[str, Any]:

@@ -33,7 +33,7 @@ class StageRecord:
     peak_rss_bytes: int | None = None
     bytes_in: int | None = None
     bytes_out: int | None = None
-    manifest_sha256: str | None = None  # of the store that the stage left; receipts of before have none
+    manifest_sha256: str | None = None  # of the store that the stage left
 
 
 @dataclass(frozen=True)
@@ -112,12 +112,8 @@ class Run:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What the survey was asked for; from its manifest where that says so.
-
-        Without ``rounds = 1``, which earlier versions told: there is no other number by now.
-        """
-        told = _table(self.facts.get("settings")) or _table(self.receipt.get("settings"))
-        return {name: value for name, value in told.items() if (name, value) != ("rounds", 1)}
+        """What the survey was asked for; from its manifest where that says so."""
+        return _table(self.facts.get("settings")) or _table(self.receipt.get("settings"))
 
     @property
     def products(self) -> dict[str, str]:

@@ -8,7 +8,7 @@ on.
 ::
 
     <name>          the bytes of a file of the camera, or of notes, which have checksums of their own
-    <name>%sums     one JSON object a line: how far the file reached, and the CRC-32 of its bytes up to there
+    <name>%sums     records of how far the file reached, the CRC-32 of its bytes up to there, and that of the record
 
 What an earlier process left of a file is compared with its sums once, and cut off from where they do not fit: the
 camera is asked for it again.
@@ -16,16 +16,14 @@ camera is asked for it again.
 
 from __future__ import annotations
 
-import json
 import logging
 import os
+import struct
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
 from urllib.parse import quote
 
-from pipeline.json_lines import read_checked, with_check
 from pipeline.rig.devices import NotKept
 from storage.archive.staging import disk_words, open_plain, plain_reader, plain_size, read_plain, sync_path
 
@@ -33,17 +31,18 @@ SYNC_BYTES = 1 << 24
 SUMS = "%sums"  # which no quoted name ends with
 LOG = logging.getLogger(__name__)
 _APPEND = os.O_WRONLY | os.O_APPEND | os.O_CREAT
+_RECORD = struct.Struct("<QII")
 _BLOCK = 1 << 20
 _LONGEST = 240  # of a file's name, in most file systems 255
 
 
 @dataclass
 class _Sums:
-    """How far a file is known to be as it was fetched: bytes, their CRC-32, and how long its sums are."""
+    """How far a file is known to be as it was fetched, and how many records say so."""
 
     reached: int = 0
     crc32: int = 0
-    length: int = 0
+    records: int = 0
 
 
 class FetchedFiles:
@@ -126,28 +125,31 @@ class FetchedFiles:
         """Take down how far a file reaches now. What the disk takes half of is cut off when the file is compared."""
         known = self._sums[name]
         reached, crc32 = known.reached + len(data), zlib.crc32(data, known.crc32)
-        text, sums = _sum_line(reached, crc32), _sums_of(path)
+        text, sums = _record(reached, crc32), _sums_of(path)
         try:
             with os.fdopen(open_plain(sums, _APPEND), "ab", buffering=0) as file:
                 _write_all(file.fileno(), text)
         except OSError:
-            _cut(sums, known.length)
+            _cut(sums, known.records * _RECORD.size)
             raise
-        self._sums[name] = _Sums(reached, crc32, known.length + len(text))
+        self._sums[name] = _Sums(reached, crc32, known.records + 1)
 
     def _compare(self, name: str, path: Path) -> None:
         """Cut off what an earlier process left and no sum vouches for; notes vouch for themselves."""
         if name in self._sums or _is_note(name):
             return
-        found, whole = _vouched_for(path)
-        if not whole:
+        found, changed = _agreeing(path)
+        size = plain_size(path) if os.path.lexists(path) else 0
+        if changed or size > found.reached:
             LOG.warning("%s: what follows byte %d is not as it was fetched, or was not all kept", path, found.reached)
             _cut(path, found.reached)
-            text = _sum_line(found.reached, found.crc32)
             _sums_of(path).unlink(missing_ok=True)
-            with os.fdopen(open_plain(_sums_of(path), _APPEND), "ab") as file:
-                file.write(text)
-            found.length = len(text)
+            found.records = 0
+            if found.reached:
+                _sums_of(path).write_bytes(_record(found.reached, found.crc32))
+                found.records = 1
+        elif os.path.lexists(_sums_of(path)):
+            _cut(_sums_of(path), found.records * _RECORD.size)
         self._sums[name] = found
 
     def _path(self, name: str) -> Path:
@@ -162,11 +164,8 @@ def first_unlike(path: Path) -> int | None:
 
     Raises OSError: one of both cannot be read.
     """
-    found, _ = _vouched_for(path)
-    sums = list(read_checked(read_plain(_sums_of(path))))
-    last = max((line.content["reached"] for line in sums if line.content is not None), default=0)
-    changed = any(line.state == "changed" for line in sums)
-    return found.reached if changed or found.reached < last else None
+    found, changed = _agreeing(path)
+    return found.reached if changed else None
 
 
 def _is_note(name: str) -> bool:
@@ -177,44 +176,33 @@ def _sums_of(path: Path) -> Path:
     return path.with_name(path.name + SUMS)
 
 
-def _vouched_for(path: Path) -> tuple[_Sums, bool]:
-    """How far the sums of a file fit its bytes, and whether nothing is left of either that they do not say.
+def _agreeing(path: Path) -> tuple[_Sums, bool]:
+    """How far bytes and sums of a file agree, and whether anything of either has changed since.
 
     Each sum is of all bytes before it, so one that is lost is passed over.
     """
-    found = _Sums()
-    if not os.path.lexists(path) and not os.path.lexists(_sums_of(path)):
-        return found, True
+    found, reached, crc32, changed = _Sums(), 0, 0, False
     try:
-        text = read_plain(_sums_of(path))
-        found.length = len(text)
+        sums = read_plain(_sums_of(path))
         with plain_reader(path) as file:
-            whole, end = _follow(file, text, found), plain_size(path)
+            for number in range(len(sums) // _RECORD.size):
+                to, expected, check = _RECORD.unpack_from(sums, number * _RECORD.size)
+                if check != zlib.crc32(sums[number * _RECORD.size :][: _RECORD.size - 4]):
+                    changed = True
+                    continue
+                while reached < to and (data := file.read(min(to - reached, _BLOCK))):
+                    reached, crc32 = reached + len(data), zlib.crc32(data, crc32)
+                if reached < to or crc32 != expected:
+                    return found, True
+                found = _Sums(reached, crc32, number + 1)
     except FileNotFoundError:
-        return found, not os.path.lexists(path) or plain_size(path) == 0
-    return found, whole and found.reached == end
+        pass
+    return found, changed
 
 
-def _follow(file: BinaryIO, sums: bytes, found: _Sums) -> bool:
-    """Take down in ``found`` how far bytes and sums agree; whether all of the sums do."""
-    reached = crc32 = 0
-    lines = list(read_checked(sums))
-    for line in lines:
-        if line.content is None or line.state != "whole":
-            continue
-        while reached < line.content["reached"]:
-            data = file.read(min(line.content["reached"] - reached, _BLOCK))
-            if not data:
-                return False
-            reached, crc32 = reached + len(data), zlib.crc32(data, crc32)
-        if crc32 != line.content["crc32"]:
-            return False
-        found.reached, found.crc32 = reached, crc32
-    return all(line.state == "whole" for line in lines)
-
-
-def _sum_line(reached: int, crc32: int) -> bytes:
-    return with_check(json.dumps({"reached": reached, "crc32": crc32}).encode())
+def _record(reached: int, crc32: int) -> bytes:
+    facts = _RECORD.pack(reached, crc32, 0)[:-4]
+    return facts + zlib.crc32(facts).to_bytes(4, "little")
 
 
 def _unread(path: Path, error: OSError) -> NotKept:

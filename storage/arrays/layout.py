@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import zarr
-from numcodecs.errors import UnknownCodecError  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, BloscShuffle, Crc32cCodec, ZstdCodec
 from zarr.storage import MemoryStore
@@ -244,8 +243,6 @@ def damage_named(where: str) -> Iterator[None]:
     """Turn what decoders raise on damaged bytes into an IncompleteStoreError that names the array."""
     try:
         yield
-    except UnknownCodecError as error:
-        raise IncompleteStoreError(missing_codec(where, error.codec_id)) from error
     except (OSError, ValueError, KeyError, TypeError, RuntimeError, IndexError) as error:
         raise IncompleteStoreError(f"{where} cannot be read: {error}; run verify on the archive") from error
 
@@ -253,8 +250,7 @@ def damage_named(where: str) -> Iterator[None]:
 def missing_codec(where: str, codec: str) -> str:
     """What to say of an array whose codec is not installed; its bytes may well be whole."""
     name = codec.strip("'")  # numcodecs gives it in quotes
-    once = ", as earlier versions of SpectralZoom packed raw lines," if name == "pcodec" else ","
-    return f"{where} is packed with {name}{once} which is not installed; pip install {name} (nothing is damaged)"
+    return f"{where} is packed with {name}, which is not installed; pip install {name} (nothing is damaged)"
 
 
 def round_bits(

@@ -1,75 +1,83 @@
 """The line spool: what a capture writes while it runs, so that a crash loses at most the lines since the last sync.
 
-::
+``<name>.lines`` begins with one JSON object on a line: what the lines belong to, with a checksum of its own. Records
+of one size follow, one a line: number, mirror X and Y, time, exposure, valid, a CRC-32, and the raw numbers (sample,
+band) uint16. The CRC goes on from that of the header, so that a record belongs to one sweep alone.
 
-    <name>.bil      raw numbers, one line after the other, bands by samples in each (an ENVI file with <name>.hdr)
-    <name>.index    one JSON object a line: the header first, then number, mirror, time, exposure, valid, CRC-32
-
-A line counts when its index entry is whole by its own checksum and its numbers have the CRC that the entry states.
-Lines that do not count lie either behind the last that does, and are cut off: the capture goes on there; or before it:
-these are lost, and are put back in their places when the source gives them again. Spools of earlier versions, whose
-entries have no checksum, are refused: nothing tells which of their numbers are those of the capture.
+A line counts when its record has its CRC. Records that do not count lie either behind the last that does, and are cut
+off: the capture goes on there; or before it: these lines are lost, and are put back in their places when the source
+gives them again.
 """
 
 from __future__ import annotations
 
+import json
 import logging
 import os
+import struct
+import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.errors import RigError
+from pipeline.json_lines import read_checked, with_check
 from pipeline.source import Line
-from storage.archive.staging import disk_words, open_plain, plain_reader, read_plain, sync_path
-from storage.arrays.spool_index import FORMAT, Head, SpoolEntry, difference, read_head
+from storage.archive.keys import plain
+from storage.archive.staging import disk_words, open_plain, plain_reader, sync_path
 
+ENDING = ".lines"
 SYNC_LINES = 64
 MOST_NAMED = 8
 LOG = logging.getLogger(__name__)
-_APPEND = os.O_WRONLY | os.O_APPEND | os.O_CREAT
-_ANEW = os.O_WRONLY | os.O_CREAT | os.O_TRUNC
+_FACTS, _CRC = struct.Struct("<q4d?"), struct.Struct("<I")
+_LONGEST_HEADER = 1 << 20
 
 
 class Spool:
     """Lines on disk, appended one by one. Use as a context manager, or close it."""
 
-    def __init__(self, path: Path, shape: tuple[int, int], header: Mapping[str, Any]) -> None:
-        self.path = path  # of the numbers
-        self.index_path = path.with_suffix(".index")
+    def __init__(self, path: Path, head: bytes, shape: tuple[int, int]) -> None:
+        self.path = path
         self.samples, self.bands = shape
         self.count = 0  # lines that are there or lost: the number of the next one appended
         self.lost: list[int] = []  # numbers of those that are lost, in order: `mend` them before the lines are read
-        self._head = Head.of(*shape, header)
-        self._index_end = 0
-        self._line_bytes = shape[0] * shape[1] * 2
-        self._data: BinaryIO | None = None
-        self._index: BinaryIO | None = None
+        self._head = head
+        self._seed = zlib.crc32(head)
+        self._size = _FACTS.size + _CRC.size + 2 * shape[0] * shape[1]  # of a record
+        self._file: BinaryIO | None = None
 
     @classmethod
     def open(cls, folder: Path, samples: int, bands: int, *, header: Mapping[str, Any], name: str = "lines") -> Spool:
         """Open the spool in ``folder``, or begin it; lines from an earlier, broken capture are kept and counted.
 
         ``header`` is what the lines belong to (the sweep, the source, the seed). Raises RigError: the spool holds lines
-        of anything else or of an earlier version, or the disk refuses.
+        of anything else, or the disk refuses.
         """
-        spool = cls(folder / f"{name}.bil", (samples, bands), header)
+        facts = {"samples": samples, "bands": bands, "header": plain(dict(header))}
+        spool = cls(folder / f"{name}{ENDING}", with_check(json.dumps(facts).encode()), (samples, bands))
         with _refusals(spool.path, 0):
             folder.mkdir(parents=True, exist_ok=True)
-            there = os.path.lexists(spool.index_path) and os.path.lexists(spool.path)
-            if not there or b"\n" not in read_plain(spool.index_path):  # nor is a header that is torn
-                for path, content in ((spool.path, b""), (spool.index_path, spool._head.text)):
-                    _write_anew(path, content)
-                for named in (folder, folder.parent, folder.parent.parent):  # lines need their files' names
+            if not os.path.lexists(spool.path):
+                with os.fdopen(open_plain(spool.path, os.O_WRONLY | os.O_CREAT), "wb") as file:
+                    file.write(spool._head)
+                for named in (spool.path, folder, folder.parent, folder.parent.parent):  # lines need their file's name
                     sync_path(named)
             spool.recover()
-            spool._write_envi_header()
         return spool
+
+    @classmethod
+    def known(cls, path: Path) -> Spool | None:
+        """Open a spool by its own header, to be read; None where that cannot be believed."""
+        with plain_reader(path) as file:
+            head = file.readline(_LONGEST_HEADER)
+        facts = _header(head)
+        return None if facts is None else cls(path, head, (facts["samples"], facts["bands"]))
 
     def __enter__(self) -> Spool:
         return self
@@ -88,195 +96,145 @@ class Spool:
 
         Raises RigError: the line is out of order or of another size, or the disk refuses. The lines before it are kept.
         """
-        self._check_line(line, self.count)
-        content = _to_bytes(line.data)
-        entry = self._head.entry(line, content).text
+        record = self._record(line, self.count)
         with _refusals(self.path, self.count):
+            if self._file is None:
+                self._file = self._writer(os.O_APPEND)
             try:
-                data, index = self._files()
-                _write_all(data, content)
-                _write_all(index, entry)
+                _write_all(self._file, record)
             except OSError:
                 self._cut_back()
                 raise
         self.count += 1
-        self._index_end += len(entry)
         if self.count % SYNC_LINES == 0:
             self.sync()
 
     def mend(self, lines: Iterable[Line]) -> None:
         """Put lost lines back: one for each number in `lost`, in that order.
 
-        Afterwards both files are what they would be had nothing been lost; killed in between, some are lost yet. Raises
+        Afterwards the file is what it would be had nothing been lost; killed in between, some are lost yet. Raises
         RigError: a line is out of order or of another size, or the disk refuses.
         """
-        if not self.lost:
-            return
-        waiting, lost = list[SpoolEntry](), list(self.lost)
-        for number, line in zip(lost, lines, strict=True):
-            self._check_line(line, number)
-            content = _to_bytes(line.data)
-            with _refusals(self.path, number):
-                self.close()
-                with os.fdopen(open_plain(self.path, os.O_WRONLY), "wb", buffering=0) as file:
-                    file.seek(number * self._line_bytes)
-                    _write_all(file, content)
-                waiting.append(self._head.entry(line, content))
-                if len(waiting) == SYNC_LINES or number == lost[-1]:
-                    self._add_entries(waiting)
-                    waiting.clear()
+        for number, line in zip(list(self.lost), lines if self.lost else (), strict=True):
+            record = self._record(line, number)
+            with _refusals(self.path, number), self._writer() as file:
+                file.seek(self._place(number))
+                _write_all(file, record)
+                os.fdatasync(file.fileno())
+            self.lost = [one for one in self.lost if one != number]
 
     def sync(self) -> None:
-        """Wait until the disk has every line, numbers first. Raises RigError where it refuses."""
-        with _refusals(self.path, self.count):
-            for file in self._files():
-                os.fdatasync(file.fileno())
-            self._write_envi_header()
+        """Wait until the disk has every line. Raises RigError where it refuses."""
+        if self._file is not None:
+            with _refusals(self.path, self.count):
+                os.fdatasync(self._file.fileno())
 
     def recover(self) -> int:
         """Find the good lines and those that are lost, cut off what a crash left torn behind the last good one.
 
-        Gives the number of the line to go on with. Every line is read and compared with its CRC. Raises RigError: the
-        lines are of another sweep or of an earlier version.
+        Gives the number of the line to go on with. Raises RigError: the lines are of another sweep.
         """
-        index = read_plain(self.index_path)
-        if not self._head.is_head_of(index):
-            self._refuse_another(index)
-        good: dict[int, SpoolEntry] = {}  # by number, of lines whose numbers are those that were written
-        with plain_reader(self.path) as data:
-            for number, entry in sorted(self._head.entries(index).items()):
-                content = self._read(data, number)
-                if len(content) == self._line_bytes and entry.fits(content):
-                    good[number] = entry
+        with plain_reader(self.path) as file:
+            head = file.readline(_LONGEST_HEADER)
+        good = [number for number, line in enumerate(self.read()) if line is not None]
+        if head != self._head:
+            found = _header(head)
+            if found is not None and not good:
+                raise RigError(
+                    f"{self.path} holds lines of another sweep ({_difference(found, _header(self._head) or {})}); "
+                    f"finish that capture, or remove the folder to start anew"
+                )
+            LOG.warning("%s: its header has changed; lines that belong to this sweep are kept", self.path)
+            with self._writer() as file:
+                _write_all(file, self._head)
         self.count = max(good, default=-1) + 1
-        self.lost = [number for number in range(self.count) if number not in good]
+        self.lost = sorted(set(range(self.count)) - set(good))
         if self.lost:
             LOG.warning("%s: not as it was captured, and asked for again: %s", self.path, line_words(self.lost))
-        self._keep_entries(index, good)
         self._cut_back()
         return self.count
+
+    def read(self, first: int = 0, last: int | None = None) -> Iterator[Line | None]:
+        """Give the lines from ``first`` on, before ``last``; None for each that is not as it was captured."""
+        with plain_reader(self.path) as file:
+            file.seek(self._place(first))
+            for number in count(first) if last is None else range(first, last):
+                record = file.read(self._size)
+                if len(record) < self._size:
+                    return
+                yield self._line(number, record)
 
     def blocks(self, size: int = SYNC_LINES) -> Iterator[list[Line]]:
         """Give the lines in blocks of ``size``; the last may be shorter.
 
         Raises RigError: a line has changed since it was written, or is lost and not mended; names it.
         """
-        if self._data is not None:
-            self.sync()
-        entries = self._head.entries(read_plain(self.index_path))
-        with plain_reader(self.path) as data:
-            for first in range(0, self.count, size):
-                numbers = range(first, min(first + size, self.count))
-                yield [self._line(number, entries.get(number), data) for number in numbers]
+        for first in range(0, self.count, size):
+            block = list(self.read(first, min(first + size, self.count)))
+            whole = [line for line in block if line is not None]
+            if len(whole) < len(block):
+                raise RigError(
+                    f"{self.path}: line {first + block.index(None)} has changed since it was captured (CRC-32 "
+                    f"differs); run again: it is asked for again, and the other lines are kept"
+                )
+            yield whole
 
-    def close(self, *, sync: bool = True) -> None:
-        """Close the files; what was appended stays."""
+    def close(self) -> None:
+        """Close the file; what was appended stays."""
         try:
-            if sync and self._data is not None:
-                self.sync()
+            self.sync()
         finally:
-            for file in (self._data, self._index):
-                if file is not None:
-                    file.close()
-            self._data = self._index = None
+            if self._file is not None:
+                self._file.close()
+            self._file = None
 
-    # --- files --------------------------------------------------------------------------------------------------------
-
-    def _check_line(self, line: Line, number: int) -> None:
+    def _record(self, line: Line, number: int) -> bytes:
         if line.number != number or line.data.shape != (self.samples, self.bands):
             raise RigError(
                 f"{self.path}: got line {line.number} of shape {line.data.shape}, expected line {number} of shape "
                 f"{(self.samples, self.bands)} (sample, band); lines come in order, invalid ones with valid=False"
             )
+        facts = _FACTS.pack(number, line.mirror_x, line.mirror_y, line.time_s, line.exposure_ms, line.valid)
+        data = np.ascontiguousarray(line.data, "<u2").tobytes()
+        return facts + _CRC.pack(zlib.crc32(data, zlib.crc32(facts, self._seed))) + data
 
-    def _files(self) -> tuple[BinaryIO, BinaryIO]:
-        if self._data is None or self._index is None:
-            self._data = os.fdopen(open_plain(self.path, _APPEND), "ab", buffering=0)
-            self._index = os.fdopen(open_plain(self.index_path, _APPEND), "ab", buffering=0)
-        return self._data, self._index
+    def _line(self, number: int, record: bytes) -> Line | None:
+        facts, data = record[: _FACTS.size], record[_FACTS.size + _CRC.size :]
+        (crc,) = _CRC.unpack_from(record, _FACTS.size)
+        if crc != zlib.crc32(data, zlib.crc32(facts, self._seed)):
+            return None
+        found, mirror_x, mirror_y, time_s, exposure_ms, valid = _FACTS.unpack(facts)
+        values = np.frombuffer(data, "<u2").reshape(self.samples, self.bands).astype(np.uint16)
+        return Line(number, values, mirror_x, mirror_y, time_s, exposure_ms, valid) if found == number else None
+
+    def _place(self, number: int) -> int:
+        return len(self._head) + number * self._size
+
+    def _writer(self, more: int = 0) -> BinaryIO:
+        return os.fdopen(open_plain(self.path, os.O_WRONLY | more), "wb", buffering=0)
 
     def _cut_back(self) -> None:
         """Take away what stands behind the last good line, so that the next one begins in its place."""
-        self.close(sync=False)
-        for path, size in ((self.path, self.count * self._line_bytes), (self.index_path, self._index_end)):
-            with os.fdopen(open_plain(path, os.O_WRONLY), "wb") as file:
-                file.truncate(size)
-
-    def _refuse_another(self, index: bytes) -> None:
-        """Raise RigError where an index begins with another header; one that is damaged is judged by its entries."""
-        found = read_head(index)
-        if found is None or found.content is None:
-            LOG.warning("%s: its header has changed; lines that belong to this sweep are kept", self.index_path)
-            return
-        if found.content.get("format") != FORMAT:
-            raise RigError(
-                f"{self.index_path} was begun by another version ({found.content.get('format')!r}, this one writes "
-                f"{FORMAT!r}): its lines have no checksums that this one knows; finish that capture with the version "
-                f"that began it, or remove the folder to start anew"
-            )
-        raise RigError(
-            f"{self.index_path} holds lines of another sweep ({difference(found.content, self._head.facts)}); "
-            f"finish that capture, or remove the folder to start anew"
-        )
-
-    def _keep_entries(self, index: bytes, entries: Mapping[int, SpoolEntry]) -> None:
-        """Have the index begin with these entries and nothing else, without a write where it does so already."""
-        wanted = self._head.text + b"".join(entries[number].text for number in sorted(entries))
-        self._index_end = len(wanted)
-        if not index.startswith(wanted):
-            staged = self.index_path.with_suffix(".index.part")
-            _write_anew(staged, wanted)
-            sync_path(staged)
-            staged.replace(self.index_path)
-            sync_path(self.index_path.parent)
-
-    def _add_entries(self, entries: list[SpoolEntry]) -> None:
-        """Enter lines that were put back, once the disk has their numbers."""
-        sync_path(self.path)
-        index = read_plain(self.index_path)
-        known = {number: one for number, one in self._head.entries(index).items() if number not in self.lost}
-        self._keep_entries(index, known | {entry.number: entry for entry in entries})
-        back = {entry.number for entry in entries}
-        self.lost = [number for number in self.lost if number not in back]
-
-    def _read(self, data: BinaryIO, number: int) -> bytes:
-        data.seek(number * self._line_bytes)
-        return data.read(self._line_bytes)
-
-    def _line(self, number: int, entry: SpoolEntry | None, data: BinaryIO) -> Line:
-        content = self._read(data, number)
-        if entry is None or not entry.fits(content):
-            what = "its entry in the index" if entry is None else "CRC-32"
-            raise RigError(
-                f"{self.path}: line {number} has changed since it was captured ({what} differs); run again: it is "
-                f"asked for again, and the other lines are kept"
-            )
-        numbers = np.frombuffer(content, "<u2").reshape(self.bands, self.samples)
-        facts = entry.facts
-        return Line(
-            number=number,
-            data=np.ascontiguousarray(numbers.T, np.uint16),
-            mirror_x=facts["mirror_x"],
-            mirror_y=facts["mirror_y"],
-            time_s=facts["time_s"],
-            exposure_ms=facts["exposure_ms"],
-            valid=facts["valid"],
-        )
-
-    def _write_envi_header(self) -> None:
-        """Say how many whole lines the ENVI file has, in one step."""
-        staged = self.path.with_suffix(".hdr.part")
-        _write_anew(staged, envi_header(self.samples, self.bands, self.count))
-        staged.replace(self.path.with_suffix(".hdr"))
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+        with self._writer() as file:
+            file.truncate(self._place(self.count))
 
 
-def envi_header(samples: int, bands: int, lines: int) -> bytes:
-    """Header by which any ENVI program reads the numbers of a spool."""
-    return (
-        "ENVI\ndescription = {line spool of SpectralZoom}\n"
-        f"samples = {samples}\nlines = {lines}\nbands = {bands}\n"
-        "header offset = 0\nfile type = ENVI Standard\ndata type = 12\ninterleave = bil\nbyte order = 0\n"
-    ).encode("ascii")
+def spool_problems(path: Path) -> Iterator[str]:
+    """What is not as it was captured of the lines at a path; a record that is not all there is no damage."""
+    spool = Spool.known(path)
+    if spool is None:
+        with plain_reader(path) as file:
+            if b'"check"' not in file.readline(_LONGEST_HEADER):
+                return  # about to be begun
+        yield f"{path.name}: its header has changed; lines that belong to it are told when the capture goes on"
+        return
+    lost = [number for number, line in enumerate(spool.read()) if line is None]
+    if lost:
+        words = "not as captured (CRC-32), or never on the disk: asked for again when the capture goes on"
+        yield f"{path.name}: {line_words(lost)} {words}"
 
 
 def line_words(numbers: Sequence[int]) -> str:
@@ -284,6 +242,25 @@ def line_words(numbers: Sequence[int]) -> str:
     named = ", ".join(str(number) for number in numbers[:MOST_NAMED])
     more = f" and {len(numbers) - MOST_NAMED} more" if len(numbers) > MOST_NAMED else ""
     return f"line{'s' if len(numbers) > 1 else ''} {named}{more}"
+
+
+def _header(head: bytes) -> dict[str, Any] | None:
+    """What a file's first line says its lines belong to; None where it cannot be believed."""
+    found = next(read_checked(head), None)
+    if found is None or found.state != "whole" or found.content is None or found.text + b"\n" != head:
+        return None
+    sizes = [found.content.get(name) for name in ("samples", "bands")]
+    good = all(type(size) is int and size > 0 for size in sizes) and isinstance(found.content.get("header"), dict)
+    return {name: value for name, value in found.content.items() if name != "check"} if good else None
+
+
+def _difference(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
+    """First thing in which two headers differ, in words."""
+    have, want = ({**head, **head["header"]} for head in (found, wanted))
+    for name in sorted((set(have) | set(want)) - {"header"}):
+        if have.get(name) != want.get(name):
+            return f"{name} is {have.get(name)!r}, expected {want.get(name)!r}"
+    return "its header differs"
 
 
 @contextmanager
@@ -299,17 +276,8 @@ def _refusals(path: Path, lines: int) -> Iterator[None]:
         ) from error
 
 
-def _write_anew(path: Path, content: bytes) -> None:
-    with os.fdopen(open_plain(path, _ANEW), "wb") as file:
-        file.write(content)
-
-
-def _write_all(file: BinaryIO, content: bytes | memoryview) -> None:
+def _write_all(file: BinaryIO, content: bytes) -> None:
     """Write every byte; a full disk may take only some of them before it refuses."""
     view = memoryview(content)
     while view:
         view = view[os.write(file.fileno(), view) :]
-
-
-def _to_bytes(data: NDArray[np.uint16]) -> memoryview:
-    return np.ascontiguousarray(data.T, "<u2").data.cast("B")

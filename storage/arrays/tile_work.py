@@ -20,8 +20,9 @@ from pipeline.geometry.scan import exposing
 from pipeline.rectify.kernels import Kernel
 from pipeline.rectify.mosaic import LineCache
 from pipeline.rectify.placed import PixelGrid, Placed, place
-from pipeline.rectify.region import Reaches, Tile, cache_bytes, column_reach, mosaic_tile, plan_tiles, tile_bytes
+from pipeline.rectify.region import Reaches, Tile, plan_tiles
 from pipeline.rectify.registration.alignment import SweepShift, no_shifts
+from pipeline.rectify.tiles import MosaicWork
 from pipeline.rectify.tracks import LineNumbers, number_lines
 from storage.archive.manifests import read_table
 from storage.arrays.cubes import RawCube, open_raw_cube
@@ -85,29 +86,12 @@ def _period_s(cube: RawCube, camera: LineCamera) -> float:
     return float(np.median(rising)) if len(rising) else camera.frame_ms * 1e-3
 
 
-ROWS_OF_MEANS = 8  # of a mosaic whose pixels are means, rectified at once
 RESERVED_BYTES = 512 * 2**20  # a process before its first tile: interpreter, torch, zarr
 
 
 @dataclass(frozen=True)
-class MosaicWork:
-    """What a mosaic is made of, and with what."""
-
-    placed: Sequence[Placed]
-    camera: LineCamera
-    grid: PixelGrid
-    kernel: Kernel = "catmull-rom"
-    finer: PixelGrid | None = None  # whose pixels are rectified, and their means are the grid's
-
-    @property
-    def read(self) -> PixelGrid:
-        """The pixels that lines are rectified onto."""
-        return self.finer or self.grid
-
-
-@dataclass(frozen=True)
 class MosaicRecipe:
-    """The same by absolute paths: small, hashable, and good in every process that sees them."""
+    """What a mosaic is made of, by absolute paths: small, hashable, and good in every process that sees them."""
 
     raw: Path  # folder of raw cubes
     camera: LineCamera
@@ -190,7 +174,7 @@ class TileBudget:
 
 
 def write_mosaic(
-    work: MosaicWork | MosaicRecipe,
+    recipe: MosaicRecipe,
     writer: MosaicWriter,
     *,
     memory: int,
@@ -200,35 +184,17 @@ def write_mosaic(
 ) -> TileBudget:
     """Rectify and blend sweeps into a stored mosaic, and tell how. Whoever makes the tiles, the same bytes come out.
 
-    Every crew can follow a recipe, threads alone take opened sweeps; fewer tiles are made at a time where ``memory``
-    [bytes] of this process and those that it starts, not of workers elsewhere, holds fewer. ``seen`` is filled with the
-    pixels that it shows, ``report`` called with the share done after each tile, from the calling thread. Raises
-    SettingsError: not even one tile fits the memory, or the crew cannot work here. WorkerError: processes that made
-    tiles were lost. TypeError: opened sweeps for a crew of processes.
+    Fewer tiles are made at a time where ``memory`` [bytes] of this process and those that it starts, not of workers
+    elsewhere, holds fewer. ``seen`` is filled with the pixels that it shows, ``report`` called with the share done
+    after each tile, from the calling thread. Raises SettingsError: not even one tile fits the memory, or the crew
+    cannot work here. WorkerError: processes that made tiles were lost.
     """
-    opened = work.open() if isinstance(work, MosaicRecipe) else work
-    tiles = plan_tiles(opened.placed, opened.camera, opened.grid, writer.tile_shape)
-    budget = tile_budget(opened, tiles, writer.tile_shape, memory=memory, crew=crew)
-
-    def show(rows: slice, columns: slice, part: NDArray[np.float32] | None) -> None:
-        if seen is not None and part is not None:
-            seen.put(rows, columns, part)
-
-    cut = None if seen is None else seen.cut
+    work = _work_of(recipe)
+    tiles = plan_tiles(work.placed, work.camera, work.grid, writer.tile_shape)
+    budget = tile_budget(work, tiles, writer.tile_shape, memory=memory, crew=crew)
+    maker = TileMaker(recipe, writer.path.absolute(), budget.cache, None if seen is None else seen.cut)
     if crew.shares_memory:
-        made = OpenMosaic(opened, writer, LineCache(budget.cache), cut)
-        run_blocks(
-            lambda tile: made.make(tile.rows, tile.columns, None if opened.finer else tile.reach),
-            tiles,
-            Crew(workers=budget.workers),
-            keep=False,
-            report=report,
-            each=lambda tile, part: show(tile.rows, tile.columns, part),
-        )
-        return budget
-    if not isinstance(work, MosaicRecipe):
-        raise TypeError(f"crew {crew.scheduler!r} needs a MosaicRecipe, whose paths each process opens; got MosaicWork")
-    maker = TileMaker(work, writer.path.absolute(), budget.cache, cut)
+        _opened(maker)  # before several threads ask for it
     fewer = not crew.elsewhere and budget.workers < min(crew.count, len(tiles))
     run_blocks(
         maker,
@@ -236,9 +202,10 @@ def write_mosaic(
         Crew(crew.scheduler, budget.workers) if fewer else crew,
         keep=False,
         report=report,
-        paths=[*work.folders, maker.out],
-        each=lambda place, part: show(*place, part),
+        paths=[*recipe.folders, maker.out],
+        each=lambda place, part: None if seen is None or part is None else seen.put(*place, part),
     )
+    let_tiles_go()
     return budget
 
 
@@ -253,82 +220,41 @@ class TileMaker:
 
     def __call__(self, place: tuple[slice, slice]) -> NDArray[np.float32] | None:
         """Make and write the tile of some rows and columns; gives what a thumbnail shows of it."""
-        return _opened(self).make(*place)
-
-
-class OpenMosaic:
-    """A mosaic in the making: what is read, what is written, and the raw lines between."""
-
-    def __init__(self, work: MosaicWork, writer: MosaicWriter, cache: LineCache, cut: ThumbnailCut | None) -> None:
-        self._work, self._writer, self._cache, self._cut = work, writer, cache, cut
-
-        @lru_cache(maxsize=2)  # tiles go down the columns; a method of this object would keep it alive
-        def reach(start: int, stop: int) -> Reaches:
-            return column_reach(work.placed, work.camera, work.read, slice(start, stop))
-
-        self._reach = reach
-
-    def make(self, rows: slice, columns: slice, reach: Reaches | None = None) -> NDArray[np.float32] | None:
-        """Make and write the tile there; what sweeps show of its columns is found once for all rows."""
-        values, coverage = self._means(rows, columns) if self._work.finer else self._tile(rows, columns, reach)
-        part = None if self._cut is None else self._cut(rows, columns, values).copy()
-        self._writer.write_tile(rows.start, columns.start, values, coverage)
+        (rows, columns), opened = place, _opened(self)
+        reach = opened.reach(columns.start, columns.stop)
+        values, coverage = opened.work.make_tile(rows, columns, reach, opened.lines)
+        part = None if self.cut is None else self.cut(rows, columns, values).copy()
+        opened.writer.write_tile(rows.start, columns.start, values, coverage)
         return part
 
-    def _tile(self, rows: slice, columns: slice, reach: Reaches | None) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
-        """Rectify a part of the pixels that lines are read on."""
-        work, reach = self._work, self._reach(columns.start, columns.stop) if reach is None else reach
-        return mosaic_tile(
-            work.placed, work.camera, work.read, rows, columns, kernel=work.kernel, cache=self._cache, reach=reach
-        )
 
-    def _means(self, rows: slice, columns: slice) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
-        """Means over the finer pixels that lines reached, a few rows at a time; how many sweeps saw one of them."""
-        fine, bands = self._work.read, len(self._work.placed[0].lines.references.panel)
-        times = self._work.grid.spacing_px // fine.spacing_px
-        wide = slice(columns.start * times, min(columns.stop * times, fine.shape[1]))
-        shape = rows.stop - rows.start, columns.stop - columns.start
-        values, coverage = np.empty((*shape, bands), np.float32), np.empty(shape, np.intp)
-        for first in range(rows.start, rows.stop, ROWS_OF_MEANS):
-            last = min(first + ROWS_OF_MEANS, rows.stop)
-            deep = slice(first * times, min(last * times, fine.shape[0]))
-            part = slice(first - rows.start, last - rows.start)
-            values[part], coverage[part] = block_means(*self._tile(deep, wide, None), times)
-        return values, coverage
+@dataclass(frozen=True)
+class _Opened:
+    """What makes tiles in one process."""
+
+    work: MosaicWork
+    writer: MosaicWriter
+    lines: LineCache
+    reach: Callable[[int, int], Reaches]  # of some columns: tiles go down them
 
 
-def block_means(
-    values: NDArray[np.float32], coverage: NDArray[np.intp], times: int
-) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
-    """Mean of every ``times`` x ``times`` pixels that are no NaN, (y, x, band), and the most sweeps that saw one.
+@lru_cache(maxsize=1)
+def _work_of(recipe: MosaicRecipe) -> MosaicWork:
+    return recipe.open()
 
-    Sides that ``times`` does not divide end in a smaller block. NaN where nothing of a block was seen.
-    """
-    beyond = [(0, -size % times) for size in coverage.shape]
-    if any(more for _, more in beyond):
-        values = np.pad(values, (*beyond, (0, 0)), constant_values=np.nan)
-        coverage = np.pad(coverage, beyond)
-    blocks = values.reshape(values.shape[0] // times, times, values.shape[1] // times, times, -1)
-    covered = coverage.reshape(*blocks.shape[:4]).max(axis=(1, 3))
-    with np.errstate(over="ignore", invalid="ignore"):
-        total = blocks.sum(axis=(1, 3), dtype=np.float32)
-    if np.isfinite(total).all():  # the rule: all was seen
-        return total / np.float32(times**2), covered
-    seen = np.isfinite(blocks)
-    count = seen.sum(axis=(1, 3), dtype=np.float32)
-    total = np.where(seen, blocks, np.float32(0)).sum(axis=(1, 3), dtype=np.float32)
-    return np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0), covered
+
+@lru_cache(maxsize=1)
+def _opened(maker: TileMaker) -> _Opened:
+    """What a maker needs, opened once in this process; the one before it is let go."""
+    work = _work_of(maker.recipe)
+    reach = lru_cache(maxsize=2)(lambda start, stop: work.reach(slice(start, stop)))
+    return _Opened(work, MosaicWriter.reopen(maker.out), LineCache(maker.cache), reach)
 
 
 def let_tiles_go() -> None:
     """Give back the memory of the last mosaic's raw lines in this process, whose work goes on with something else."""
     _opened.cache_clear()
-
-
-@lru_cache(maxsize=1)
-def _opened(maker: TileMaker) -> OpenMosaic:
-    """What a maker needs, opened once in this process; the one before it is let go."""
-    return OpenMosaic(maker.recipe.open(), MosaicWriter.reopen(maker.out), LineCache(maker.cache), maker.cut)
+    _work_of.cache_clear()
 
 
 def tile_budget(
@@ -340,28 +266,17 @@ def tile_budget(
     """
     processes = not crew.shares_memory
     most = max(1, min(1 if crew.elsewhere else crew.count, len(tiles)))
-    bands = len(work.placed[0].lines.references.panel) if work.placed else 1
-    one, parts = tile_bytes(tile_shape, bands), 0
-    if work.finer is not None:
-        times = work.grid.spacing_px // work.finer.spacing_px
-        part_shape = ROWS_OF_MEANS * times, tile_shape[1] * times
-        one += tile_bytes(part_shape, bands)
-        parts = cache_bytes(work.placed, plan_tiles(work.placed, work.camera, work.finer, part_shape), 2)
-
-    def lines(at_once: int) -> int:
-        """Raw lines that neighbours share: tiles, or parts of each tile of means, which is made a part at a time."""
-        return at_once * parts if work.finer else cache_bytes(work.placed, tiles, at_once)
-
-    budgets = (TileBudget(count, lines(1 if processes else count), one, processes) for count in range(most, 0, -1))
-    for budget in budgets:
+    for count in range(most, 0, -1):
+        one, lines = work.tile_memory(tiles, tile_shape, 1 if processes else count)
+        budget = TileBudget(count, lines, one, processes)
         if crew.elsewhere or budget.projected <= memory:
             return budget
-    least = budget
+    bands = len(work.placed[0].lines.references.panel) if work.placed else 1
     raise SettingsError(
-        f"projected memory {_mib(least.projected)} exceeds --memory {_mib(memory)}: one tile of {tile_shape[0]} x "
-        f"{tile_shape[1]} px and {bands} bands takes {_mib(one)}, the raw lines behind it {_mib(least.cache)}, "
+        f"projected memory {_mib(budget.projected)} exceeds --memory {_mib(memory)}: one tile of {tile_shape[0]} x "
+        f"{tile_shape[1]} px and {bands} bands takes {_mib(one)}, the raw lines behind it {_mib(lines)}, "
         f"{'each of two processes' if processes else 'the process itself'} {_mib(RESERVED_BYTES)}; give at least "
-        f"--memory {_mib(least.projected)}"
+        f"--memory {_mib(budget.projected)}"
     )
 
 

@@ -34,7 +34,6 @@ from storage.archive.staging import (
 DAY_S = 86400.0
 NOTHING: Mapping[str, int | str] = MappingProxyType({})
 IN_USE = "somebody is using the archive: run gc again when it is free"
-_MADE_AHEAD = "-mosaic"  # after the key: tiles that earlier versions made of a spool's lines while they came
 What = Literal["store", "files", "spool", "unfinished", "upload"]  # files: of a store that runs go on naming
 
 
@@ -131,7 +130,7 @@ def plan_clearance(
     spools = [
         Removal(f"spool/{path.name}", "spool", bytes_below(path), "its lines are published")
         for path in sorted((archive.root / "spool").glob("*"))
-        if path.name.removesuffix(_MADE_AHEAD) in published
+        if path.name in published
     ]
     return Clearance((*removals, *uploads, *spools, *_unfinished(archive.root)), kept, obstacle)
 
@@ -205,7 +204,7 @@ def _unfinished(root: Path) -> list[Removal]:
 
 def _lock_of(root: Path, uri: str, what: What) -> Path:
     path = Path(uri)
-    name = f"capture-{path.name.removesuffix(_MADE_AHEAD)}" if what == "spool" else f"{path.parent.name}-{path.stem}"
+    name = f"capture-{path.name}" if what == "spool" else f"{path.parent.name}-{path.stem}"
     return root / ".locks" / f"{name}.lock"
 
 
@@ -213,7 +212,7 @@ def _remove(archive: Archive, removal: Removal) -> bool:
     """Take one thing away; False where another process holds it."""
     path = archive.root / removal.uri
     if removal.what == "store":
-        return archive.discard(StageRef(path.parent.name, path.name, path), wait=False)
+        return archive.discard(StageRef(path.parent.name, path.name, path), wait=False, unnamed=True)
     if removal.what == "files":
         return archive.clear(StageRef(path.parent.name, path.name, path), wait=False)
     if removal.what == "upload":

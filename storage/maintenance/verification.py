@@ -7,8 +7,6 @@ is told which part it holds, and which chunks of it can no longer be read.
 from __future__ import annotations
 
 import itertools
-import json
-import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -16,62 +14,28 @@ from pathlib import Path
 from typing import Any, Literal
 
 import zarr
-from numcodecs.errors import UnknownCodecError  # type: ignore[import-untyped]
-from numcodecs.registry import codec_registry  # type: ignore[import-untyped]
 
+from pipeline.json_lines import read_checked
+from pipeline.rig.capture import JOURNAL
 from storage.archive.keys import without_manifest
 from storage.archive.lineage import Catalogue
 from storage.archive.manifests import (
     broken_files,
     cleared_from,
     extended_from,
-    is_sealed,
     listed_bytes,
     manifest_sha256,
-    packed_from,
     try_manifest,
 )
 from storage.archive.run_folders import unfinished_extensions
-from storage.archive.staging import MANIFEST_NAME, kind_of, read_plain
-from storage.arrays.layout import missing_codec
-from storage.maintenance.growing_checks import SPOOLS, growing_problems
+from storage.archive.staging import MANIFEST_NAME, NotPlainError, kind_of, read_plain
+from storage.arrays.fetched_files import SUMS, first_unlike
+from storage.arrays.spool import ENDING, spool_problems
 
 WORDS = {"y": "rows", "x": "columns", "line": "lines", "sample": "samples", "band": "bands", "patch": "patches"}
 MOST_NAMED = 3
+SPOOLS = "spool"
 _NO_ARRAY = (OSError, ValueError, KeyError, TypeError, IndexError, RecursionError)
-
-
-@dataclass(frozen=True)
-class Shard:
-    """One file of a Zarr v3 array: the array, and the indices that the file holds."""
-
-    array: Path
-    dims: tuple[str, ...]
-    shape: tuple[int, ...]
-    box: tuple[slice, ...]  # of the file
-    chunk: tuple[int, ...]  # what has a checksum of its own
-
-    def words(self, box: Sequence[slice]) -> str:
-        """Index ranges of a part of the array; a dimension of which it has everything is left out."""
-        ranges = [
-            f"{WORDS.get(dim, dim)} {part.start} to {part.stop - 1}"
-            for dim, size, part in zip(self.dims, self.shape, box, strict=True)
-            if part.stop - part.start < size
-        ]
-        return ", ".join(ranges) or "all of it"
-
-    def chunks(self) -> list[tuple[slice, ...]]:
-        """What the file is made of, cut to the array."""
-        steps = [
-            [slice(start, min(start + step, part.stop)) for start in range(part.start, part.stop, step)]
-            for part, step in zip(self.box, self.chunk, strict=True)
-        ]
-        return list(itertools.product(*steps))
-
-    def unreadable(self) -> list[tuple[slice, ...]]:
-        """Chunks that fail their checksum or cannot be decoded; all of them where the file's index is damaged."""
-        array: zarr.Array[Any] = zarr.open_array(self.array, mode="r", zarr_format=3)
-        return [box for box in self.chunks() if not _can_be_read(array, box)]
 
 
 def name_damage(store: Path, name: str) -> str:
@@ -79,88 +43,61 @@ def name_damage(store: Path, name: str) -> str:
 
     For example ``(values: rows 0 to 63, columns 0 to 639; unreadable: rows 32 to 63, columns 0 to 31)``.
     """
-    if any(path.is_symlink() for path in (store / name).parents if path.is_relative_to(store)):
+    file = store / name
+    inner = [path for path in file.parents if path.is_relative_to(store)]
+    folder = next((path for path in inner if path != store and kind_of(path / "zarr.json") == "a file"), None)
+    if folder is None or any(path.is_symlink() for path in inner):
         return ""
     try:
-        shard = find_shard(store, name)
-        if shard is None:
-            return ""
-        where = f"{shard.array.relative_to(store).as_posix()}: {shard.words(shard.box)}"
-        return f" ({where}{_damage_words(shard) if kind_of(store / name) == 'a file' else ''})"
-    except _NO_ARRAY:
+        array: zarr.Array[Any] = zarr.open_array(folder, mode="r", zarr_format=3)
+        numbers = [int(part) for part in file.relative_to(folder).parts[1:]]  # of c/0/3/0
+        sizes = zip(numbers, array.shards or array.chunks, array.shape, strict=True)
+        box = [slice(number * size, min((number + 1) * size, whole)) for number, size, whole in sizes]
+    except _NO_ARRAY:  # such as a store's own description
         return ""
+    where = f"{folder.relative_to(store).as_posix()}: {_words(array, box)}"
+    return f" ({where}{_unreadable(array, box) if kind_of(file) == 'a file' else ''})"
 
 
-def _damage_words(shard: Shard) -> str:
-    broken, count = shard.unreadable(), len(shard.chunks())
-    if count == 1:
+def _words(array: zarr.Array[Any], box: Sequence[slice]) -> str:
+    """Index ranges of a part of an array; a dimension of which it has everything is left out."""
+    dims = getattr(array.metadata, "dimension_names", None) or [f"axis {axis}" for axis in range(array.ndim)]
+    ranges = [
+        f"{WORDS.get(dim, dim)} {part.start} to {part.stop - 1}"
+        for dim, size, part in zip(dims, array.shape, box, strict=True)
+        if part.stop - part.start < size
+    ]
+    return ", ".join(ranges) or "all of it"
+
+
+def _unreadable(array: zarr.Array[Any], box: Sequence[slice]) -> str:
+    """Which chunks of a file cannot be decoded: all of them where the file's index is damaged."""
+    steps = [
+        [slice(start, min(start + step, part.stop)) for start in range(part.start, part.stop, step)]
+        for part, step in zip(box, array.chunks, strict=True)
+    ]
+    chunks = list(itertools.product(*steps))
+    broken = [chunk for chunk in chunks if not _can_be_read(array, chunk)]
+    if len(chunks) == 1:
         return ""
     if not broken:
         return "; every chunk of it can still be read"
-    if len(broken) == count:
+    if len(broken) == len(chunks):
         return "; none of its chunks can be read"
-    named = "; ".join(shard.words(box) for box in broken[:MOST_NAMED])
     more = f" and {len(broken) - MOST_NAMED} more" if len(broken) > MOST_NAMED else ""
-    return f"; unreadable: {named}{more}"
-
-
-def find_shard(store: Path, name: str) -> Shard | None:
-    """The part of an array that ``name``, a file of a store, holds; None where it is no array's file.
-
-    Raises OSError, ValueError, KeyError, TypeError, IndexError: the array's own description is damaged.
-    """
-    file = store / name
-    for array in file.parents:
-        if array == store or not array.is_relative_to(store):
-            return None
-        if kind_of(array / "zarr.json") == "a file":
-            break
-    about = json.loads(read_plain(array / "zarr.json"))
-    if about.get("node_type") != "array" or file == array / "zarr.json":
-        return None
-    shape = tuple(int(size) for size in about["shape"])
-    sizes = [int(size) for size in about["chunk_grid"]["configuration"]["chunk_shape"]]
-    numbers = _chunk_numbers(file.relative_to(array).as_posix(), len(shape))
-    box = tuple(
-        slice(number * size, min((number + 1) * size, whole))
-        for number, size, whole in zip(numbers, sizes, shape, strict=True)
-    )
-    dims = tuple(about.get("dimension_names") or (f"axis {axis}" for axis in range(len(shape))))
-    return Shard(array, dims, shape, box, _inner_chunk(about, sizes))
-
-
-def _chunk_numbers(name: str, dims: int) -> list[int]:
-    """Of ``c/0/3/0`` (or ``c.0.3.0``) the numbers."""
-    words = name.replace(".", "/").split("/")
-    if words[0] != "c" or len(words) != dims + 1:
-        raise ValueError(f"{name} is no chunk of {dims} dimensions")
-    return [int(word) for word in words[1:]]
-
-
-def _inner_chunk(about: dict[str, Any], sizes: list[int]) -> tuple[int, ...]:
-    for codec in about["codecs"]:
-        if codec["name"] == "sharding_indexed":
-            sizes = [int(size) for size in codec["configuration"]["chunk_shape"]]
-    if not all(size > 0 for size in sizes):
-        raise ValueError(f"chunks of {sizes}")
-    return tuple(sizes)
+    return f"; unreadable: {'; '.join(_words(array, chunk) for chunk in broken[:MOST_NAMED])}{more}"
 
 
 def _can_be_read(array: zarr.Array[Any], box: tuple[slice, ...]) -> bool:
-    """Whether one chunk decodes. Whatever a decoder says of damaged bytes, the answer is no (no codec: it raises)."""
-    if math.prod(part.stop - part.start for part in box) <= 0:
-        return True
+    """Whether one chunk decodes; whatever a decoder says of damaged bytes, the answer is no."""
     try:
         array[box]
-    except UnknownCodecError:
-        raise
     except Exception:
         return False
     return True
 
 
-ASIDE = ".aside"
-Kind = Literal["whole", "broken", "missing", "stray", "growing", "unreadable"]
+Kind = Literal["whole", "broken", "missing", "stray", "growing"]
 Progress = Callable[[str, float], None]  # address of what is being read, how far of all bytes, 0..1
 
 
@@ -170,7 +107,6 @@ class Finding:
 
     ``missing``: something names or rests on a store that is not there. ``stray``: what is no part of the archive.
     ``growing``: something of a spool that cannot be believed; the rest of it is used.
-    ``unreadable``: whole, but in a codec that is not installed.
     """
 
     uri: str
@@ -202,20 +138,16 @@ def verify_everything(
             catalogue = Catalogue.read(root)
             problems = list(read_again(path)) + list(_identity_problems(catalogue, uri))
         found += [Finding(uri, problem, "broken") for problem in problems]
-        if problems:
-            continue
-        store = catalogue.stores.get(uri)  # every byte is as published; whether its numbers can be read?
-        if store is None or not packed_from(store.facts) or "pcodec" in codec_registry:
+        if not problems:
             found.append(Finding(uri, None))
-        else:
-            words = missing_codec("every byte of it is as published, but it", "pcodec")
-            found.append(Finding(uri, words, "unreadable"))
     return [*found, *_misplaced(catalogue, root), *_missing(catalogue), *_broken_off(root), *verify_growing(root)]
 
 
 def verify_growing(root: Path) -> Iterator[Finding]:
     """Findings about spools and what lies beside them; none where all is as it was written."""
-    yield from (Finding(uri, problem, "growing") for uri, problem in growing_problems(root))
+    for folder in _inside(root / SPOOLS):
+        for problem in _spool_problems(folder):
+            yield Finding(f"{SPOOLS}/{folder.name}", problem, "growing")
     if kind_of(root / SPOOLS) not in (None, "a folder"):
         yield Finding(SPOOLS, f"is {kind_of(root / SPOOLS)}, expected a folder; take it out of the archive", "stray")
     for place, folders, files in os.walk(root / SPOOLS):
@@ -225,9 +157,32 @@ def verify_growing(root: Path) -> Iterator[Finding]:
                 yield Finding(uri, f"is {kind}, expected a file; take it out of the archive", "stray")
 
 
+def _spool_problems(folder: Path) -> Iterator[str]:
+    """What is not as it was written in the folder of a capture under way: lines, and the rig's files beside them."""
+    for path in (one for one in (*_inside(folder), *(file for inner in _inside(folder) for file in _inside(inner)))):
+        name = path.relative_to(folder).as_posix()
+        try:
+            if path.suffix == ENDING:
+                yield from spool_problems(path)
+            elif path.name == JOURNAL:
+                changed = [line.number for line in read_checked(read_plain(path)) if line.state == "changed"]
+                yield from (f"{name}: line {number} has changed since it was written" for number in changed)
+            elif name.endswith(SUMS) and (at := first_unlike(path.with_name(path.name.removesuffix(SUMS)))) is not None:
+                where = f"{name.removesuffix(SUMS)} is not as it was fetched from byte {at} on"
+                yield f"{where}; it is asked for again when the capture goes on"
+        except (FileNotFoundError, NotPlainError):
+            continue  # its lines are published; or it is a link and the like, which is told of every such thing
+        except OSError as error:
+            yield f"{name} cannot be read: {error.strerror}"
+
+
+def _inside(folder: Path) -> list[Path]:
+    return sorted(folder.iterdir()) if kind_of(folder) == "a folder" else []
+
+
 def _changed_since(catalogue: Catalogue, uri: str) -> bool:
     """Whether something was added to a run after the catalogue was read."""
-    run = next((run for run in catalogue.runs if run.uri == uri), None)
+    run = None if uri in catalogue.stores else next((run for run in catalogue.runs if run.uri == uri), None)
     return run is not None and extended_from(try_manifest(run.folder)[0]) != extended_from(run.facts)
 
 
@@ -249,14 +204,11 @@ def _identity_problems(catalogue: Catalogue, uri: str) -> Iterator[str]:
     stated = f"stages/{store.facts.get('stage')}/{store.facts.get('key')}"
     if stated != uri:
         yield f"its {MANIFEST_NAME} is that of {stated}; move it back, or take it out of the archive"
-    knowing = [run for run in catalogue.runs if uri in run.recorded]
-    if not knowing:
-        return
-    before = *packed_from(store.facts), *cleared_from(store.facts)
-    own = {manifest_sha256(store.ref.path), *before}
-    anew = is_sealed(store.facts) and all(store.created > run.sealed for run in knowing)
-    if not anew and not any(run.recorded[uri] in own for run in knowing):
-        yield f"its {MANIFEST_NAME} has changed since {knowing[-1].uri} was published (its SHA-256 differs)"
+    knowing = catalogue.recorded_by.get(uri, [])
+    own = {manifest_sha256(store.ref.path), *cleared_from(store.facts)} if knowing else set()
+    anew = all(store.created > run.sealed for run, _ in knowing)
+    if not anew and not any(sha256 in own for _, sha256 in knowing):
+        yield f"its {MANIFEST_NAME} has changed since {knowing[-1][0].uri} was published (its SHA-256 differs)"
 
 
 def _misplaced(catalogue: Catalogue, root: Path) -> Iterator[Finding]:
@@ -290,8 +242,6 @@ def _missing(catalogue: Catalogue) -> Iterator[Finding]:
 
 
 def _broken_off(root: Path) -> Iterator[Finding]:
-    for path in sorted((root / ASIDE).glob("*/*")):
-        yield Finding(path.relative_to(root).as_posix(), "a repair was broken off; run verify --repair again", "stray")
     for part in unfinished_extensions(root):
         words = "what was added to it lacks its last step, a name; any command that writes into the archive gives it"
         yield Finding(f"runs/{part.stem}", words, "stray")

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SettingsError
 from pipeline.geometry.grid import SceneGrid
+from pipeline.rectify.tiles import block_means
 from storage.arrays.layout import SHARD_ROWS
 from storage.arrays.mosaics import PATCHES_A_SHARD, MosaicWriter, PatchWriter
-from storage.arrays.tile_work import RESERVED_BYTES, Thumbnail, block_means
+from storage.arrays.tile_work import RESERVED_BYTES, Thumbnail
 
 COPIES = 6  # of a block while it is read: the file's numbers, their float32, and what is made of them
 SHARE = 4  # of the memory beside what the process takes anyway: more at once is read no faster

@@ -1,39 +1,52 @@
 """An archive in a bucket: the same stores, keys and runs, worked on in a folder of this machine.
 
-What is captured and made is published in the working copy first, as in any archive, then uploaded; a conditional put of
-the manifest publishes it for everybody: whoever comes first wins, for ever, and others take what stands. Stores made
-elsewhere are found by their manifests, and fetched when somebody asks where they lie. Where the bucket stops answering,
-work goes on in the working copy, and the next run uploads what waits there. All of the working copy that is in the
-bucket may be deleted at any time while nobody works on it.
+A store's or run's manifest has the same address in the bucket; its files lie below ``<address>/<attempt>/``, the
+attempt being the beginning of the SHA-256 of the manifest that lists them: two writers never mix theirs. A store is
+published in the working copy first, then uploaded; a conditional put of its manifest, last, publishes it for everybody:
+whoever comes first wins, for ever, and others take what stands. Files are fetched when somebody asks where they lie.
+
+What was made is kept in the working copy where the bucket stops answering, and the same command uploads it. All of the
+working copy that is in the bucket may be deleted at any time while nobody works on it.
 """
 
 from __future__ import annotations
 
-import logging
+import hashlib
+import os
+import re
 import secrets
-from collections.abc import Callable, Iterable, Iterator
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Any, TypeVar
+from tempfile import TemporaryDirectory
+from typing import Any
 
-from pipeline.errors import ArchiveError
+from pipeline.errors import ArchiveError, IncompleteStoreError
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef, in_text, open_folder, store_at
-from storage.archive.manifests import check_files, is_cleared, read_manifest
+from storage.archive.manifests import (
+    check_files,
+    extended_from,
+    is_cleared,
+    parse_manifest,
+    read_manifest,
+    try_manifest,
+)
+from storage.archive.records import RECEIPT, read_run
 from storage.archive.run_folders import RunDraft
-from storage.archive.staging import refusals
-from storage.remote.object_checks import Lease, find_leftovers, find_lost_runs, take_lease
-from storage.remote.object_copies import KNOWN, WorkingCopy
-from storage.remote.object_stores import Objects, UnreachableError, connect, parse_place
-from storage.remote.object_transfers import BEGUN
+from storage.archive.staging import MANIFEST_NAME, is_name, refusals, remove_tree, rename_into_place, retire, sync_path
+from storage.maintenance.verification import Finding, Progress, name_damage, verify_everything
+from storage.remote.object_stores import Listed, Objects, parse_place, some_at_a_time
 
 MARK = "archive.json"  # at the prefix: here is an archive
 MARK_TEXT = b'{"archive": "spectralzoom", "layout": 1}\n'
-Result = TypeVar("Result")
-
-log = logging.getLogger(__name__)
+ATTEMPT = re.compile(r"((?:stages/[^/]+|runs)/[^/]+)/([0-9a-f]{16})/.+")  # a file's address, and its upload
+ASIDE = ".fetch-"  # begins the names of folders of the working copy for what is not whole yet
+DAY_S = 86400.0
+UPLOAD_S = 3600.0  # the files of a run that lie there so long without a manifest are no upload under way
 
 
 class ObjectArchive(Archive):
@@ -43,9 +56,9 @@ class ObjectArchive(Archive):
 
     def __init__(self, root: Path, objects: Objects, *, writes: bool = True) -> None:
         super().__init__(root, writes=writes)
-        self.objects, self.copy = objects, WorkingCopy(root, objects)
-        self.trouble: UnreachableError | None = None  # why nothing is asked of the bucket any more
-        self._lease: Lease | None = None
+        self.objects = objects
+        self._standing: dict[str, bytes] = {}  # manifests found in the bucket since this was opened
+        self._later_runs: set[Path] = set()  # that were published since it was mirrored first
 
     @property
     def name(self) -> str:
@@ -57,159 +70,158 @@ class ObjectArchive(Archive):
         """The folder in which the user works: there is none around a bucket."""
         return Path.cwd()
 
-    # --- stages -------------------------------------------------------------------------------------------------------
+    # --- stores -------------------------------------------------------------------------------------------------------
 
     def ref(self, stage: str, key: str) -> StageRef:
         """Address of a store, whether it is there or not; its path fetches it."""
-        plain = store_at(self.root, stage, key)
-        return RemoteRef(stage, key, plain.path, self.copy.fetch)
+        return RemoteRef(stage, key, store_at(self.root, stage, key).path, self._fetch)
 
     def find(self, stage: str, key: str) -> StageRef | None:
-        """The published store, or None: here, or in the bucket, unless its files were cleared away.
+        """The published store, or None, also where its files were cleared away; what waits here is uploaded.
 
-        What waits here for its upload is uploaded.
-
-        Raises IncompleteStoreError: it is there, but its manifest is damaged, or a file that is nowhere else.
+        Raises IncompleteStoreError: its manifest in the bucket is damaged.
         """
         ref = self.ref(stage, key)
-        folder = self.root / ref.uri
-        if not self.copy.is_whole(ref.uri) and not self._while_answering(lambda: self.copy.look_up(ref.uri), False):
-            if not folder.exists() or self.copy.is_known(ref.uri):  # cleared away there, or not to be had now
+        whole = self._is_whole(ref.uri)
+        if ref.uri not in self._standing and not self._look_up(ref.uri, keep=whole):
+            if not whole:
                 return None
-            check_files(folder, hashes=False)
-        if is_cleared(read_manifest(folder)):
-            return None
-        self._send(ref.uri)
-        return ref
-
-    def _send(self, uri: str) -> None:
-        """Upload a store that waits; within `in_use` a bucket that does not answer is told of at the end of it."""
-        if self.writes and not self.copy.is_known(uri):
-            self._while_answering(lambda: self.copy.send(uri), None)
-
-    def _put_in_place(self, part: Path, final: Path) -> None:
-        uri = final.relative_to(self.root).as_posix()
-        self.copy.put_in_place(part, uri)
-        self._send(uri)
-        if self._lease is not None:
-            self._while_answering(self._lease.renew, None)
+            if self.writes:
+                self._send(ref.uri)
+        return None if is_cleared(read_manifest(self.root / ref.uri)) else ref
 
     def manifest_hashes(self, refs: Iterable[StageRef]) -> dict[str, str]:
         """`manifest_hash` by address, of stores and of all they rest on, each of which is in the bucket then."""
         given = list(refs)
-        hashes = super().manifest_hashes(given)
-        self._while_answering(lambda: self.copy.ensure(hashes), None)
+        self._ensure(super().manifest_hashes(given))
         return super().manifest_hashes(given)
 
     def locate(self, address: str) -> Path:
         """Where on this machine a product lies by its address relative to the archive; fetched if need be."""
-        self.copy.fetch(in_text(address) or "/".join(address.split("/")[:2]))
+        self._fetch(in_text(address) or "/".join(address.split("/")[:2]))
         return super().locate(address)
 
-    def discard(self, ref: StageRef, *, wait: bool = True) -> bool:
-        """Take one store away for good, here and in the bucket."""
+    def discard(self, ref: StageRef, *, wait: bool = True, unnamed: bool = False) -> bool:
+        """Take one store away for good, here and in the bucket; see `Archive.discard`.
+
+        Its manifest goes first. With ``unnamed`` it comes back where a run that names it has been published since this
+        archive was opened; whoever publishes a run looks for its stores after that.
+        """
+        manifest = f"{ref.uri}/{MANIFEST_NAME}"
+        standing = self.objects.read(manifest)
+        self.objects.remove([manifest])
+        if unnamed:
+            self._mirror_runs()
+            if any(ref.uri in read_run(folder, {}).recorded for folder in self._later_runs):
+                if standing is not None:
+                    self.objects.create(manifest, standing)
+                return False
+        self._standing.pop(ref.uri, None)
         gone = super().discard(store_at(self.root, ref.stage, ref.key), wait=wait)
         if gone:
-            self.copy.remove(ref.uri)
+            self.objects.remove(self.objects.listing(ref.uri))
+        elif standing is not None:
+            self.objects.create(manifest, standing)
         return gone
 
     def clear(self, ref: StageRef, *, wait: bool = True) -> bool:
         """Take a store's files away, here and in the bucket; see `Archive.clear`."""
-        self.copy.ensure([ref.uri])
+        self._ensure([ref.uri])
         cleared = super().clear(store_at(self.root, ref.stage, ref.key), wait=wait)
         if cleared:
-            self.copy.send_cleared(ref.uri)
+            self._upload(ref.uri, first=False)
         return cleared
 
-    @contextmanager
-    def in_use(self, *, alone: bool = False) -> Iterator[bool]:
-        """Keep others, on other machines too, from clearing stores away while the block runs.
-
-        Raises UnreachableError: at the end, where the bucket stopped answering: all is kept here, and what to do is
-        said.
-        """
-        with super().in_use(alone=alone) as free:
-            lease = self._take_lease(alone=alone) if free and self.trouble is None else None
-            outer, self._lease = self._lease, lease or self._lease
-            try:
-                if alone and lease is not None:  # what others have published since this was opened counts
-                    self.copy.forget_all_but(self.copy.mirror())
-                yield free and (lease is not None or (self.trouble is not None and not alone))
-            finally:
-                self._lease = outer
-                if lease is not None:
-                    with suppress(UnreachableError):
-                        lease.end()
-        if self.trouble is not None:
-            raise UnreachableError(
-                f"{self.trouble}; what was made is kept in {self.root}: the same command uploads it and goes on",
-                passing=self.trouble.passing,
-            )
-
-    def _take_lease(self, *, alone: bool) -> Lease | None:
-        with refusals(self.root, "write to the working copy"):
-            try:
-                return take_lease(self.objects, self.root, alone=alone)
-            except UnreachableError as error:
-                if alone or not error.passing:
-                    raise
-                self.go_on_without(error)
-                return None
-
-    def go_on_without(self, error: UnreachableError) -> None:
-        """Ask nothing of the bucket any more, but work on in the working copy."""
-        self.trouble = error
-        log.warning("%s; going on in %s", error, self.root)
-
-    def _while_answering(self, work: Callable[[], Result], otherwise: Result) -> Result:
-        """Do what needs the bucket; while the archive is in use, go on without it once it does not answer."""
-        if self.trouble is not None:
-            return otherwise
+    def restore(self, uri: str) -> bool:
+        """Write a broken store or run of the bucket again, if the working copy has it as it was published."""
+        folder = self.root / uri
+        standing = self.objects.read(f"{uri}/{MANIFEST_NAME}")
+        manifest, problem = try_manifest(folder)
+        if problem is not None or is_cleared(manifest):
+            return False
+        if standing not in (None, (folder / MANIFEST_NAME).read_bytes()) and parse_manifest(standing)[1] is None:
+            return False  # another machine has made it anew since
         try:
-            return work()
-        except UnreachableError as error:
-            if self._lease is None:
-                raise
-            self.go_on_without(error)
-            return otherwise
+            self._fetch_files(uri)
+            check_files(folder, hashes=True)
+        except IncompleteStoreError:
+            return False
+        self.objects.remove(self.objects.listing(uri))
+        self._upload(uri, first=True)
+        return True
 
-    def now(self) -> datetime:
-        """Time by the clock that dates the objects, as far as a lease tells it."""
-        return super().now() if self._lease is None or self._lease.taken is None else self._lease.taken
-
-    def catch_up(self, *, send: bool, mirror: bool) -> None:
-        """Upload what waits here where ``send``; bring manifests and receipts, and forget what is gone, where asked."""
-        if send and self.copy.waiting():
-            with self.in_use():  # or gc elsewhere may take what of it is there for an upload that was broken off
-                self.copy.send_waiting()
-        if mirror:
-            found = self.copy.mirror()
-            with super().in_use(alone=True) as free:
-                if free:  # or somebody here may be reading what would be forgotten
-                    self.copy.forget_all_but(found)
+    def drop_run(self, uri: str) -> None:
+        """Take a damaged run away, here and in the bucket."""
+        super().drop_run(uri)
+        self.objects.remove(self.objects.listing(uri))
 
     # --- runs ---------------------------------------------------------------------------------------------------------
 
     def _begin_run(self, run_id: str) -> RunDraft | None:
-        claim = secrets.token_hex(8).encode()
-        standing = self._while_answering(lambda: self.objects.claim(f"runs/{run_id}/{BEGUN}", claim), None)
-        if self.trouble is not None:  # a name that nobody else takes meanwhile
-            run_id = f"{run_id}-{claim.decode()}"
-        elif standing != claim:  # another machine began a run of this name
-            return None
-        return self._sending(super()._begin_run(run_id))
+        return self._sending(super()._begin_run(f"{run_id}-{secrets.token_hex(3)}"))  # which no other machine takes
 
     def extend_run(self, run_id: str, *, wait: bool = True) -> RunDraft | None:
         """Begin to add to a run that is published here or in the bucket; see `Archive.extend_run`."""
         return self._sending(super().extend_run(run_id, wait=wait))
 
     def _sending(self, draft: RunDraft | None) -> RunDraft | None:
-        """Have a run uploaded once it is published in the working copy."""
+        """Have a run uploaded once it is published in the working copy, and then look for its stores once more."""
+
+        def send(uri: str) -> None:
+            self._upload(uri, first=draft is not None and not draft.extends)
+            recorded = read_run(self.root / uri, {}).recorded
+            self._standing = {one: text for one, text in self._standing.items() if one not in recorded}
+            self._ensure(recorded)
+
         if draft is not None:
-            draft.send = lambda uri: self._while_answering(lambda: self.copy.send_run(uri), None)
+            draft.send = send
         return draft
 
-    # --- verification and clearing up ---------------------------------------------------------------------------------
+    def send_runs(self) -> None:
+        """Upload the runs, and what was added to some, that a command which was killed could not upload."""
+        there = _manifests(self.objects.listing("runs"))
+        for uri in (f"runs/{folder.name}" for folder in self.runs() if try_manifest(folder)[1] is None):
+            if uri not in there:
+                self._ensure(read_run(self.root / uri, {}).recorded)
+                self._upload(uri, first=True)
+            elif not self._is_dated(uri, there[uri]) and self._has_more(uri):
+                self._upload(uri, first=False)
+
+    def _has_more(self, uri: str) -> bool:
+        """Whether a run here is that of the bucket once something was added to it."""
+        standing = self.objects.read(f"{uri}/{MANIFEST_NAME}") or b""
+        return hashlib.sha256(standing).hexdigest() in extended_from(read_manifest(self.root / uri))
+
+    # --- the whole of it ----------------------------------------------------------------------------------------------
+
+    def mirror(self) -> None:
+        """Bring the manifests of all stores, and the runs with their receipts."""
+        stages = [f"stages/{stage}" for stage in self.objects.children("stages")]
+        found = [f"{folder}/{key}" for folder in stages for key in self.objects.children(folder)]
+        with refusals(self.root, "write to the working copy"):
+            some_at_a_time(self._bring, [uri for uri in found if not (self.root / uri / MANIFEST_NAME).is_file()])
+            self._mirror_runs()
+        self._later_runs.clear()
+
+    def _mirror_runs(self) -> None:
+        """Bring the runs that are new in the bucket, or that something was added to, with their receipts."""
+        found = _manifests(self.objects.listing("runs"))
+        changed = [uri for uri, one in found.items() if not self._is_dated(uri, one)]
+        some_at_a_time(self._bring, changed)
+        self._later_runs |= {self.root / uri for uri in changed}
+
+    def _bring(self, uri: str) -> None:
+        with suppress(IncompleteStoreError):  # whoever reads it says so
+            if _is_address(uri) and self._look_up(uri) and uri.startswith("runs/"):
+                self._fetch_files(uri, [RECEIPT])
+
+    def now(self) -> datetime:
+        """Time by the clock that dates the objects, rounded up: it tells whole seconds."""
+        if not self.writes:
+            return super().now()
+        self.objects.write(".now", b"")
+        dated = self.objects.read_dated(".now")
+        return super().now() if dated is None else dated[1] + timedelta(seconds=1)
 
     def size_of(self, uri: str) -> int:
         """Bytes of all objects of a store."""
@@ -218,51 +230,307 @@ class ObjectArchive(Archive):
     def lost_runs(self) -> list[str]:
         """Addresses of runs in the bucket of which there are files, but no manifest, neither there nor here."""
         here = {f"runs/{folder.name}" for folder in self.runs()}
-        return [uri for uri in find_lost_runs(self.objects.listing("runs")) if uri not in here]
+        return [uri for uri in _lost_runs(self.objects.listing("runs")) if uri not in here]
 
     def leftovers(self, keep_days: float) -> dict[str, int]:
-        """What was broken off and has been in the bucket for ``keep_days``: address and bytes."""
-        return find_leftovers(self.objects, keep_days)
+        """Files in the bucket that no manifest publishes, older than ``keep_days``: folder and bytes."""
+        there = self.objects.listing()
+        latest = max((one.changed for one in there.values()), default=None)
+        uploads: dict[str, list[Listed]] = {}
+        for path, one in there.items():
+            if (found := ATTEMPT.fullmatch(path)) and found[1] not in _lost_runs(there):
+                uploads.setdefault(f"{found[1]}/{found[2]}", []).append(one)
+        old: dict[str, int] = {}
+        for folder, files in sorted(uploads.items()):
+            assert latest is not None
+            if (latest - max(one.changed for one in files)).total_seconds() >= keep_days * DAY_S:
+                uri = folder.rpartition("/")[0]
+                text = self.objects.read(f"{uri}/{MANIFEST_NAME}")
+                if text is None or _files_at(uri, text) != folder:
+                    old[folder] = sum(one.size for one in files)
+        return old
 
     def drop_leftover(self, uri: str) -> None:
         """Remove one of `leftovers`."""
         self.objects.remove(self.objects.listing(uri))
+
+    def verify_everything(self, progress: Progress | None = None) -> list[Finding]:
+        """Check every store and run in the bucket; nothing is taken from the working copy but what grows there."""
+        there = self.objects.listing()
+        with TemporaryDirectory(prefix="spectralzoom-verify-") as named, refusals(Path(named), "read manifests into"):
+            root = Path(named)
+            (root / "stages").mkdir()
+            some_at_a_time(lambda uri: _lay_out(self.objects, root, uri), _manifests(there))
+
+            def problems(folder: Path) -> Iterator[str]:
+                uri, text = folder.relative_to(root).as_posix(), (folder / MANIFEST_NAME).read_bytes()
+                found = list(_problems(self.objects, there, folder, _files_at(uri, text)))
+                if found and self.objects.read(f"{uri}/{MANIFEST_NAME}") == text:  # else it has gone, or was made anew
+                    yield from found
+
+            found = verify_everything(root, progress, problems)
+        words = f"{MANIFEST_NAME} is missing, or its upload was broken off"
+        return [*found, *(Finding(uri, words, "broken") for uri in _lost_runs(there))]
+
+    # --- the working copy ---------------------------------------------------------------------------------------------
+
+    def _put_in_place(self, part: Path, final: Path) -> None:
+        uri = final.relative_to(self.root).as_posix()
+        with self._locked(f"copy-{uri.replace('/', '-')}"):
+            if self._is_whole(uri):  # brought from the bucket meanwhile
+                remove_tree(part)
+            else:
+                retire(final)
+                rename_into_place(part, final)
+        self._send(uri)
+
+    def _is_whole(self, uri: str) -> bool:
+        """Whether all of a store is here, by its manifest and the sizes of its files; no, where those were cleared."""
+        manifest, problem = try_manifest(self.root / uri)
+        return problem is None and not is_cleared(manifest) and not self._lacks(uri, manifest)
+
+    def _lacks(self, uri: str, manifest: Mapping[str, Any]) -> list[str]:
+        return [name for name, one in manifest["files"].items() if _size(self.root / uri / name) != one["size"]]
+
+    def _is_dated(self, uri: str, listed: Listed) -> bool:
+        """Whether the manifest here has size and date of an object, as one has that was brought from the bucket."""
+        path = self.root / uri / MANIFEST_NAME
+        return _size(path) == listed.size and int(path.stat().st_mtime) == int(listed.changed.timestamp())
+
+    def _look_up(self, uri: str, *, keep: bool = False) -> bool:
+        """Whether a manifest stands in the bucket, which is here then; of one that was cleared no, to ``keep`` ours.
+
+        Raises IncompleteStoreError: it is damaged.
+        """
+        dated = self.objects.read_dated(f"{uri}/{MANIFEST_NAME}")
+        if dated is None or (keep and is_cleared(parse_manifest(dated[0])[0])):
+            return False
+        if parse_manifest(dated[0])[1] is None or try_manifest(self.root / uri)[1] is not None:
+            self._lay(uri, *dated)  # else what has rotted in the bucket would take the place of what is whole here
+        read_manifest(self.root / uri)
+        self._standing[uri] = dated[0]
+        return True
+
+    def _lay(self, uri: str, manifest: bytes, changed: datetime) -> None:
+        """Have a manifest here, with the date of its object; files that it lists otherwise than before go."""
+        folder = self.root / uri
+        with self._locked(f"copy-{uri.replace('/', '-')}"), self._aside() as aside:
+            before, problem = try_manifest(folder)
+            made = aside / folder.name
+            made.mkdir()
+            (made / MANIFEST_NAME).write_bytes(manifest)
+            os.utime(made / MANIFEST_NAME, (changed.timestamp(), changed.timestamp()))
+            sync_path(made / MANIFEST_NAME)
+            if problem is None and before["files"] == parse_manifest(manifest)[0].get("files"):
+                (made / MANIFEST_NAME).replace(folder / MANIFEST_NAME)
+                sync_path(folder)
+            else:
+                folder.parent.mkdir(parents=True, exist_ok=True)
+                retire(folder)
+                made.rename(folder)
+            sync_path(folder.parent)
+
+    @contextmanager
+    def _aside(self) -> Iterator[Path]:
+        """Give a folder of the working copy for what is not whole yet; a disk that refuses says so in words."""
+        with (
+            refusals(self.root, "write to the working copy"),
+            TemporaryDirectory(prefix=ASIDE, dir=self.root, ignore_cleanup_errors=True) as named,
+        ):
+            yield Path(named)
+
+    def _fetch(self, uri: str) -> None:
+        """Have a store or run here whole; of one of which nothing is known, a reader says what it finds.
+
+        Raises IncompleteStoreError: an object of it is missing or has changed, or all of it was removed since.
+        """
+        if not (self.root / uri / MANIFEST_NAME).is_file() or not self._lacks(uri, read_manifest(self.root / uri)):
+            return
+        try:
+            self._fetch_files(uri)
+        except IncompleteStoreError:
+            ours = (self.root / uri / MANIFEST_NAME).read_bytes()
+            if not self._look_up(uri):
+                self._standing.pop(uri, None)
+                raise self._removed(uri) from None
+            if (self.root / uri / MANIFEST_NAME).read_bytes() == ours:
+                raise
+            self._fetch_files(uri)  # cleared away, and made again since
+
+    def _fetch_files(self, uri: str, only: Iterable[str] | None = None) -> None:
+        """Bring the files that are not here (of ``only`` these names), each checked by its hash."""
+        folder = self.root / uri
+        manifest = read_manifest(folder)
+        place = _files_at(uri, (folder / MANIFEST_NAME).read_bytes())
+        lacking = [name for name in self._lacks(uri, manifest) if only is None or name in only]
+
+        with self._aside() as aside:
+
+            def fetch(name: str) -> None:
+                sha256 = manifest["files"][name]["sha256"]
+                self.objects.fetch(f"{place}/{name}", folder / name, sha256, aside / secrets.token_hex(8))
+
+            some_at_a_time(fetch, lacking)
+
+    def _send(self, uri: str) -> None:
+        """Upload what is published here; where another came first, take that one, unless its files were cleared away.
+
+        Raises IncompleteStoreError: a file of it is not as it was published.
+        """
+        dated = self.objects.read_dated(f"{uri}/{MANIFEST_NAME}")
+        if dated is None or is_cleared(parse_manifest(dated[0])[0]):
+            self._upload(uri, first=dated is None)
+        else:
+            self._lay(uri, *dated)
+            self._standing[uri] = dated[0]
+
+    def _upload(self, uri: str, *, first: bool) -> None:
+        """Upload a folder's files, then its manifest; where that is not the ``first``, what stands is replaced."""
+        folder, objects = self.root / uri, self.objects
+        text, files = (folder / MANIFEST_NAME).read_bytes(), read_manifest(folder)["files"]
+        check_files(folder, hashes=True)
+        place, there = _files_at(uri, text), objects.listing(uri)
+        waiting = [name for name, one in files.items() if _listed_size(there, f"{place}/{name}") != one["size"]]
+        some_at_a_time(lambda name: objects.write(f"{place}/{name}", folder / name), waiting)
+        if not first:
+            objects.write(f"{uri}/{MANIFEST_NAME}", text)
+            objects.remove([path for path in there if ATTEMPT.fullmatch(path) and not path.startswith(f"{place}/")])
+        elif not objects.create(f"{uri}/{MANIFEST_NAME}", text):
+            self._look_up(uri)  # whoever came first; or it was this upload, of which the answer was lost
+            return
+        self._standing[uri] = text
+        if uri.startswith("runs/") and (dated := objects.read_dated(f"{uri}/{MANIFEST_NAME}")) is not None:
+            self._lay(uri, *dated)  # by its date it is known as what stands
+
+    def _ensure(self, uris: Iterable[str]) -> None:
+        """See that stores stand in the bucket as they are known here; those that do not are uploaded.
+
+        Raises IncompleteStoreError: one is neither in the bucket nor whole here.
+        """
+
+        def ensure(uri: str) -> None:
+            whole = self._is_whole(uri)
+            if uri in self._standing or self._look_up(uri, keep=whole):
+                return
+            if not whole:
+                raise self._removed(uri)
+            self._send(uri)
+
+        some_at_a_time(ensure, list(uris))
+
+    def _removed(self, uri: str) -> IncompleteStoreError:
+        return IncompleteStoreError(f"{self.name}/{uri} was removed meanwhile; run again, and it is made again")
+
+
+def _is_address(uri: str) -> bool:
+    """Whether an object's name can be an address in an archive: what a bucket lists is not trusted."""
+    return all(is_name(part) for part in uri.split("/"))
+
+
+def _files_at(uri: str, manifest: bytes) -> str:
+    """Address of the files that a manifest lists."""
+    return f"{uri}/{hashlib.sha256(manifest).hexdigest()[:16]}"
+
+
+def _manifests(there: Mapping[str, Listed]) -> dict[str, Listed]:
+    """What is published, by address."""
+    depths = {"stages": 4, "runs": 3}
+    named = {path.removesuffix(f"/{MANIFEST_NAME}"): one for path, one in there.items() if _ends(path)}
+    return {uri: one for uri, one in named.items() if depths.get(uri.split("/")[0]) == uri.count("/") + 2}
+
+
+def _ends(path: str) -> bool:
+    return path.endswith(f"/{MANIFEST_NAME}") and _is_address(path)
+
+
+def _lost_runs(there: Mapping[str, Listed]) -> list[str]:
+    """Runs of which there are files, but no manifest, and that are not about to be uploaded."""
+    files = {path: found[1] for path in there if path.startswith("runs/") and (found := ATTEMPT.fullmatch(path))}
+    latest = max((one.changed for one in there.values()), default=None)
+    old = {uri for path, uri in files.items() if latest and (latest - there[path].changed).total_seconds() >= UPLOAD_S}
+    return sorted(uri for uri in old if f"{uri}/{MANIFEST_NAME}" not in there and _is_address(uri))
+
+
+def _lay_out(objects: Objects, root: Path, uri: str) -> None:
+    """Write the manifest of what is published at an address, and of a run the receipt, damaged or not."""
+    text = objects.read(f"{uri}/{MANIFEST_NAME}")
+    if text is None:
+        return
+    (root / uri).mkdir(parents=True)
+    (root / uri / MANIFEST_NAME).write_bytes(text)
+    if uri.startswith("runs/") and (receipt := objects.read(f"{_files_at(uri, text)}/{RECEIPT}")) is not None:
+        (root / uri / RECEIPT).write_bytes(receipt)
+
+
+def _problems(objects: Objects, there: Mapping[str, Listed], folder: Path, place: str) -> Iterator[str]:
+    """What is wrong with one published folder, whose files lie at ``place``, object by object."""
+    manifest, problem = try_manifest(folder)
+    if problem is not None:
+        yield f"{MANIFEST_NAME} cannot be believed: {problem}"
+        return
+    for name, entry in manifest["files"].items():
+        problem = _object_problem(objects, there, f"{place}/{name}", entry)
+        if problem is None:
+            continue
+        about = [f"{parent.as_posix()}/zarr.json" for parent in Path(name).parents if parent != Path()]
+        for one in (name, *about):  # which part of an array it is, and which of its chunks can be read
+            try:
+                objects.save(f"{place}/{one}", folder / one)
+            except FileNotFoundError:
+                (folder / one).unlink(missing_ok=True)
+        yield f"{name} {problem}{name_damage(folder, name)}"
+    extra = {path.removeprefix(f"{place}/") for path in there if path.startswith(f"{place}/")} - set(manifest["files"])
+    yield from (f"{name} is not in the manifest: take it out of the archive" for name in sorted(extra))
+
+
+def _object_problem(objects: Objects, there: Mapping[str, Listed], name: str, entry: Mapping[str, Any]) -> str | None:
+    size = _listed_size(there, name)
+    if size not in (None, entry["size"]):
+        return f"has {size} bytes, expected {entry['size']}"
+    try:
+        same = size is not None and objects.measure(name) == entry["sha256"]
+    except FileNotFoundError:
+        size = None
+    if size is None:
+        return "cannot be read: it is missing"
+    return None if same else "has changed since it was published (its SHA-256 differs)"
+
+
+def _listed_size(there: Mapping[str, Listed], name: str) -> int | None:
+    return there[name].size if name in there else None
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return -1
 
 
 def open_object_archive(text: str | Path, *, create: bool = True, write: bool = True) -> ObjectArchive:
     """Open the archive at ``s3://bucket/prefix``, or begin it where ``create``.
 
     Without ``create`` all manifests and receipts are brought, for verbs that read the whole of it. Raises
-    SettingsError: the address is none. UnreachableError: the bucket refuses, or does not answer and there is no working
-    copy to go on with. ArchiveError: there is no archive, the store has no conditional puts, or the working copy cannot
-    be written.
+    SettingsError: the address is none. UnreachableError: the bucket refuses, or does not answer. ArchiveError: there is
+    no archive, the store has no conditional puts, or the working copy cannot be written.
     """
     place = parse_place(text)
-    root, objects = place.working_copy(), Objects(place, connect(place))
-    archive = ObjectArchive(root, objects, writes=write)
-    can_go_on = create and write and (root / KNOWN).is_dir()
-    try:
-        _find_mark(objects, create=create)
-        _open_working_copy(root)
-        archive.catch_up(send=write, mirror=not create)
-    except UnreachableError as error:
-        if not (can_go_on and error.passing):
-            raise
-        _open_working_copy(root)
-        archive.go_on_without(error)
+    archive = ObjectArchive(place.working_copy(), Objects(place), writes=write)
+    _find_mark(archive.objects, create=create)
+    open_folder(archive.root, create=True, write=True)
+    for old in archive.root.glob(f"{ASIDE}*"):  # of a process that was killed
+        if time.time() - old.stat().st_mtime > DAY_S:
+            remove_tree(old)
+    if write:
+        archive.send_runs()
+    if not create:
+        archive.mirror()
     return archive
-
-
-def _open_working_copy(root: Path) -> None:
-    open_folder(root, create=True, write=True)
-    with refusals(root, "write to the working copy"):
-        (root / KNOWN).mkdir(exist_ok=True)
 
 
 def is_object_archive(text: str | Path) -> bool:
     """Whether there is an archive at ``s3://bucket/prefix`` (UnreachableError: that cannot be told)."""
-    place = parse_place(text)
-    return Objects(place, connect(place)).read(MARK) is not None
+    return Objects(parse_place(text)).read(MARK) is not None
 
 
 def _find_mark(objects: Objects, *, create: bool) -> None:

@@ -1,8 +1,7 @@
 """An archive's place in a bucket, and its objects: read, written, listed and removed, each of them as a whole.
 
 How the bucket is reached stands in the environment, as for any S3 client: AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY,
-AWS_REGION, AWS_ENDPOINT_URL. SPECTRALZOOM_WORK names the folder of working copies. What was asked and moved is counted,
-so that a rerun can show that it was nothing.
+AWS_REGION, AWS_ENDPOINT_URL. SPECTRALZOOM_WORK names the folder of working copies.
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -28,7 +26,6 @@ if TYPE_CHECKING:
 
 AT_ONCE = 8  # objects on their way
 PART_BYTES = 8 << 20  # of a large object's parts, and of what is held of it
-_TRIES = 3
 RETRIES = 6  # of one request, after waits that grow up to threefold: some ten seconds in all
 BACKOFF: BackoffConfig = {"init_backoff": timedelta(seconds=0.5), "max_backoff": timedelta(seconds=8), "base": 3}
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
@@ -54,18 +51,12 @@ _MEANINGS = {  # what a store's answer begins with or holds -> what it means and
     "501 Not Implemented": "it lacks what an archive needs (conditional puts, listing): use another store",
     "status code: 5": "it has trouble of its own, or is asked too much: run again later",
 }
-_PASSING = ("error sending request", "timed out", "response body error", "status code: 5")
-
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
 class UnreachableError(ArchiveError):
-    """A bucket that refuses, or does not answer. ``passing``: it may answer later, with nothing changed here."""
-
-    def __init__(self, message: str, *, passing: bool = False) -> None:
-        super().__init__(message)
-        self.passing = passing
+    """A bucket that refuses, or does not answer."""
 
 
 @dataclass(frozen=True)
@@ -176,8 +167,7 @@ def answers_of(place: ObjectPlace) -> Iterator[None]:
         if "invalid path" in text:
             meaning += "; take it out of the bucket: nothing in an archive is called so"
         at = "" if place.endpoint is None else f" at {place.endpoint}"
-        passing = any(sign in text for sign in _PASSING) and "501 Not" not in text
-        raise UnreachableError(f"{place.url}{at}: {meaning}", passing=passing) from error
+        raise UnreachableError(f"{place.url}{at}: {meaning}") from error
 
 
 def _first_line(error: BaseException) -> str:
@@ -192,24 +182,14 @@ class Listed:
     changed: datetime
 
 
-@dataclass
-class Traffic:
-    """Requests made (a part of a large object is not counted on its own) and bytes of content moved."""
-
-    requests: int = 0
-    sent: int = 0
-    received: int = 0
-
-
 class Objects:
     """The objects of one place; names are relative to it.
 
     Every method raises UnreachableError where the bucket refuses or does not answer.
     """
 
-    def __init__(self, place: ObjectPlace, store: S3Store) -> None:
-        self.place, self.store, self.traffic = place, store, Traffic()
-        self._counting = threading.Lock()
+    def __init__(self, place: ObjectPlace) -> None:
+        self.place, self.store = place, connect(place)
 
     def read(self, name: str) -> bytes | None:
         """Content of a small object, None where there is none."""
@@ -217,53 +197,35 @@ class Objects:
 
     def read_dated(self, name: str) -> tuple[bytes, datetime] | None:
         """Content of a small object and when it was written, by the store's clock."""
-        with self._asking():
+        with answers_of(self.place):
             try:
                 answer = self.store.get(name)
-                content = bytes(answer.bytes())
+                return bytes(answer.bytes()), answer.meta["last_modified"]
             except FileNotFoundError as error:
                 if "NoSuchBucket" in str(error):
                     raise
                 return None
-        self._count(received=len(content))
-        return content, answer.meta["last_modified"]
 
     def create(self, name: str, content: bytes) -> bool:
         """Write an object unless there is one of this name (``If-None-Match: *``); tells whether it was written."""
         from obstore.exceptions import AlreadyExistsError  # an extra
 
-        with self._asking():
+        with answers_of(self.place):
             try:
                 self.store.put(name, content, mode="create", use_multipart=False)
             except AlreadyExistsError:
                 return False
-        self._count(sent=len(content))
         return True
-
-    def claim(self, name: str, content: bytes) -> bytes:
-        """Write an object unless there is one, and give what stands there then: that of whoever came first.
-
-        A request that is sent again because its answer was lost finds its own content, and so has come first.
-        """
-        for _ in range(_TRIES):
-            if self.create(name, content):
-                return content
-            standing = self.read(name)
-            if standing is not None:
-                return standing
-        raise ArchiveError(f"{self.place.url}/{name} comes and goes: somebody removes what is being written; run again")
 
     def write(self, name: str, source: Path | bytes) -> None:
         """Write an object from a file, whatever was there; nobody sees a part of it."""
-        with self._asking():
+        with answers_of(self.place):
             self.store.put(name, source, chunk_size=PART_BYTES, max_concurrency=2)
-        self._count(sent=source.stat().st_size if isinstance(source, Path) else len(source))
 
     def blocks(self, name: str) -> Iterator[memoryview]:
         """Content of an object, some MB at a time (FileNotFoundError: there is none)."""
-        with self._asking():
+        with answers_of(self.place):
             for block in self.store.get(name).stream(PART_BYTES):
-                self._count(received=len(block))
                 yield memoryview(block)
 
     def save(self, name: str, path: Path) -> str:
@@ -294,28 +256,28 @@ class Objects:
             sync_path(aside)
             path.parent.mkdir(parents=True, exist_ok=True)
             aside.replace(path)
+            sync_path(path.parent)
         finally:
             with suppress(OSError):
                 aside.unlink(missing_ok=True)
 
-    def measure(self, name: str) -> tuple[int, str]:
-        """Size and SHA-256 of an object, read to its end (FileNotFoundError: there is none)."""
-        digest, size = hashlib.sha256(), 0
+    def measure(self, name: str) -> str:
+        """SHA-256 of an object, read to its end (FileNotFoundError: there is none)."""
+        digest = hashlib.sha256()
         for block in self.blocks(name):
             digest.update(block)
-            size += len(block)
-        return size, digest.hexdigest()
+        return digest.hexdigest()
 
     def children(self, folder: str) -> list[str]:
         """Names of what lies in a folder and is one itself."""
-        with self._asking():
+        with answers_of(self.place):
             found = self.store.list_with_delimiter(folder)
         return sorted(prefix.rstrip("/").rpartition("/")[2] for prefix in found["common_prefixes"])
 
     def listing(self, folder: str | None = None) -> dict[str, Listed]:
         """Every object below a folder, or below the prefix, by its name."""
         found: dict[str, Listed] = {}
-        with self._asking():
+        with answers_of(self.place):
             for batch in self.store.list(folder, chunk_size=1000):
                 found |= {one["path"]: Listed(one["size"], one["last_modified"]) for one in batch}
         return found
@@ -324,20 +286,8 @@ class Objects:
         """Remove objects; those that are not there are no matter."""
         waiting = list(names)
         if waiting:
-            with self._asking(), suppress(FileNotFoundError):
+            with answers_of(self.place), suppress(FileNotFoundError):
                 self.store.delete(waiting)
-
-    @contextmanager
-    def _asking(self) -> Iterator[None]:
-        self._count(requests=1)
-        with answers_of(self.place):
-            yield
-
-    def _count(self, requests: int = 0, sent: int = 0, received: int = 0) -> None:
-        with self._counting:
-            self.traffic.requests += requests
-            self.traffic.sent += sent
-            self.traffic.received += received
 
 
 def some_at_a_time(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:

@@ -29,12 +29,12 @@ from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.planning.coverage import full_sweeps
 from pipeline.rectify.mosaic import BLOCK_LINES
-from pipeline.rectify.placed import PixelGrid, place
+from pipeline.rectify.placed import PixelGrid
 from pipeline.source import Line, References
 from storage.arrays.cubes import RawCubeWriter, SweepHeader, open_raw_cube
 from storage.arrays.layout import ArraySpec, create_array, create_group, image_spec
 from storage.arrays.mosaics import MosaicWriter, load_mosaic
-from storage.arrays.tile_work import MosaicWork, write_mosaic
+from storage.arrays.tile_work import MosaicRecipe, write_mosaic
 from storage.parallel.crew import Crew
 
 CAMERA = LineCamera()
@@ -205,10 +205,9 @@ def write_raw(folder: Path, sweeps: list[Sweep], bands: int) -> list[Path]:
 
 def rectify(paths: list[Path], out: Path, grid: PixelGrid, memory: int, workers: int | None) -> None:
     """The stage: cubes opened, placed, made into one mosaic on disk."""
-    placed = [place(open_raw_cube(path), CAMERA, grid=grid) for path in paths]
     wavelength_nm = open_raw_cube(paths[0]).wavelength_nm
     writer = MosaicWriter(out, grid.shape, wavelength_nm)
-    write_mosaic(MosaicWork(placed, CAMERA, grid), writer, memory=memory, crew=Crew(workers=workers))
+    write_mosaic(MosaicRecipe(paths[0].parent, CAMERA, grid), writer, memory=memory, crew=Crew(workers=workers))
 
 
 def measured(paths: list[Path], out: Path, grid: PixelGrid, memory: int, workers: int | None) -> Spent:

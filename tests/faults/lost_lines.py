@@ -1,7 +1,7 @@
 """What a capture loses when it dies, or cannot keep up: ``python tests/faults lost_lines spool_rate``.
 
 A killed process loses nothing that it had written: the system has it. When the power fails, a file is what the disk
-was last asked to keep, and of what came after anything: cut off, zeros, other bytes, in one file and not in the other.
+was last asked to keep, and of what came after anything: cut off, zeros, other bytes.
 
 At a camera's pace line n is ready n periods after the first; a camera keeps some until they are fetched, and drops
 what is not fetched by then. Half a minute of it lies beside a process that reads the disk and syncs files of its own.
@@ -54,11 +54,11 @@ with Spool.open(Path(sys.argv[1]), SAMPLES, BANDS, header=HEADER) as spool:
 
 @dataclass(frozen=True)
 class Moment:
-    """A capture at one moment: how many lines it has appended, and bytes of both files, as written and as synced."""
+    """A capture at one moment: how many lines it has appended, and bytes of its file, as written and as synced."""
 
     appended: int
-    written: tuple[int, int]
-    synced: tuple[int, int]
+    written: int
+    synced: int
 
 
 @dataclass
@@ -93,20 +93,17 @@ def fill(spool: Spool, upto: int) -> None:
 def record(folder: Path) -> list[Moment]:
     """Capture undisturbed, and note what was appended and synced before and after each line and each sync."""
     moments: list[Moment] = []
-    paths = (folder / "lines.bil", folder / "lines.index")
-    synced, real = [0, 0], os.fdatasync
-    appended = 0
+    path = folder / "lines.lines"
+    real, synced, appended = os.fdatasync, 0, 0
 
     def note() -> None:
-        sizes = (paths[0].stat().st_size, paths[1].stat().st_size)
-        moments.append(Moment(appended, sizes, (synced[0], synced[1])))
+        moments.append(Moment(appended, path.stat().st_size, synced))
 
     def watched(descriptor: int) -> None:
+        nonlocal synced
         note()
         real(descriptor)
-        for number, path in enumerate(paths):
-            if os.path.samestat(os.fstat(descriptor), path.stat()):
-                synced[number] = path.stat().st_size
+        synced = path.stat().st_size
         note()
 
     os.fdatasync = watched  # type: ignore[assignment]
@@ -122,14 +119,13 @@ def record(folder: Path) -> list[Moment]:
 
 
 def cut_power(whole: Path, moment: Moment, folder: Path, chance: random.Random) -> str:
-    """Make what a disk may hold after the power failed at a moment; says what became of either file's last bytes."""
-    fates = []
-    for number, name in enumerate(("lines.bil", "lines.index")):
-        content = (whole / name).read_bytes()[: moment.written[number]]
-        fate = chance.choice(FATES)
-        (folder / name).write_bytes(_left(content, moment.synced[number], fate, chance))
-        fates.append(fate)
-    return " and ".join(fates)
+    """Make what a disk may hold after the power failed at a moment; says what became of the file's last bytes."""
+    content = (whole / "lines.lines").read_bytes()
+    begun = content.index(b"\n") + 1  # the header is on the disk before the first line
+    fate = chance.choice(FATES)
+    left = _left(content[: moment.written], max(moment.synced, begun), fate, chance)
+    (folder / "lines.lines").write_bytes(left)
+    return fate
 
 
 def _left(content: bytes, synced: int, fate: str, chance: random.Random) -> bytes:
@@ -214,9 +210,7 @@ def _contents(folder: Path) -> dict[str, bytes]:
 
 def rows(quick: bool = False) -> list[Row]:
     demanded = f"at most {SYNC_LINES} lines lost, the capture goes on to the same bytes"
-    garbled = (
-        "both files as of the last fdatasync, what came later cut off, zeroed, garbled or kept, each in its own way"
-    )
+    garbled = "the file as of the last fdatasync, what came later cut off, zeroed, garbled or kept"
     cases = (
         ("capture killed", "SIGKILL of the process that appends lines", "no appended line lost", try_kills, (KILLS, 3)),
         ("power fails in a capture", garbled, demanded, try_power, (CUTS, 40)),

@@ -74,12 +74,11 @@ def test_capture_killed(tmp_path: Path) -> None:
     assert set(found.lost) == {0}
 
 
-@pytest.mark.parametrize("name", ["lines.index", "lines.bil", "lines.hdr"])
-def test_bit_flips_in_a_spool(tmp_path: Path, name: str) -> None:
+def test_bit_flips_in_a_spool(tmp_path: Path) -> None:
     """Told by verify; one line at most is asked for again, none is another, the capture goes on to the same bytes."""
-    found = growing_files.flip_spool(name, 60, tmp_path, seed=2)
+    found = growing_files.flip_spool("lines.lines", 60, tmp_path, seed=2)
     assert found.wrong == []
-    assert found.told >= found.flips - 1  # the end of the last line is no part of it
+    assert found.told == found.flips
 
 
 def test_spool_at_a_cameras_pace(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 from storage.archive.archive import Archive
 from storage.archive.keys import StageRef
+from storage.archive.manifests import _seal, _text
 from storage.remote.opening import verify_archive
 
 DAY_S = 86400
@@ -66,14 +67,16 @@ def flip(path: Path, at: int = -3, bit: int = 2) -> None:
     path.write_bytes(content)
 
 
+def rewrite(path: Path, **facts: Any) -> None:
+    """Change what a manifest says, under a seal that fits."""
+    content = {name: value for name, value in json.loads(path.read_text()).items() if name != "seal"} | facts
+    path.write_text(_text(content | {"seal": _seal(content)}))
+
+
 def grow_old(ref: StageRef, days: float) -> None:
-    """Set a store's date back, in its (unsealed) manifest and on its file."""
+    """Set a store's date back, in its manifest and on its file."""
     path = ref.path / "manifest.json"
-    content = json.loads(path.read_text())
-    for name in ("seal", "format"):
-        content.pop(name, None)
-    content["created"] = "2020-01-01T00:00:00+00:00"
-    path.write_text(json.dumps(content))
+    rewrite(path, created="2020-01-01T00:00:00+00:00")
     moment = path.stat().st_mtime - days * DAY_S
     os.utime(path, (moment, moment))
 

@@ -15,7 +15,7 @@ from flows.archive.plan_command import plan_content
 from flows.archive.reprocess_command import ReprocessRequest, run_reprocess
 from flows.settings.load import load_settings
 from pipeline.errors import BudgetError, SettingsError, WeightsError
-from storage.arrays.tile_work import block_means
+from pipeline.rectify.tiles import block_means
 from tests.conftest import Survey, WeightsMaker
 
 RECORD = {

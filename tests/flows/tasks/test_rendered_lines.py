@@ -79,13 +79,12 @@ def test_a_capture_goes_on_from_any_line(expected: list[Line], first: int) -> No
 
 
 def test_the_spool_gets_the_same_bytes(tmp_path: Path) -> None:
-    """Numbers and index of one worker's capture and of three workers' are the same files."""
+    """The files of one worker's capture and of three workers' are the same."""
     source = source_of("rotation", "shot")
     for workers in (1, 3):
         with Spool.open(tmp_path / str(workers), 48, 3, header={}) as spool:
             take_lines(source, SWEEP, spool.append, Crew("threads", workers))
-    for name in ("lines.bil", "lines.index"):
-        assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "3" / name).read_bytes()
+    assert (tmp_path / "1" / "lines.lines").read_bytes() == (tmp_path / "3" / "lines.lines").read_bytes()
 
 
 def test_blocks_wait_for_earlier_ones(monkeypatch: pytest.MonkeyPatch) -> None:

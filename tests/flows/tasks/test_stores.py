@@ -127,7 +127,7 @@ BROKEN_AT = 21
 def test_lost_lines_are_rendered_again(
     survey_png: Any, surveyed_png: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Bits flip in index, header and numbers: verify tells of it, and the same command ends with the same stores."""
+    """Bits flip in header and lines: verify tells of it, and the same command ends with the same stores."""
     surveyed_png(tmp_path / "whole")
     append, appended = Spool.append, [0]
 
@@ -141,13 +141,12 @@ def test_lost_lines_are_rendered_again(
         patch.setattr(Spool, "append", breaks)
         with pytest.raises(RigError, match="unplugged"):
             survey_png(tmp_path / "broken")
-    (index,) = (tmp_path / "broken" / "spool").glob("*/*.index")
-    numbers = index.with_suffix(".bil")
-    ends = [at for at, byte in enumerate(index.read_bytes()) if byte == ord("\n")]
-    for path, at in ((index, 40), (index, ends[3] - 30), (index, ends[9]), (numbers, numbers.stat().st_size // 2)):
-        flip(path, at)
+    (lines,) = (tmp_path / "broken" / "spool").glob("*/*.lines")
+    size = lines.stat().st_size
+    for at in (40, size // 3, size // 2, size - 9):
+        flip(lines, at)
     told = [one for one in verify_archive(Archive.open(tmp_path / "broken")) if one.problem is not None]
-    assert {(one.uri, one.kind) for one in told} == {(f"spool/{index.parent.name}", "growing")}
+    assert {(one.uri, one.kind) for one in told} == {(f"spool/{lines.parent.name}", "growing")}
     survey_png(tmp_path / "broken")
     before, after = (Archive.open(tmp_path / name) for name in ("whole", "broken"))
     assert [ref.uri for ref in after.refs()] == [ref.uri for ref in before.refs()]

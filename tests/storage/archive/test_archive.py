@@ -322,8 +322,8 @@ def test_a_run_begins_in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.Mon
 
 def test_spools_outlive_processes_until_dropped(tmp_path: Path, archive: Archive) -> None:
     """A spool folder is the same each time it is asked for, and goes when dropped."""
-    (archive.spool_folder("k1") / "lines.bil").write_bytes(b"x")
-    assert (archive.spool_folder("k1") / "lines.bil").exists()
+    (archive.spool_folder("k1") / "lines.lines").write_bytes(b"x")
+    assert (archive.spool_folder("k1") / "lines.lines").exists()
     archive.drop_spool("k1")
     assert list((tmp_path / "spool").iterdir()) == []
 

@@ -48,7 +48,7 @@ def put(small: Small, case: Case) -> str:
         "receipt": "receipt.json",
         "beside": "inner/more",
     }
-    path = folder / ("lines.index" if kind == "spool" else names[part])
+    path = folder / ("lines.lines" if kind == "spool" else names[part])
     if path.exists():
         target = away(path)
     else:
@@ -57,7 +57,7 @@ def put(small: Small, case: Case) -> str:
         os.mkfifo(path)
     else:
         path.symlink_to("nowhere" if what == "link nowhere" else target)
-    return {"store": small.mosaic.uri, "run": f"runs/{small.run.name}", "spool": "spool/key/lines.index"}[kind]
+    return {"store": small.mosaic.uri, "run": f"runs/{small.run.name}", "spool": "spool/key/lines.lines"}[kind]
 
 
 @pytest.mark.parametrize("case", CASES)

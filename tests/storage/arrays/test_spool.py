@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
-import re
-import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
-import rasterio
 
 from pipeline.errors import RigError
-from pipeline.json_lines import with_check
 from pipeline.source import Line
 from storage.arrays.spool import Spool
 from tests.storage.small_archive import flip
@@ -53,41 +48,26 @@ def test_lines_come_back_in_blocks(tmp_path: Path) -> None:
 
 
 def test_every_64th_line_waits_for_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Numbers and index are both synced at lines 64 and 128: a power cut loses fewer than 64 lines."""
+    """The file is synced at lines 64 and 128: a power cut loses fewer than 64 lines."""
     synced_at: list[int] = []
     with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
         real = os.fdatasync
         monkeypatch.setattr(os, "fdatasync", lambda file: (synced_at.append(spool.count), real(file))[1])
         for number in range(130):
             spool.append(_line(number))
-        assert synced_at == [64, 64, 128, 128]
+        assert synced_at == [64, 128]
 
 
-def test_the_spool_is_an_envi_file(tmp_path: Path) -> None:
-    """The header describes band-interleaved lines of uint16 that a memory map reads."""
-    _fill(tmp_path, 7)
-    text = (tmp_path / "lines.hdr").read_text()
-    assert text.startswith("ENVI\n")
-    assert "lines = 7\n" in text
-    cube = np.memmap(tmp_path / "lines.bil", "<u2", "r", shape=(7, 4, 6))
-    np.testing.assert_array_equal(cube[3].T, _line(3).data)
-    with pytest.warns(rasterio.errors.NotGeoreferencedWarning), rasterio.open(tmp_path / "lines.bil") as file:
-        np.testing.assert_array_equal(file.read()[:, 3].T, _line(3).data)
+RECORD = 45 + 2 * 6 * 4  # bytes of a line
 
 
-@pytest.mark.parametrize("name", ["lines.bil", "lines.index"])
-@pytest.mark.parametrize("cut", [1, 30, 47, 48, 49, 130])
-def test_a_torn_tail_is_cut_off(tmp_path: Path, name: str, cut: int) -> None:
-    """Whatever part of the last lines is lost, the whole lines before it are kept and the capture goes on.
-
-    An entry that only lost its end is whole by its checksum.
-    """
+@pytest.mark.parametrize("cut", [1, 30, RECORD - 1, RECORD, RECORD + 1, 3 * RECORD])
+def test_a_torn_tail_is_cut_off(tmp_path: Path, cut: int) -> None:
+    """Whatever part of the last lines is lost, the whole lines before it are kept and the capture goes on."""
     _fill(tmp_path, 8)
-    size = (tmp_path / name).stat().st_size
-    os.truncate(tmp_path / name, size - cut)
+    os.truncate(tmp_path / "lines.lines", (tmp_path / "lines.lines").stat().st_size - cut)
     with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
-        assert spool.count == 8 if (name, cut) == ("lines.index", 1) else 4 < spool.count < 8
-        assert spool.lost == []
+        assert (spool.count, spool.lost) == (8 - -(-cut // RECORD), [])
         assert _same([line for block in spool.blocks() for line in block])
     _fill(tmp_path, 8)
     with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
@@ -100,10 +80,8 @@ def test_lost_lines_are_put_back(tmp_path: Path, lost: list[int]) -> None:
     """The same bytes as had nothing been lost; until then the others are there and these are not given."""
     _fill(tmp_path, 75)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    lines = before["lines.index"].split(b"\n")
     for number in lost:
-        lines[1 + number] = lines[1 + number].replace(b"true", b"tree").replace(b"false", b"falls")
-    (tmp_path / "lines.index").write_bytes(b"\n".join(lines))
+        flip(tmp_path / "lines.lines", (number - 75) * RECORD + 7 * number % RECORD)
     with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
         assert (spool.count, spool.lost) == (75, lost)
         with pytest.raises(RigError, match=f"line {lost[0]} has changed since it was captured"):
@@ -114,24 +92,11 @@ def test_lost_lines_are_put_back(tmp_path: Path, lost: list[int]) -> None:
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-def test_numbers_are_on_the_disk_before_the_entries_that_vouch_for_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of lines that are put back too: a power cut leaves them lost, and never wrong."""
-    _fill(tmp_path, 6)
-    flip(tmp_path / "lines.bil", 48 * 4 + 5)
-    synced = list[str]()
-    with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
-        monkeypatch.setattr("storage.arrays.spool.sync_path", lambda path: synced.append(path.name))
-        spool.mend([_line(4)])
-    assert synced[:2] == ["lines.bil", "lines.index.part"]
-
-
 def test_lines_are_put_back_in_their_places_alone(tmp_path: Path) -> None:
     """Another line than the one that is lost is refused, and nothing is overwritten with it."""
     _fill(tmp_path, 6)
     with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
-        flip(tmp_path / "lines.bil", 48 * 4 + 5)
+        flip(tmp_path / "lines.lines", -RECORD - 5)
         with pytest.raises(RigError, match="line 4 has changed"):  # reading compares each line's checksum
             list(spool.blocks())
         assert (spool.recover(), spool.lost) == (6, [4])  # and opening again finds it lost, and the one after it good
@@ -144,49 +109,22 @@ def test_lines_are_put_back_in_their_places_alone(tmp_path: Path) -> None:
 
 
 def test_a_damaged_header_costs_no_line_of_this_sweep(tmp_path: Path) -> None:
-    """Entries go on from the header's checksum: those of this sweep are known without it, another's are not taken."""
+    """Records go on from the header's checksum: those of this sweep are known without it, another's are not taken."""
     _fill(tmp_path, 6)
-    flip(tmp_path / "lines.index", 30)
+    flip(tmp_path / "lines.lines", 30)
     with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
         assert (spool.count, spool.lost) == (6, [])
         assert _same(next(spool.blocks()))
-    flip(tmp_path / "lines.index", 30)
+    flip(tmp_path / "lines.lines", 30)
     with Spool.open(tmp_path, 6, 4, header={**HEADER, "seed": 4}) as spool:
         assert spool.count == 0
 
 
-@pytest.mark.parametrize(
-    "change", [{"line": -1}, {"line": 2.0}, {"valid": 1}, {"time_s": None}, {"crc32": "0"}, {"x": 0}]
-)
-def test_an_entry_of_other_facts_is_a_lost_line(tmp_path: Path, change: dict[str, object]) -> None:
-    """Whatever its checksum says: facts that are missing, too many or of another kind are no line's."""
-    _fill(tmp_path, 5)
-    path = tmp_path / "lines.index"
-    head, *entries = path.read_bytes().splitlines(keepends=True)
-    facts = {name: value for name, value in json.loads(entries[2]).items() if name != "check"}
-    entries[2] = with_check(json.dumps(facts | change).encode(), zlib.crc32(head))
-    path.write_bytes(head + b"".join(entries))
-    with Spool.open(tmp_path, 6, 4, header=HEADER) as spool:
-        assert (spool.count, spool.lost) == (5, [2])
-
-
-def test_a_spool_of_an_earlier_version_is_refused(tmp_path: Path) -> None:
-    """Its entries have no checksum: one message says so and what to do, and nothing of it is touched."""
-    _fill(tmp_path, 3)
-    content = (tmp_path / "lines.index").read_bytes()
-    earlier = re.sub(rb', "check": "[0-9a-f]{8}"', b"", content).replace(b"line spool 2", b"line spool 1")
-    (tmp_path / "lines.index").write_bytes(earlier)
-    with pytest.raises(RigError, match=r"another version.*finish that capture with the version that began it"):
-        Spool.open(tmp_path, 6, 4, header=HEADER)
-    assert (tmp_path / "lines.index").read_bytes() == earlier
-
-
-@pytest.mark.parametrize("name", ["lines.bil", "lines.index"])
 @pytest.mark.parametrize("kind", ["link", "pipe"])
-def test_a_link_or_a_pipe_is_no_spool(tmp_path: Path, name: str, kind: str) -> None:
+def test_a_link_or_a_pipe_is_no_spool(tmp_path: Path, kind: str) -> None:
     """Neither followed nor waited for, and what a link leads to stays as it was."""
     _fill(tmp_path / "spool", 3)
-    path, away = tmp_path / "spool" / name, tmp_path / "away"
+    path, away = tmp_path / "spool" / "lines.lines", tmp_path / "away"
     path.rename(away)
     before = away.read_bytes()
     os.mkfifo(path) if kind == "pipe" else path.symlink_to(away)

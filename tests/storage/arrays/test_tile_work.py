@@ -19,21 +19,12 @@ from pipeline.geometry.scan import Sweep, line_positions
 from pipeline.rectify.mosaic import LineCache, line_blocks
 from pipeline.rectify.placed import PixelGrid, place
 from pipeline.rectify.region import cache_bytes, plan_tiles
+from pipeline.rectify.tiles import MosaicWork, block_means
 from pipeline.source import Line, References
 from storage.arrays import tile_work
 from storage.arrays.cubes import RawCube, RawCubeWriter, SweepHeader, open_raw_cube
 from storage.arrays.mosaics import MosaicWriter, load_mosaic
-from storage.arrays.tile_work import (
-    MosaicRecipe,
-    MosaicWork,
-    OpenMosaic,
-    Thumbnail,
-    ThumbnailCut,
-    TileMaker,
-    block_means,
-    tile_budget,
-    write_mosaic,
-)
+from storage.arrays.tile_work import MosaicRecipe, Thumbnail, ThumbnailCut, TileMaker, tile_budget, write_mosaic
 from storage.parallel.crew import Crew
 
 CAMERA = LineCamera()
@@ -72,14 +63,6 @@ class KillOnce(ThumbnailCut):
         return super().__call__(rows, columns, values)
 
 
-class Whole:
-    """A cube that can be read by whole lines alone."""
-
-    def __init__(self, cube: RawCube) -> None:
-        self.sweep, self.references, self.read = cube.sweep, cube.references, cube.read
-        self.position, self.time_s, self.valid_line = cube.position, cube.time_s, cube.valid_line
-
-
 @pytest.fixture(scope="module")
 def processes() -> Iterator[Crew]:
     """Two worker processes for all tests here."""
@@ -111,17 +94,14 @@ def digest_of(folder: Path) -> str:
 
 
 def test_workers_do_not_change_a_byte(tmp_path: Path, cubes: list[RawCube]) -> None:
-    """One tile at a time in a plain loop, or three at once, the files are the same; cubes read whole give them too."""
+    """One tile at a time in a plain loop, or three at once, the files are the same."""
     digests = set()
     for crew in (ONE, THREE):
         path = tmp_path / f"{crew.workers}.zarr"
-        budget = write_mosaic(work_of(cubes), mosaic_at(path), memory=PLENTY, crew=crew)
+        budget = write_mosaic(recipe_of(cubes), mosaic_at(path), memory=PLENTY, crew=crew)
         assert budget.workers == crew.workers
         digests.add(digest_of(path))
     assert len(digests) == 1
-    plain = MosaicWork([place(Whole(cube), CAMERA, grid=GRID) for cube in cubes], CAMERA, GRID)
-    write_mosaic(plain, mosaic_at(tmp_path / "whole.zarr"), memory=PLENTY, crew=ONE)
-    np.testing.assert_array_equal(load_mosaic(tmp_path / "whole.zarr").values, load_mosaic(tmp_path / "1.zarr").values)
 
 
 def test_progress_and_tiles_are_told(tmp_path: Path, cubes: list[RawCube]) -> None:
@@ -135,7 +115,7 @@ def test_progress_and_tiles_are_told(tmp_path: Path, cubes: list[RawCube]) -> No
             seen.append((rows.start, columns.start))
 
     write_mosaic(
-        work_of(cubes),
+        recipe_of(cubes),
         mosaic_at(tmp_path / "m.zarr"),
         memory=PLENTY,
         crew=TWO,
@@ -152,7 +132,7 @@ def test_thumbnail_is_every_nth_pixel(tmp_path: Path, cubes: list[RawCube], most
     """Whatever tiles it is made of, a thumbnail holds the mosaic's own pixels, at most so many a side."""
     thumbnail = Thumbnail(GRID.shape, [2, 0], most_px)
     path = tmp_path / "m.zarr"
-    write_mosaic(work_of(cubes), mosaic_at(path), memory=PLENTY, crew=ONE, seen=thumbnail)
+    write_mosaic(recipe_of(cubes), mosaic_at(path), memory=PLENTY, crew=ONE, seen=thumbnail)
     down, across = (-(-size // most_px) for size in GRID.shape)
     whole = load_mosaic(path).values[::down, ::across, ::-2]
     np.testing.assert_allclose(thumbnail.image, whole, rtol=3e-4)
@@ -161,7 +141,7 @@ def test_thumbnail_is_every_nth_pixel(tmp_path: Path, cubes: list[RawCube], most
 
 def test_memory_says_how_many_tiles_at_a_time(tmp_path: Path, cubes: list[RawCube]) -> None:
     """With memory for one tile only one is made at a time, whatever is allowed; a byte less and none is."""
-    work = work_of(cubes)
+    work = recipe_of(cubes)
     least = write_mosaic(work, mosaic_at(tmp_path / "a.zarr"), memory=PLENTY, crew=ONE).projected
     tight = write_mosaic(work, mosaic_at(tmp_path / "b.zarr"), memory=least, crew=THREE)
     assert tight.workers == 1
@@ -174,7 +154,7 @@ def test_an_error_in_a_tile_ends_the_work(tmp_path: Path, cubes: list[RawCube]) 
 
     thumbnail = Thumbnail(GRID.shape, [3], 100)  # a band too far
     with pytest.raises(IndexError, match="index 3 is out of bounds"):
-        write_mosaic(work_of(cubes), mosaic_at(tmp_path / "m.zarr"), memory=PLENTY, crew=TWO, seen=thumbnail)
+        write_mosaic(recipe_of(cubes), mosaic_at(tmp_path / "m.zarr"), memory=PLENTY, crew=TWO, seen=thumbnail)
 
 
 def test_processes_write_the_same_bytes(tmp_path: Path, cubes: list[RawCube], processes: Crew) -> None:
@@ -202,12 +182,6 @@ def test_a_worker_killed_between_tiles_changes_nothing(
     assert digest_of(folder / "m.zarr") == digest_of(tmp_path / "a.zarr")
 
 
-def test_processes_need_a_recipe(tmp_path: Path, cubes: list[RawCube], processes: Crew) -> None:
-    """Opened sweeps cannot be sent to other processes."""
-    with pytest.raises(TypeError, match="crew 'processes' needs a MosaicRecipe"):
-        write_mosaic(work_of(cubes), mosaic_at(tmp_path / "m.zarr"), memory=PLENTY, crew=processes)
-
-
 def test_each_process_keeps_the_lines_of_one_tile(cubes: list[RawCube]) -> None:
     """Two processes keep each what one thread keeps; two threads share what both need."""
     work = work_of(cubes)
@@ -226,9 +200,8 @@ def test_means_keep_the_lines_of_two_parts_of_a_tile(cubes: list[RawCube], tmp_p
     budget = tile_budget(work, tiles, writer.tile_shape, memory=PLENTY, crew=ONE)
     assert budget.cache < cache_bytes(work.placed, tiles, 1)
     kept = LineCache(budget.cache)
-    made = OpenMosaic(work, writer, kept, None)
     for tile in tiles:
-        made.make(tile.rows, tile.columns)
+        work.make_tile(tile.rows, tile.columns, work.reach(tile.columns), kept)
     assert kept.reads == sum(len(line_blocks(slice(0, len(cube.valid_line)))) for cube in cubes)
 
 
@@ -237,7 +210,7 @@ def test_a_worker_lets_tiles_go(tmp_path: Path, cubes: list[RawCube]) -> None:
     writer = mosaic_at(tmp_path / "m.zarr")
     maker = TileMaker(recipe_of(cubes), writer.path, 2**24)
     maker((slice(0, 64), slice(0, 640)))
-    lines = weakref.ref(tile_work._opened(maker)._cache)
+    lines = weakref.ref(tile_work._opened(maker).lines)
     assert lines() is not None
     tile_work.let_tiles_go()
     assert lines() is None
@@ -289,7 +262,7 @@ def test_means_of_a_block_do_not_depend_on_holes_in_others() -> None:
     assert np.isfinite(torn).all()
 
 
-@pytest.mark.parametrize("crew", [ONE, THREE, Crew("processes", 2)])
+@pytest.mark.parametrize("crew", [ONE, Crew("processes", 2)])
 def test_a_mosaic_of_means_is_the_mean_of_the_finer_one(cubes: list[RawCube], tmp_path: Path, crew: Crew) -> None:
     """Whoever makes its tiles: 4 x 4 finer pixels a pixel, those that no line reached left out."""
     fine, coarse = recipe_of(cubes), PixelGrid((-68.5, -418.5), 4, (35, 225))

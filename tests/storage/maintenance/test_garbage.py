@@ -70,8 +70,8 @@ def test_raw_lines_of_a_rig_go_only_when_asked(archive: Archive) -> None:
 def test_spools_of_published_captures_and_dead_parts_go(tmp_path: Path, archive: Archive) -> None:
     """The spool of a capture that is not published is what its lines will be continued from."""
     small = small_survey(archive)
-    for key in (small.raw.key, f"{small.raw.key}-mosaic", "underway"):  # tiles beside a spool are of earlier versions
-        (archive.spool_folder(key) / "lines.bil").write_bytes(b"x" * 100)
+    for key in (small.raw.key, "underway"):
+        (archive.spool_folder(key) / "lines.lines").write_bytes(b"x" * 100)
     (tmp_path / "stages" / "rectify" / "dead.part").mkdir()
     (tmp_path / "stages" / "rectify" / "dead.part" / "half").write_bytes(b"y" * 10)
     with archive.publish("rectify", "living") as staged:
@@ -81,7 +81,6 @@ def test_spools_of_published_captures_and_dead_parts_go(tmp_path: Path, archive:
         assert staged.path.is_dir()
     assert {(one.uri, one.what, one.size) for one in found.removals} == {
         (f"spool/{small.raw.key}", "spool", 100),
-        (f"spool/{small.raw.key}-mosaic", "spool", 100),
         ("stages/rectify/dead.part", "unfinished", 10),
     }
     assert [path.name for path in (tmp_path / "spool").iterdir()] == ["underway"]
@@ -100,7 +99,7 @@ def test_a_stray_file_among_the_runs_holds_nothing_up(tmp_path: Path, archive: A
 def test_a_spool_stays_while_its_capture_may_be_in_need_of_it(archive: Archive) -> None:
     """Held by whoever publishes its lines, or where what was published of them is damaged."""
     small = small_survey(archive)
-    (archive.spool_folder(small.raw.key) / "lines.bil").write_bytes(b"x")
+    (archive.spool_folder(small.raw.key) / "lines.lines").write_bytes(b"x")
     with archive.publish("capture", small.raw.key):
         assert clear_up(archive).removals == ()
     manifest = (small.raw.path / "manifest.json").read_bytes()
@@ -177,7 +176,7 @@ def test_broken_off_it_leaves_a_whole_archive(archive: Archive, at: int) -> None
     """Stores go before those that they were made of; the next time does the rest."""
     small_survey(archive)
     small_survey(archive, seed=1, named=False)
-    (archive.spool_folder(archive.refs("capture")[0].key) / "lines.bil").write_bytes(b"x")
+    (archive.spool_folder(archive.refs("capture")[0].key) / "lines.lines").write_bytes(b"x")
     steps: list[Removal] = []
 
     def stop(removal: Removal, done: float) -> None:

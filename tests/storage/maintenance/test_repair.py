@@ -1,4 +1,4 @@
-"""A repair makes anew what is broken and what was made of it, and loses nothing that it cannot make."""
+"""A repair makes anew what is broken, and leaves alone what it cannot make."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from pipeline.errors import ArchiveError, SceneError
 from storage.archive.archive import Archive
-from storage.maintenance.repair import Repaired, plan_repair, put_back, repair
+from storage.maintenance.repair import Repaired, plan_repair, repair
 from storage.remote.opening import verify_archive
 from tests.storage.small_archive import Small, flip, small_survey
 
@@ -37,18 +37,17 @@ def _moments(archive: Archive) -> dict[str, int]:
     return {ref.uri: (ref.path / "manifest.json").stat().st_mtime_ns for ref in archive.refs()}
 
 
-def test_only_what_depends_on_it_is_made_again(tmp_path: Path, archive: Archive) -> None:
-    """A broken mosaic: it and its map; not the raw lines, and nothing of the other survey."""
+def test_only_what_is_broken_is_made_again(archive: Archive) -> None:
+    """Neither what it was made of, nor what was made of it, nor anything of the other survey."""
     small, _ = _two(archive)
     before = _moments(archive)
     flip(small.mosaic.path / "data.bin")
     done = _repair(archive)
     assert done.complete
-    assert set(done.remade) == {small.mosaic.uri, small.map.uri}
+    assert done.remade == [small.mosaic.uri]
     after = _moments(archive)
     assert {uri for uri in after if after[uri] != before[uri]} == set(done.remade)
     assert _bad(archive) == []
-    assert not (tmp_path / ".aside").exists()
 
 
 @pytest.mark.parametrize("how", ["flip", "manifest", "lost", "gone"])
@@ -72,7 +71,7 @@ def test_broken_raw_lines_of_the_simulator_are_made_again(archive: Archive, how:
     done = _repair(archive, again)
     assert done.complete
     assert sorted(ran) == ["bilinear", "nearest"]
-    assert len(done.remade) == 5
+    assert done.remade == [small.raw.uri]
     assert _bad(archive) == []
 
 
@@ -92,56 +91,22 @@ def test_raw_lines_of_a_rig_stay_with_all_that_was_made_of_them(archive: Archive
     assert _bad(archive) == [small.raw.uri]
 
 
-def test_what_cannot_be_made_is_put_back(archive: Archive) -> None:
-    """The scene has gone: the sound map, set aside with the broken mosaic, is where it was."""
+@pytest.mark.parametrize("error", [SceneError("no scene farm.png; give the file"), KeyboardInterrupt()])
+def test_what_could_not_be_made_again_is_named_by_the_next_verify(archive: Archive, error: BaseException) -> None:
+    """The scene has gone, or the repair was broken off: once that is mended the same command makes it."""
     small = small_survey(archive)
-    before = _moments(archive)
     flip(small.mosaic.path / "data.bin")
 
     def fail(settings: dict[str, Any]) -> None:
-        raise SceneError("no scene farm.png; give the file")
+        raise error
 
-    done = _repair(archive, fail)
-    assert not done.complete
-    assert done.put_back == dict.fromkeys((small.mosaic.uri, small.map.uri), "no scene farm.png; give the file")
-    assert _moments(archive) == before
+    if isinstance(error, KeyboardInterrupt):
+        with pytest.raises(KeyboardInterrupt):
+            _repair(archive, fail)
+    else:
+        assert _repair(archive, fail).failed[small.mosaic.uri] == "no scene farm.png; give the file"
     assert _bad(archive) == [small.mosaic.uri]
-
-
-def test_a_repair_broken_off_is_put_back_first(tmp_path: Path, archive: Archive) -> None:
-    """At once where the process lives, and by the next repair where it was killed."""
-    small = small_survey(archive)
-    before = _moments(archive)
-    flip(small.mosaic.path / "data.bin")
-
-    def interrupt(settings: dict[str, Any]) -> None:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        _repair(archive, interrupt)
-    assert _moments(archive) == before
-    (tmp_path / ".aside" / "segment").mkdir(parents=True)
-    small.map.path.rename(tmp_path / ".aside" / "segment" / small.map.key)
-    told = {one.uri: one.problem for one in verify_archive(archive) if one.problem is not None}
-    assert "a repair was broken off" in (told[f".aside/segment/{small.map.key}"] or "")
-    assert put_back(tmp_path) == [small.map.uri]
-    assert _moments(archive) == before
-
-
-def test_nothing_that_was_set_aside_is_lost_by_the_next_repair(tmp_path: Path, archive: Archive) -> None:
-    """Also what no run names yet: it comes back before anything else is done; what was made again since stays."""
-    small, other = small_survey(archive), small_survey(archive, seed=1, named=False)
-    for ref in (other.map, other.mosaic):
-        aside = tmp_path / ".aside" / ref.stage / ref.key
-        aside.parent.mkdir(parents=True)
-        ref.path.rename(aside)
-    again = small_survey(archive, seed=1, named=False)
-    made = archive.manifest_hash(again.map)
-    archive.discard(again.mosaic)
-    flip(small.map.path / "data.bin")
-    _repair(archive)
-    assert archive.manifest_hash(again.map) == made
-    assert other.mosaic.path.exists()
+    assert _repair(archive).remade == [small.mosaic.uri]
     assert _bad(archive) == []
 
 
@@ -183,8 +148,7 @@ def test_what_no_run_names_is_dropped(archive: Archive) -> None:
     flip(small.mosaic.path / "data.bin")
     done = _repair(archive, lambda settings: pytest.fail("nothing to run"))
     assert done.complete
-    assert set(done.dropped) == {small.mosaic.uri, small.map.uri}
-    assert _bad(archive) == []
+    assert done.dropped == [small.mosaic.uri]
 
 
 def test_what_was_never_of_the_archive_is_not_thrown_away(tmp_path: Path, archive: Archive) -> None:
@@ -202,11 +166,11 @@ def test_what_was_never_of_the_archive_is_not_thrown_away(tmp_path: Path, archiv
 
 
 def test_stores_of_a_version_no_longer_made_stay(archive: Archive) -> None:
-    """Sound ones with those that are broken: this version would make something else."""
+    """This version would make something else."""
     small = small_survey(archive)
     flip(small.raw.path / "data.bin")
     plan = plan_repair(archive, verify_archive(archive), versions=VERSIONS | {"segment": 2})
-    assert plan.remade == (small.mosaic.uri, small.raw.uri)
+    assert plan.remade == (small.raw.uri,)
     plan = plan_repair(archive, verify_archive(archive), versions=VERSIONS | {"capture": 2})
     assert plan.remade == ()
     assert "made by version 1 of the stage capture, which is now 2" in plan.hopeless[small.raw.uri]

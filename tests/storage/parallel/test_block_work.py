@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import signal
 import socket
@@ -14,14 +13,12 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
-import dask
-import numpy as np
 import pytest
 from dask.distributed import LocalCluster
 
 from pipeline.errors import SettingsError, ShapeError, WorkerError
-from storage.parallel import cluster_work
-from storage.parallel.crew import Crew, count_cores, run_blocks
+from storage.parallel import crew as crew_module
+from storage.parallel.crew import THREADS_OF, Crew, run_blocks
 
 ROOT = Path(__file__).parents[3]
 PROCESSES = Crew("processes", 2)
@@ -122,16 +119,6 @@ def test_an_error_of_a_process_is_raised_here(processes: Crew) -> None:
     assert run_blocks(square, range(3), processes) == [0, 1, 4]
 
 
-def test_what_cannot_travel_is_refused(processes: Crew) -> None:
-    """Closures, and arrays in the work or in items, are refused before anything is sent."""
-    with pytest.raises(TypeError, match=r"the work of blocks cannot be sent .* expected a function of a module"):
-        run_blocks(lambda item: item, range(3), processes)
-    with pytest.raises(TypeError, match=r"the work of blocks takes \d+ bytes .* give partial paths to open"):
-        run_blocks(partial(square_unless, np.zeros(10**5)), range(3), processes)
-    with pytest.raises(TypeError, match="the item of blocks takes"):
-        run_blocks(np.sum, [np.zeros(10**5)], processes)
-
-
 def test_a_killed_worker_costs_only_time(tmp_path: Path, processes: Crew) -> None:
     """kill -9 of a worker in the middle of a block: the block is made again, by another."""
     assert run_blocks(partial(die_once, tmp_path), range(8), processes) == list(range(8))
@@ -140,7 +127,7 @@ def test_a_killed_worker_costs_only_time(tmp_path: Path, processes: Crew) -> Non
 
 def test_a_block_that_kills_its_workers_is_one_error() -> None:
     """Where every try kills the worker, the error says so and what to do; a crew kept open gets other workers."""
-    with dask.config.set({"distributed.scheduler.allowed-failures": 1}), Crew("processes", 1).open() as crew:
+    with Crew("processes", 1).open() as crew:
         (before, _), *_ = run_blocks(threads_here, [0], crew)
         with pytest.raises(
             WorkerError, match=r"1 worker processes: workers died .* in the same block.*--scheduler threads"
@@ -159,14 +146,14 @@ def test_an_unknown_scheduler_is_refused(scheduler: str) -> None:
 
 def test_workers_are_counted() -> None:
     """None is a worker for each core; fewer than one is refused."""
-    assert Crew().count == count_cores() >= 1
+    assert Crew().count == len(os.sched_getaffinity(0))
     with pytest.raises(SettingsError, match="at least 1, got 0"):
         Crew(workers=0)
 
 
 def test_nobody_answers(monkeypatch: pytest.MonkeyPatch) -> None:
     """No scheduler at the address: one error that says where, what was expected and what to do."""
-    monkeypatch.setattr(cluster_work, "ANSWER_S", 0.3)
+    monkeypatch.setattr(crew_module, "ANSWER_S", 0.3)
     with pytest.raises(SettingsError, match=r"tcp://127.0.0.1:9: expected a dask scheduler .*start `dask scheduler`"):
         run_blocks(square, [1], Crew("tcp://127.0.0.1:9"))
 
@@ -185,60 +172,27 @@ def test_workers_of_a_scheduler_elsewhere_give_the_same(elsewhere: Crew, tmp_pat
     assert run_blocks(square, range(6), elsewhere, paths=[tmp_path]) == [square(item) for item in range(6)]
 
 
-def test_workers_that_see_other_files_are_refused(
-    elsewhere: Crew, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("here", "words"),
+    [
+        ({"numpy": "0.1"}, r"has numpy \d.*, expected 0.1 as here; install the same there"),
+        ({"spectralzoom": "of code abc"}, r"has spectralzoom of code \w+, expected of code abc as here"),
+        ({"/archive": "with 7 names"}, r"has /archive None, expected with 7 names as here.*mount the archive"),
+    ],
+)
+def test_workers_that_differ_are_refused(
+    elsewhere: Crew, monkeypatch: pytest.MonkeyPatch, here: dict[str, str], words: str
 ) -> None:
-    """A folder that differs there is named, with what both see and what to do; nothing is made."""
-    monkeypatch.setattr(cluster_work, "_seen", lambda folder: "with 7 names")
-    with pytest.raises(
-        SettingsError, match=rf"worker tcp:.* has {tmp_path} with 0 names .*, expected with 7 names .*mount"
-    ):
-        run_blocks(square, [1], elsewhere, paths=[tmp_path])
-
-
-@pytest.fixture
-def other_versions(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
-    """Somebody who may change what this process takes for its own versions."""
-    cluster_work.versions_here.cache_clear()
-    yield monkeypatch
-    cluster_work.versions_here.cache_clear()
-
-
-def test_workers_of_another_version_are_refused(elsewhere: Crew, other_versions: pytest.MonkeyPatch) -> None:
-    """Other code or another numpy there would give other bytes: the first that differs is named."""
-    other_versions.setattr(cluster_work, "version", lambda name: "0.1")
-    with pytest.raises(SettingsError, match=r"has numpy \d.*, expected 0.1 as here; install the same there"):
-        run_blocks(square, [1], elsewhere)
-    cluster_work.versions_here.cache_clear()
-    other_versions.setattr(cluster_work, "_code_digest", lambda: "of code abc")
-    with pytest.raises(SettingsError, match=r"has spectralzoom of code \w+, expected of code abc as here"):
+    """Other code, another numpy or other files would give other bytes: the first that differs is named."""
+    run, true = crew_module.dask_distributed.Client.run, crew_module.about_here([])
+    monkeypatch.setattr(crew_module.dask_distributed.Client, "run", lambda self, ask, folders: run(self, _true, true))
+    monkeypatch.setattr(crew_module, "about_here", lambda folders: {**true, **here})
+    with pytest.raises(SettingsError, match=rf"worker tcp:.* {words}"):
         run_blocks(square, [1], elsewhere)
 
 
-def test_workers_still_run_what_they_began_with(other_versions: pytest.MonkeyPatch) -> None:
-    """Files that changed on the disk since are not what a process runs."""
-    before = cluster_work.versions_here()
-    assert before["spectralzoom"] != f"of code {hashlib.sha256().hexdigest()[:12]}"  # of no file at all
-    other_versions.setattr(cluster_work, "_code_digest", lambda: "of code abc")
-    assert cluster_work.versions_here() == before
-
-
-def test_workers_with_several_threads_of_arithmetic_are_refused() -> None:
-    """Sums of several threads are rounded otherwise: other bytes under the same key."""
-    expected = {**cluster_work.about_here([]), **cluster_work.ONE_THREAD}
-    with pytest.raises(SettingsError, match=r"worker 1 has OMP_NUM_THREADS 4, expected 1 in its environment"):
-        cluster_work.check_facts("worker 1", expected | {"OMP_NUM_THREADS": "4"}, expected)
-
-
-def test_a_scheduler_that_lacks_the_program_is_refused(elsewhere: Crew, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The scheduler opens what it passes on to workers."""
-    monkeypatch.setattr(cluster_work, "versions_here", _not_there)
-    with pytest.raises(SettingsError, match=r"the scheduler or a worker cannot import SpectralZoom \(.*no storage"):
-        run_blocks(square, [1], elsewhere)
-
-
-def _not_there() -> None:
-    raise ModuleNotFoundError("no storage")
+def _true(facts: dict[str, str]) -> dict[str, str]:
+    return {**facts, THREADS_OF: os.environ[THREADS_OF]}
 
 
 STALE_S = 0.6
@@ -270,7 +224,7 @@ GONE = """
 import subprocess, sys, time
 from contextlib import suppress
 from pipeline.errors import PipelineError, WorkerError
-from storage.parallel import cluster_work
+from storage.parallel import crew as crew_module
 from storage.parallel.crew import Crew, run_blocks
 from tests.storage.parallel.test_block_work import nap
 
@@ -292,7 +246,7 @@ def end(started):
         one.wait()
 
 if __name__ == "__main__":
-    cluster_work.ANSWER_S = 1.0
+    crew_module.ANSWER_S = 1.0
     with Crew(sys.argv[1]).open() as crew:
         started = begin(crew)
         try:
@@ -337,42 +291,12 @@ if __name__ == "__main__":
 """
 
 
-TERMINATED = """
-import os, signal, sys, threading
-from contextlib import suppress
-from pathlib import Path
-from storage.parallel.crew import Crew, run_blocks
-def children():
-    return [child for task in Path("/proc/self/task").glob("*/children") for child in task.read_text().split()]
-def terminate():
-    while True:
-        with suppress(OSError):  # a thread that has ended
-            if len(children()) > 1:  # a tracker, and a worker
-                break
-    os.kill(os.getpid(), signal.SIGTERM)
-if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    threading.Thread(target=terminate, daemon=True).start()
-    try:
-        run_blocks(abs, range(4), Crew("processes", 1))
-    except KeyboardInterrupt:
-        sys.exit(143)
-"""
-
-
 def run_script(folder: Path, text: str, *words: str) -> subprocess.Popen[str]:
     """A program in a process, and a session, of its own."""
     (script := folder / "script.py").write_text(text)
     command, environment = [sys.executable, str(script), *words], {**os.environ, "PYTHONPATH": str(ROOT)}
     said = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen(command, env=environment, start_new_session=True, **said)  # type: ignore[call-overload, no-any-return]
-
-
-def test_sigterm_while_workers_begin(tmp_path: Path) -> None:
-    """It is heard once they are there, and they end without a word."""
-    with run_script(tmp_path, TERMINATED) as started:
-        assert started.communicate(timeout=60) == ("", "")
-    assert started.returncode == 143
 
 
 def touch_slowly(folder: Path, number: int) -> None:
