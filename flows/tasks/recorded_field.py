@@ -68,7 +68,7 @@ class OpenedRecording:
         if self.settings.labels is not None:
             found, notes = load_field_labels(self.settings.labels, (height, width))
         scene = RasterScene(
-            name=self.settings.name or _name_of(str(self.settings.sweeps)),
+            name=self.settings.name or (Path(str(self.settings.sweeps).rstrip("/")).stem or RECORDED),
             key=f"{RECORDED}/{stage_key(RECORDED, 1, self.field.content, [])}/{width}x{height}",
             raster=SceneRaster.of(np.zeros((height, width, 1), np.float32), None if found is None else found.index),
             light=Once.of(
@@ -143,8 +143,3 @@ def _step_of(source: RecordedSource, camera: LineCamera) -> int:
             f"may have up to {MOST_STEP} px between lines; correct the pointing, or camera.focal_length_mm"
         )
     return step
-
-
-def _name_of(sweeps: str) -> str:
-    """What a field is called that nobody named: as its recording."""
-    return Path(sweeps.rstrip("/")).stem or RECORDED

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flows.settings.survey_settings import RECORDED, Settings
+from flows.settings.survey_settings import RECORDED, RIG, Settings
 from flows.settings.values import LOOK_PART
 from flows.tasks.capture_plan import CapturePlan, plan_capture
 from flows.tasks.look_choice import LookChoice, choose_look
@@ -23,11 +23,11 @@ from flows.tasks.recorded_field import OpenedRecording, open_recorded
 from flows.tasks.scan_choice import ScanChoice, choose_plain_scan
 from flows.tasks.scene import (
     FieldSource,
+    SimulatedField,
     check_labels,
     check_mask,
     check_scene_there,
     farm_refusal,
-    field_source,
     for_rig,
     judged_labels,
     open_map,
@@ -47,7 +47,7 @@ from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.grid import SceneGrid
 from pipeline.geometry.scan import Sweep
 from pipeline.ground.georeference import georeference_record
-from pipeline.lazy import Once
+from pipeline.lazy import Once, deferred
 from pipeline.rectify.placed import PixelGrid, place
 from pipeline.rectify.region import plan_tiles
 from pipeline.rectify.tiles import MosaicWork
@@ -63,6 +63,11 @@ from storage.readers.open_cubes import load_labels_array
 from storage.readers.raster_work import RasterPixels
 from storage.readers.scene_files import OpenScene
 from storage.remote.opening import is_archive, open_archive
+
+if TYPE_CHECKING:
+    import flows.tasks.rig_field as rig_field
+else:
+    rig_field = deferred("flows.tasks.rig_field")
 
 
 def check_memory(settings: Settings, source: SimulatedSource, grid: SceneGrid, plan: CapturePlan) -> None:
@@ -318,6 +323,17 @@ def _scene_for(
     if settings.mask is not None:
         check_mask(settings.mask, scene.shape)
     return pixels, scene, notes, label_notes
+
+
+def field_source(
+    scene: RasterScene, settings: Settings, simulated: SimulatedSource, planned: Sequence[Sweep]
+) -> FieldSource:
+    """Give who looks, as the settings say; raises what `flows.tasks.rig_field.rig_field` does."""
+    if settings.is_map:
+        return FieldSource()
+    if settings.source != RIG:
+        return SimulatedField(simulated)
+    return rig_field.rig_field(scene, settings, planned)
 
 
 def make_source(scene: RasterScene, settings: Settings) -> SimulatedSource:

@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +18,7 @@ from flows.training.data import scene_of_file, unpack_mask
 from models.weights.files import Description
 from pipeline.errors import SceneError, SettingsError
 from pipeline.geometry.grid import UNLABELLED
-from pipeline.geometry.scan import Sweep
-from pipeline.lazy import Once, deferred
+from pipeline.lazy import Once
 from pipeline.simulator.effects.effect import Effect
 from pipeline.simulator.scenes.farm.farm_scene import FARM_SHAPE, farm_scene, law_of_key
 from pipeline.simulator.scenes.scene import RasterScene, SceneLight, SceneRaster
@@ -29,11 +28,6 @@ from storage.readers.cube_sources import machine_bytes
 from storage.readers.open_cubes import load_labels_array, split_variable
 from storage.readers.raster_fields import is_glob, open_raster
 from storage.readers.scene_files import OpenScene, SceneFacts, load_scene_file
-
-if TYPE_CHECKING:
-    import flows.tasks.rig_field as rig_field
-else:
-    rig_field = deferred("flows.tasks.rig_field")
 
 # Peak of a survey of the farm without controls: 1.58 GB for 1280 x 1024 px, 4.12 GB for 2560 x 2560 px
 FARM_BYTES, FARM_BYTES_PER_PX = 1_000_000_000, 490
@@ -297,17 +291,6 @@ class SimulatedField(FieldSource):
     def opened(self, spool: Path) -> AbstractContextManager[Source]:
         """The simulated source itself."""
         return nullcontext(self.source)
-
-
-def field_source(
-    scene: RasterScene, settings: Settings, simulated: SimulatedSource, planned: Sequence[Sweep]
-) -> FieldSource:
-    """Give who looks, as the settings say; raises what `flows.tasks.rig_field.rig_field` does."""
-    if settings.is_map:
-        return FieldSource()
-    if settings.source != RIG:
-        return SimulatedField(simulated)
-    return rig_field.rig_field(scene, settings, planned)
 
 
 def for_rig(settings: Settings) -> Settings:

@@ -63,23 +63,32 @@ def run_init(source: str, console: Console, *, force: bool = False) -> dict[str,
     with writing(path.parent, "folder"), set_aside(path, force=force):
         with StageProgress(console, TITLES) as progress:
             draft = draft_scene(source, lambda done, name: progress.show("look", done, name, ended=done == 1))
-        write_whole(path, scene_text(draft))
-    return _record(source, path, draft)
-
-
-def scene_text(draft: SceneDraft) -> str:
-    """The lines of a scene.toml, each with a comment on where it comes from."""
-    parts = [
-        [
-            f"# What {_counted(len(draft.files.images), 'image')} here cannot say, as `spectralzoom init` saw it.",
-            "# Any line may be changed or taken away; what comes after a # is a comment.",
-        ],
-        _label_lines(draft),
-        _wavelength_lines(draft),
-        _nodata_lines(draft),
-        _class_lines(draft),
-    ]
-    return "\n\n".join("\n".join(lines) for lines in parts if lines) + "\n"
+        # The lines of a scene.toml, each with a comment on where it comes from.
+        parts = [
+            [
+                f"# What {_counted(len(draft.files.images), 'image')} here cannot say, as `spectralzoom init` saw it.",
+                "# Any line may be changed or taken away; what comes after a # is a comment.",
+            ],
+            _label_lines(draft),
+            _wavelength_lines(draft),
+            _nodata_lines(draft),
+            _class_lines(draft),
+        ]
+        write_whole(path, ("\n\n".join("\n".join(lines) for lines in parts if lines) + "\n"))
+    found = draft.files
+    return {
+        "file": str(path),
+        "images": len(found.images),
+        "labelled": len(found.labels),
+        "labels": draft.pattern,
+        "shape": list(draft.shape),
+        "wavelengths_nm": None if draft.wavelength_nm is None else np.asarray(draft.wavelength_nm).tolist(),
+        "wavelength_origin": draft.wavelength_origin,
+        "classes": [{"name": one.name, "value": one.value, "share": one.share} for one in draft.classes],
+        "notes": list(draft.notes),
+        "unseen": _unseen(draft),
+        "next": _next(source, draft),
+    }
 
 
 def _label_lines(draft: SceneDraft) -> list[str]:
@@ -161,23 +170,6 @@ def _quoted(text: str) -> str:
 def _said(text: str) -> str:
     """Words in a comment, which ends with its line."""
     return "".join(letter if letter.isprintable() else "?" for letter in text)
-
-
-def _record(source: str, path: Path, draft: SceneDraft) -> dict[str, Any]:
-    found = draft.files
-    return {
-        "file": str(path),
-        "images": len(found.images),
-        "labelled": len(found.labels),
-        "labels": draft.pattern,
-        "shape": list(draft.shape),
-        "wavelengths_nm": None if draft.wavelength_nm is None else np.asarray(draft.wavelength_nm).tolist(),
-        "wavelength_origin": draft.wavelength_origin,
-        "classes": [{"name": one.name, "value": one.value, "share": one.share} for one in draft.classes],
-        "notes": list(draft.notes),
-        "unseen": _unseen(draft),
-        "next": _next(source, draft),
-    }
 
 
 def _unseen(draft: SceneDraft) -> list[str]:

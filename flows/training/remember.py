@@ -6,7 +6,7 @@ would have shown it, and read by the weights that the memory is for. Other lands
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -206,14 +206,11 @@ def run_remember(request: MemoryRequest, console: Console) -> dict[str, Any]:
         f"weights with a reader of memories: {request.out}, {record['steps']} steps", markup=False, soft_wrap=True
     )
     if record["validation"]:
-        _print_validation(record["validation"], request.judged, console)
+        rows = record["validation"]
+        title = f"mIoU on {request.judged} lands that training did not see"
+        table = Table("days later", "kept", "look alone", "the surer", "remembered", "scanned anew", title=title)
+        for row in rows:
+            figures = (f"{row[name]:.1%}" for name in ("kept", "look", "surer", "remembered", "anew"))
+            table.add_row(f"{row['days']:g}", *figures)
+        console.print(table)
     return record
-
-
-def _print_validation(rows: Sequence[dict[str, float]], lands: int, console: Console) -> None:
-    title = f"mIoU on {lands} lands that training did not see"
-    table = Table("days later", "kept", "look alone", "the surer", "remembered", "scanned anew", title=title)
-    for row in rows:
-        figures = (f"{row[name]:.1%}" for name in ("kept", "look", "surer", "remembered", "anew"))
-        table.add_row(f"{row['days']:g}", *figures)
-    console.print(table)

@@ -53,7 +53,21 @@ def write_survey_draft(draft: SweepsDraft, *, force: bool = False) -> dict[str, 
     """
     path = draft.folder / SURVEY_NAME
     with writing(draft.folder, "folder"), set_aside(path, force=force):
-        write_whole(path, survey_text(draft))
+        parts = [
+            [
+                "# A survey of the recorded sweeps in this folder, as `spectralzoom init` saw them.",
+                "# Any line may be changed or taken away; what comes after a # is a comment.",
+            ],
+            ['source = "recorded"', f'sweeps = "."   # {_counted(len(draft.cubes), "cube")}: {_listed(draft)}'],
+            _pointing_lines(draft),
+            _frame_lines(draft),
+            _band_lines(draft),
+            [
+                "# budget = 0.5   # two passes in half of the seconds of a full scan; without it every line is read",
+                '# weights = "WEIGHTS.safetensors"   # of a network that was trained on such data; "farm" is built in',
+            ],
+        ]
+        write_whole(path, ("\n\n".join("\n".join(lines) for lines in parts if lines) + "\n"))
     return {
         "file": str(path),
         "sweeps": [cube.name for cube in draft.cubes],
@@ -63,25 +77,6 @@ def write_survey_draft(draft: SweepsDraft, *, force: bool = False) -> dict[str, 
         "unseen": [draft.problem] if draft.problem else [],
         "next": shlex.join(["spectralzoom", "survey", str(path), "--weights", "WEIGHTS.safetensors"]),
     }
-
-
-def survey_text(draft: SweepsDraft) -> str:
-    """Return the lines of a survey.toml, each with a comment on where it comes from."""
-    parts = [
-        [
-            "# A survey of the recorded sweeps in this folder, as `spectralzoom init` saw them.",
-            "# Any line may be changed or taken away; what comes after a # is a comment.",
-        ],
-        ['source = "recorded"', f'sweeps = "."   # {_counted(len(draft.cubes), "cube")}: {_listed(draft)}'],
-        _pointing_lines(draft),
-        _frame_lines(draft),
-        _band_lines(draft),
-        [
-            "# budget = 0.5   # two passes in half of the seconds of a full scan; without it every line is read",
-            '# weights = "WEIGHTS.safetensors"   # of a network that was trained on such data; "farm" is built in',
-        ],
-    ]
-    return "\n\n".join("\n".join(lines) for lines in parts if lines) + "\n"
 
 
 def _pointing_lines(draft: SweepsDraft) -> list[str]:

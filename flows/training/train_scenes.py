@@ -75,7 +75,12 @@ def observe_all(
     for number, (name, scene) in enumerate(zip(names, data.scenes(names), strict=True)):
         report(what, number / len(names), name)
         known = about or _common(request, scene)
-        _check_alike(scene, known)
+        if scene.class_names != known.names:
+            raise SceneError(f"scene {scene.name} has classes {scene.class_names}, the scenes before it {known.names}")
+        if not np.array_equal(scene.wavelength_nm, known.wavelength_nm):
+            raise SceneError(
+                f"scene {scene.name} has other bands than the scenes before it; train on scenes of one camera"
+            )
         known.keys[name] = scene.key
         mask = trained_pixels(scene)
         if request.choices.get("train_mask") is not None:
@@ -123,13 +128,6 @@ def suggested_patch(shape: tuple[int, int], *, built_in: bool) -> int:
     if built_in:
         return 16
     return 32 if min(shape) >= 512 else 16 if min(shape) >= 256 else 8
-
-
-def _check_alike(scene: RasterScene, about: About) -> None:
-    if scene.class_names != about.names:
-        raise SceneError(f"scene {scene.name} has classes {scene.class_names}, the scenes before it {about.names}")
-    if not np.array_equal(scene.wavelength_nm, about.wavelength_nm):
-        raise SceneError(f"scene {scene.name} has other bands than the scenes before it; train on scenes of one camera")
 
 
 def network_config(request: TrainRequest, about: About) -> SegmenterConfig:

@@ -344,11 +344,7 @@ def _opened(path: Path, framework: str) -> Iterator[Any]:
         with safe_open(path, framework=framework) as file:
             yield file
     except DAMAGED as error:
-        raise _unreadable(path, error) from error
-
-
-def _unreadable(path: Path, error: Exception) -> WeightsError:
-    return WeightsError(f"{path} is not a readable safetensors file ({error}); train or copy it again")
+        raise WeightsError(f"{path} is not a readable safetensors file ({error}); train or copy it again") from error
 
 
 def with_record(weights: Learned, **entries: Any) -> Learned:

@@ -11,9 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.capture.recorded import RecordedSource, RecordedSweep
+from pipeline.capture.recorded import RecordedSource
 from pipeline.errors import SceneError
-from pipeline.geometry.camera import LineCamera
 from pipeline.geometry.scan import Axis, Sweep
 
 MOST_CUT_LINES, MOST_CUT_PX = 3, 2.0  # by which a plan may reach beyond a recording: lines that a kernel reads, turns
@@ -113,7 +112,8 @@ class RecordedPasses:
             return []
         like, found = planned[0], list[Sweep]()
         for one in self.source.sweeps:
-            low, high = _ends_px(one, self.source.camera)
+            scan_px = one.tangents[one.valid_line, 1] / self.source.camera.ifov_rad
+            low, high = float(np.nanmin(scan_px)), float(np.nanmax(scan_px))
             lines = int((high - low) // like.step) + 1
             start = low - (like.step - 1) / 2
             name = f"{like.name.rpartition('-')[0]}-{len(found)}"
@@ -125,9 +125,3 @@ class RecordedPasses:
         if not sweep.lines:
             return sweep.exposure_ms
         return self.source.sweeps[int(self.source.pick(sweep).place[0])].sweep.exposure_ms
-
-
-def _ends_px(one: RecordedSweep, camera: LineCamera) -> tuple[float, float]:
-    """The lowest and the highest scan coordinate of valid lines."""
-    scan_px = one.tangents[one.valid_line, 1] / camera.ifov_rad
-    return float(np.nanmin(scan_px)), float(np.nanmax(scan_px))

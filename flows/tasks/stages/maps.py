@@ -94,10 +94,6 @@ def _memory_lies(run: SurveyRun, mosaic: StageRef) -> FieldShift:
     return memory_lies(run.prior.looks, mosaic.path / "mosaic.zarr", run.grid.factor)
 
 
-def _is_turned(run: SurveyRun, lies: FieldShift) -> bool:
-    return lies.edge_px((run.grid.height, run.grid.width)) > MOST_TURN_PX
-
-
 def _drawing(
     run: SurveyRun, work: FieldWork, mosaic: StageRef, patches: StageRef, path: Path, lies: FieldShift
 ) -> Drawing:
@@ -108,7 +104,7 @@ def _drawing(
     create_class_map(path / "class_map.zarr", shape, shown, grid=run.angular_grid())
     prior = run.prior
     memory = None
-    if prior is not None and not _is_turned(run, lies):
+    if prior is not None and not (lies.edge_px((run.grid.height, run.grid.width)) > MOST_TURN_PX):
         last, belief = prior.looks[0], (prior.belief.path / "belief.zarr").resolve()
         coarse = (last.mosaic.path / "mosaic.zarr").resolve() if last.factor == run.grid.factor else None
         memory = FieldMemory(belief, coarse, prior.days, prior.classes, whole_pixels(lies))
