@@ -258,3 +258,13 @@ def test_images_of_one_size_in_a_tiff_are_bands(tmp_path: Path) -> None:
     other = open_cube(tmp_path / "b.tif")
     np.testing.assert_array_equal(other.read(0, 7), values[..., :1])
     assert other.notes == ("the first of 2 images in the file, which are of several kinds",)
+
+
+def test_names_of_matlab_that_claim_too_much(tmp_path: Path) -> None:
+    """A name of a gigabyte is refused before anything of that size is asked for."""
+    scipy.io.savemat(tmp_path / "a.mat", {"cube_of_field": np.ones((3, 4, 5), np.uint8)})
+    whole, tag = (tmp_path / "a.mat").read_bytes(), struct.pack("<II", 1, len("cube_of_field"))
+    assert tag in whole
+    (tmp_path / "a.mat").write_bytes(whole.replace(tag, struct.pack("<II", 1, 1 << 30)))
+    with little_memory(), pytest.raises(SceneError, match="the variable at byte 128 is cut off"):
+        open_cube(tmp_path / "a.mat")
