@@ -127,13 +127,14 @@ def train(
         Weights to begin from: a vision transformer of timm or DeiT, a Segmenter checkpoint with its variant.yml beside
         it, or weights that this command made. What is taken is said, and kept in the weights.
     remember
-        Weights to train a reader of memories for, and nothing else: it weighs what a field's earlier visits left
-        against a later look. OUT has the weights with it, and surveys with --prior use it. Of the other flags it takes --scenes, --steps, --minutes, --seed and --validation; it begins anew where
-        it was stopped. Takes 4 GB; looking at the lands before takes half an hour on top of --minutes.
+        Weights to train a reader of prior maps for, and nothing else: it weighs what earlier visits left against a
+        later one. OUT has the weights with it, and surveys with --prior use it. It takes --scenes, --steps, --minutes,
+        --seed and --validation, and continues where it was stopped. It needs 4 GB; reading the training scenes takes
+        half an hour on top of --minutes.
     familiar
-        Weights to measure what is familiar to, and nothing else: it looks at the scenes of their training again, which
-        DATASET has to be. OUT has the weights with it, and surveys by it call pixels unknown that are unlike all of them. New weights have it from their training, if scenes were kept for
-        validation.
+        Weights to fit the detector of unknown pixels for, and nothing else: it reads the scenes of their training
+        again, which DATASET has to be. OUT has the weights with it; surveys call pixels unknown that are unlike all of
+        them. New weights have it from their training, if scenes were kept for validation.
     dim
         Width of the transformer, the numbers that a patch becomes; 192 and 384 are those of ViT-Tiny and ViT-Small.
     layers
