@@ -128,12 +128,12 @@ def train(
         it, or weights that this command made. What is taken is said, and kept in the weights.
     remember
         Weights to train a reader of memories for, and nothing else: it weighs what a field's earlier visits left
-        against a later look. OUT has the weights with it, and surveys with --prior use it. Of the other flags it takes --scenes, --steps, --minutes, --seed and --validation; it begins anew where
-        it was stopped. Takes 4 GB; looking at the lands before takes half an hour on top of --minutes.
+        against a later look. OUT has the weights with it, and surveys with --prior use it. Of the other flags it takes
+        --scenes, --steps, --minutes, --seed and --validation; it begins anew where it was stopped. Takes 4 GB; looking at the lands before takes half an hour on top of --minutes.
     familiar
         Weights to measure what is familiar to, and nothing else: it looks at the scenes of their training again, which
-        DATASET has to be. OUT has the weights with it, and surveys by it call pixels unknown that are unlike all of them. New weights have it from their training, if scenes were kept for
-        validation.
+        DATASET has to be. OUT has the weights with it, and surveys by it call pixels unknown that are unlike all of
+        them. New weights have it from their training, if scenes were kept for validation.
     dim
         Width of the transformer, the numbers that a patch becomes; 192 and 384 are those of ViT-Tiny and ViT-Small.
     layers
