@@ -129,7 +129,8 @@ def train(
     remember
         Weights to train a reader of memories for, and nothing else: it weighs what a field's earlier visits left
         against a later look. OUT has the weights with it, and surveys with --prior use it. Of the other flags it takes
-        --scenes, --steps, --minutes, --seed and --validation; it begins anew where it was stopped. Takes 4 GB; looking at the lands before takes half an hour on top of --minutes.
+        --scenes, --steps, --minutes, --seed and --validation; it begins anew where it was stopped. Takes 4 GB;
+        looking at the lands before takes half an hour on top of --minutes.
     familiar
         Weights to measure what is familiar to, and nothing else: it looks at the scenes of their training again, which
         DATASET has to be. OUT has the weights with it, and surveys by it call pixels unknown that are unlike all of
