@@ -315,11 +315,13 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
         notes.append(f"the {cube.lost_lines} lines that {cube.path.name} lacks are not filled up")
     first, (_, samples, count) = cubes[0].header, cubes[0].values.shape
     height, native = last + len(cube.values) + lost, cubes[0].values.dtype.newbyteorder("=")
-    valid, exposure = np.zeros(height, np.bool_), np.full(height, np.nan)
+    valid, exposure = np.zeros(height, np.bool_), None
     for start, part in parts.items():
         valid[start : start + len(part.values)] = True
         known = finite_number(part.header.settings.get(_EXPOSURE, ""))
-        exposure[start : start + len(part.values)] = np.nan if known is None else known
+        if known is not None:
+            exposure = np.full(height, np.nan) if exposure is None else exposure
+            exposure[start : start + len(part.values)] = known
     with_bands = next((one for one in cubes if one.header.wavelength_nm is not None), None)
     bands = Bands()
     if with_bands is not None:
@@ -342,7 +344,7 @@ def _joined(name: str, parts: Mapping[int, EnviCube], notes: list[str]) -> CubeS
         dtype=native,
         read=read,
         files=tuple(file for one in cubes for file in (one.header_path, one.path)),
-        lines=LineFacts(valid, exposure_ms=None if np.isnan(exposure).all() else exposure),
+        lines=LineFacts(valid, exposure_ms=exposure),
         bands=bands,
         nodata=first.nodata,
         bad_bands=bad_bands(first.fields.get("bbl"), count),

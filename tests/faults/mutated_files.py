@@ -155,6 +155,10 @@ def try_headers(count: int, folder: Path | None, seed: int = 0) -> Tally:
     rng, texts, tally = random.Random(seed), seeds(folder), Tally()
     with tempfile.TemporaryDirectory() as name:
         header = Path(name) / "a.hdr"
+        for text in texts:  # what reads them is imported before memory is measured
+            header.with_suffix(".bin").write_bytes(data_for(text, random.Random(seed)))
+            header.write_bytes(text.encode("latin-1"))
+            try_reading(header)
         for number in range(count):
             whole = rng.choice(texts)
             text = small(whole, rng) if rng.random() < 0.8 else whole
