@@ -426,7 +426,7 @@ def show_verdict(content: dict[str, Any], console: Console) -> None:
         _say(console, f"{uri} cannot be remade: {why}")
     if content.get("to_remake") or content.get("surveys"):
         count = len(content["to_remake"])
-        _say(console, f"verify --repair remakes {count} stores (what is broken, and what was made of it) by:")
+        _say(console, f"verify --repair makes {count} broken stores anew by:")
         for survey in content["surveys"]:
             _say(console, f"  {survey['run']}: {survey['command']}")
     _say(console, f"{content['whole']} of {content['checked']} stores and runs are as published")
@@ -435,14 +435,10 @@ def show_verdict(content: dict[str, Any], console: Console) -> None:
 def show_repair(content: dict[str, Any], console: Console) -> None:
     """Print what a repair did."""
     done = content["repair"]
-    for title, part in (
-        ("not remade and put back", done["put_back"]),
-        ("failed", done["failed"]),
-        ("left as it is", done["hopeless"]),
-    ):
+    for title, part in (("failed", done["failed"]), ("left as it is", done["hopeless"])):
         for uri, why in part.items():
             console.print(f"[bold yellow]{title}[/] {escape(uri)}: {escape(why)}", soft_wrap=True)
-    left = "nothing broken is left" if done["complete"] else "some is left as it was"
+    left = "nothing broken is left" if done["complete"] else "some could not be made anew"
     _say(console, f"{len(done['remade'])} remade, {len(done['dropped'])} that no run named removed; {left}")
 
 

@@ -21,6 +21,7 @@ KINDS = {bool: "boolean", int: "integer", float: "number", str: "string"}
 
 def _schema(schema: dict[str, Any]) -> None:
     """Add every declared setting to the schema of the parameters: type, choices, default and line of help."""
+    schema["additionalProperties"] = False  # a server refuses what is no setting
     for name, one in SURVEY.items():
         schema["properties"][name] = (
             {
@@ -28,6 +29,7 @@ def _schema(schema: dict[str, Any]) -> None:
                 "type": "object",
                 "description": one.item.metadata["description"],
                 "properties": {key: _described(key, inner) for key, inner in TABLES[name].items() if key != SECRET},
+                "additionalProperties": False,
             }
             if name in TABLES
             else _described(name, one)

@@ -74,7 +74,7 @@ def contents(root: Path) -> dict[str, bytes | None] | None:
 
 REFUSED = {
     "missing file": (1, "--scene none.png", "there is no file none.png"),
-    "corrupt file": (1, "--scene corrupt.png", "corrupt.png cannot be read as .png.*truncated"),
+    "corrupt file": (1, "--scene corrupt.png", "corrupt.png cannot be read as .png.*Copy it again"),
     "folder": (1, "--scene .", "is a folder, expected a file"),
     "labels of another size": (1, "--labels small.png", "small.png are 50 x 128 px, the scene is 96 x 128"),
     "labels missing": (1, "--labels none.png", "there is no file none.png"),

@@ -14,7 +14,7 @@ from flows.publish.findings import changed_hectares, older_hectares
 from flows.publish.receipt_table import finding_rows
 from models.evaluation.expected_scores import MapScores, expected_counts, expected_score
 from models.reading.familiar import Familiar, Limits
-from models.weights.files import add_familiar, describe_weights
+from models.weights.files import add_familiar
 from models.weights.parts import MAP_SCORES, TrainedOn
 from pipeline.errors import WeightsError
 from pipeline.geometry.grid import UNLABELLED
@@ -114,4 +114,3 @@ def test_a_table_that_is_none_is_refused_with_its_file(survey_png: Survey, weigh
     path = _judged(weights, tmp_path, SCORES.as_dict() | {"error": [[0.1]]})
     with pytest.raises(WeightsError, match=r"judged\.safetensors: its description is damaged"):
         survey_png(tmp_path / "a", weights=str(path), effects="none", budget=None, scan_step="1")
-    assert MAP_SCORES not in describe_weights(path).record
