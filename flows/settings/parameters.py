@@ -39,7 +39,7 @@ def _schema(schema: dict[str, Any]) -> None:
 def _described(name: str, one: Declared) -> dict[str, Any]:
     default = one.item.default
     usual = "" if default is None or default is MISSING else f"; {shown(one)} by default"
-    kind: dict[str, Any] = {"type": KINDS.get(one.kind, "string")}
+    kind: dict[str, Any] = {"type": KINDS.get(one.kind, ["string", "number"])}  # such as 0.5 or 50%
     if one.choices:
         kind = {"enum": list(one.choices)}
     elif name in OF_LISTS:
