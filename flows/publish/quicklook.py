@@ -12,7 +12,9 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Patch, Rectangle
+from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 from numpy.typing import NDArray
 
 from flows.publish.panels import MUTED, STYLE, UNLABELLED_COLOUR, class_palette, class_rgb, grey_of, outline, save_png
@@ -69,13 +71,14 @@ def _compose(data: QuicklookData) -> Figure:
     counts = (1,) * 5 if tallness < _FLAT else (5,) if tallness > _TALL else (3, 2)
     page = 18.0 if len(counts) != 2 else min(18.0, 12.5 / (tallness * sum(1 / count for count in counts)))
     tall = [min(max(page * tallness / count, 1.1), 12.0) + 0.9 for count in counts]  # with words above
-    figure = Figure(figsize=(page, sum(tall) + 1.6), dpi=_DPI, layout="constrained")
+    figure = Figure(figsize=(page, sum(tall) + 1.6), dpi=_DPI, layout=ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.08))
     about = [f"{width} × {height} px", data.about, f"seed {data.seed}", *([data.note] if data.note else [])]  # noqa: RUF001
     figure.suptitle(f"{data.survey}   ·   {'   ·   '.join(about)}", x=0.01, ha="left", size=15, weight="bold")
     panels = iter((_draw_raw, _draw_rectified, _draw_attention, _draw_classes, _draw_truth))
     rows = figure.subfigures(len(counts), 1, height_ratios=tall, squeeze=False).ravel()
     for row, count in zip(rows, counts, strict=True):
         for axes in row.subplots(1, count, squeeze=False).ravel():
+            axes.set_anchor("N")  # captions of a row stand at one height
             next(panels)(axes, data)
     _draw_legend(figure, data, max(1, int(page / 2.9)))
     return figure
@@ -98,6 +101,7 @@ def _draw_raw(axes: Axes, data: QuicklookData) -> None:
         left += one.shape[1] + gap
     _show(axes, image if data.along == "x" else image.swapaxes(0, 1))
     axes.set_aspect("auto")
+    axes.set_box_aspect(data.class_map.shape[0] / data.class_map.shape[1])
     count, kind = len(data.raw), "sweep" if data.policy is None or data.scan else "coarse sweep"
     words = f"{count} {kind}{'s' if count != 1 else ''}, {data.raw_lines} lines as they came"
     return _caption(axes, "1  Raw lines", words)
@@ -163,7 +167,15 @@ def _score_range(score: NDArray[np.floating]) -> tuple[NDArray[np.float64], floa
 
 def _draw_classes(axes: Axes, data: QuicklookData) -> None:
     _show(axes, class_rgb(data.class_map, _palette(data)), interpolation="nearest")
+    _scale_bar(axes, data.class_map.shape[1])
     _caption(axes, "3  Class map", "what the model says grows where")
+
+
+def _scale_bar(axes: Axes, width: int) -> None:
+    """Draw a bar of a round number of pixels, at most a quarter of the width."""
+    power = 10 ** int(np.log10(max(width / 4, 1)))
+    length = max(step * power for step in (1, 2, 5) if step * power <= max(width / 4, 1))
+    axes.add_artist(AnchoredSizeBar(axes.transData, length, f"{length} px", "lower left", borderpad=0.5))
 
 
 def _draw_truth(axes: Axes, data: QuicklookData) -> None:
@@ -224,9 +236,11 @@ def _caption(axes: Axes, title: str, words: str) -> None:
 
 
 def _heat_key(image: AxesImage, ends: tuple[str, str]) -> None:
-    """Draw the colours below the panel, with what their ends stand for."""
-    figure = image.axes.get_figure(root=False)
-    assert figure is not None
-    bar = figure.colorbar(image, ax=image.axes, orientation="horizontal", shrink=0.3, pad=0.01, aspect=30)
+    """Draw the colours in the lower right corner, with what their ends stand for."""
+    axes = image.axes
+    box = axes.inset_axes((0.62, 0.09, 0.3, 0.03))
+    bar = axes.figure.colorbar(image, cax=box, orientation="horizontal")
     low, high = image.get_clim()
     bar.set_ticks([low or 0.0, high or 1.0], labels=list(ends))
+    for label in box.get_xticklabels():
+        label.set(bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1})

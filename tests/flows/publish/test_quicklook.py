@@ -155,6 +155,16 @@ def test_palette_colours_are_all_different(count):
     np.testing.assert_array_equal(class_palette(1, given), [[0, 1, 0]])
 
 
+@pytest.mark.parametrize(("width", "length"), [(1, 1), (7, 1), (39, 5), (640, 100), (1280, 200), (2400, 500)])
+def test_scale_bar_is_a_round_number_of_at_most_a_quarter(width, length):
+    """The largest of 1, 2, 5 times a power of ten, one pixel at least."""
+    axes = Figure().subplots()
+    quicklook._scale_bar(axes, width)
+    (bar,) = axes.artists
+    assert bar.txt_label.get_text() == f"{length} px"
+    assert bar.size_bar.get_children()[0].get_width() == length
+
+
 def test_sweeps_stand_apart_and_shorter_ones_are_filled_up():
     """Between two sweeps there is a light gap; below a shorter one as well."""
     data = replace(make_data(60, 60), raw=(np.zeros((30, 40, 5), np.uint16), np.zeros((20, 80, 5), np.uint16)))
