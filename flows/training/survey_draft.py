@@ -173,7 +173,8 @@ def draft_sweeps(folder: Path) -> SweepsDraft | None:
         return None
     if any(source.dtype.name not in CAMERA_NUMBERS for source in sources):
         return None
-    pointing = tuple(sorted(one for one in folder.iterdir() if one.name.lower().endswith(_pointing_names())))
+    endings = tuple(f"pointing{ending}" for ending in ENDINGS)
+    pointing = tuple(sorted(one for one in folder.iterdir() if one.name.lower().endswith(endings)))
     frames = any(find_reference(folder, kind) is not None for kind in ("dark", "white"))
     beside = any(folder.glob("*.dark.hdr")) or any(folder.glob("*.white.hdr"))
     unplaced_envi = all(
@@ -190,7 +191,3 @@ def draft_sweeps(folder: Path) -> SweepsDraft | None:
     first = sources[0]
     known = all(source.bands.wavelength_nm is not None for source in sources)
     return SweepsDraft(folder, tuple(cubes), pointing, recording, first.shape[2], known, problem)
-
-
-def _pointing_names() -> tuple[str, ...]:
-    return tuple(f"pointing{ending}" for ending in ENDINGS)

@@ -77,13 +77,8 @@ class Remembered:
 def first_belief(looked: Looked) -> Belief:
     """What is known of a field that nobody looked at before: what was seen today, be it coarsely."""
     kept = np.maximum(looked.log_probability, np.float32(FAINTEST))  # NaN stays
-    return Belief(kept, _ages(kept, np.zeros(looked.seen.shape, np.float32)), _own_light(looked))
-
-
-def _own_light(looked: Looked) -> Floats:
-    """What today's look adds to the light that a memory rests on, (y, x)."""
-    own: Floats = np.where(looked.seen, looked.light / looked.step**2, 0).astype(np.float32)
-    return own
+    light = np.where(looked.seen, looked.light / looked.step**2, 0).astype(np.float32)
+    return Belief(kept, _ages(kept, np.zeros(looked.seen.shape, np.float32)), light)
 
 
 def recall(memory: Remembered, looked: Looked, reader: MemoryReader | None) -> Belief:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from models.network.segmenter import Segmenter
 from models.network.sizes import MOST_GAIN, SegmenterConfig
-from models.training.examples import Batch, Example
+from models.training.examples import Batch
 from pipeline.geometry.grid import UNLABELLED
 
 GLANCE_WEIGHT, SCORER_WEIGHT = 0.4, 1.0  # of the map without a seat, and of the scorer, beside the map with seats
@@ -48,12 +48,7 @@ def phase_at(done: float) -> Phase:
     return next((phase for phase in PHASES if done < phase.until), PHASES[-1])
 
 
-def class_weights(examples: list[Example], classes: int, cap: float) -> Tensor:
-    """Weights of the classes that scenes show, as `weights_of_classes`."""
-    return weights_of_classes([example.labels for example in examples], classes, cap)
-
-
-def weights_of_classes(labels: Iterable[NDArray[np.uint8]], classes: int, cap: float) -> Tensor:
+def class_weights(labels: Iterable[NDArray[np.uint8]], classes: int, cap: float) -> Tensor:
     """Weights 1 / sqrt(frequency), mean 1 over the labelled pixels' classes, capped; 0 for a class without a pixel."""
     counts = np.zeros(classes)
     for image in labels:

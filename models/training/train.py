@@ -109,7 +109,7 @@ class Trainer:
             self.samplers[larger] = CropSampler(
                 examples, config.patch, config.factor, crop, noise=settings.noise, looks=looks
             )
-        self.weight = class_weights(examples, config.classes, settings.weight_cap).to(device)
+        self.weight = class_weights([one.labels for one in examples], config.classes, settings.weight_cap).to(device)
         self.course = Course()
         self.batch: Batch | None = None  # of the last step
         self._started, self._worked = time.monotonic(), time.process_time()

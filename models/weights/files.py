@@ -237,7 +237,7 @@ def load_weights(path: Path) -> Weights:
     """
     described = describe_weights(path)
     tensors = read_tensors(path, described)
-    network = _network(described.config, "cpu")
+    network = segmenter.Segmenter(described.config)
     network.load_state_dict({name: tensors[name] for name in network.state_dict()})
     normalisation = Normalisation(*(tensors[f"normalisation.{name}"].numpy() for name in NORMALISATION))
     return Weights(
@@ -248,11 +248,6 @@ def load_weights(path: Path) -> Weights:
         tensors["class_colours"].numpy(),
         described.record,
     )
-
-
-def _network(config: SegmenterConfig, device: str) -> Segmenter:
-    with torch.device(device):
-        return segmenter.Segmenter(config)
 
 
 def read_tensors(path: Path, described: Description) -> dict[str, Tensor]:
@@ -325,7 +320,9 @@ def misfit(config: SegmenterConfig, claimed: Mapping[str, Any]) -> str:
     device, where tensors have a size and no memory.
     """
     one, all_pairs = (config.columns,), (config.columns, config.columns)
-    wanted = {name: (tuple(value.shape), "F32") for name, value in _network(config, "meta").state_dict().items()}
+    with torch.device("meta"):
+        network = segmenter.Segmenter(config)
+    wanted = {name: (tuple(value.shape), "F32") for name, value in network.state_dict().items()}
     wanted |= {"normalisation.centre": (one, "F32"), SPREAD: (one, "F32")}
     wanted |= {"normalisation.whitening": (all_pairs, "F32"), "class_colours": ((config.classes, 3), "U8")}
     for name, (shape, kind) in wanted.items():

@@ -23,7 +23,7 @@ from flows.training import train_scenes
 from flows.training.data import pack_mask, unpack_mask
 from flows.training.familiarity import FamiliarRequest, measure_familiar
 from flows.training.train import joined_split, run_train, train_weights
-from flows.training.train_scenes import TrainRequest, suggested_patch
+from flows.training.train_scenes import TrainRequest, observe_all, suggested_patch
 from models.evaluation.expected_scores import MapScores
 from models.training.start_weights import StartFile
 from models.training.train import TrainingSettings
@@ -139,11 +139,11 @@ def test_scenes_of_other_bands_are_not_mixed(folder: Path, out: Path):
     """One camera's scenes make one set of weights: the scene that differs is named."""
     request = _request(folder, out)
     data = flow.open_training_data(request.dataset, 0, None, request.camera)
-    first, second = data.scenes(data.train[:2])
-    common = train_scenes._common(request, first)
-    train_scenes._check_alike(second, common)
+    first, second = data.train[:2]
+    _, about = observe_all(request, data, (first,), "looking", lambda what, done, figure: None)
+    about.wavelength_nm = about.wavelength_nm + 10
     with pytest.raises(SceneError, match=r"scene 002.* has other bands"):
-        train_scenes._check_alike(replace(second, wavelength_nm=second.wavelength_nm + 10), common)
+        observe_all(request, data, (second,), "looking", lambda what, done, figure: None, about)
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ def test_training_learns():
     scene, settings = block_example(64, 16), replace(SETTINGS, steps=40, crop=32, learning_rate=1e-2)
     model, summary = train(CONFIG, [scene], SHIFT, settings, lambda now: losses.append(now.loss))
     batch = CropSampler([scene], 8, 2, 32).draw(8, np.random.default_rng(0), SHIFT)
-    weight = class_weights([scene], 3, 5.0)
+    weight = class_weights([scene.labels], 3, 5.0)
     with torch.no_grad():
         last = batch_loss(model, batch, weight, np.random.default_rng(0), phase_at(0.0), soft_dice=False)
     assert last < losses[0] / 3
@@ -95,11 +95,11 @@ def test_rare_classes_weigh_more():
     """Weights go by one over the root of the share, with mean 1 over pixels; a class without a pixel has none."""
     labels = np.full((10, 10), 255, np.uint8)
     labels[:8], labels[8:9, :8], labels[9:, :0] = 0, 1, 2
-    weight = class_weights([replace(block_example(), labels=labels)], 3, 100.0).numpy()
+    weight = class_weights([labels], 3, 100.0).numpy()
     assert weight[1] / weight[0] == pytest.approx(np.sqrt(10))
     assert (80 * weight[0] + 8 * weight[1]) / 88 == pytest.approx(1)
     assert weight[2] == 0
-    assert class_weights([replace(block_example(), labels=labels)], 3, 2.0).max() == 2
+    assert class_weights([labels], 3, 2.0).max() == 2
 
 
 def test_seats_are_drawn_where_the_glance_is_unsure_or_anywhere():
