@@ -6,7 +6,6 @@ would have shown it, and read by the weights that the memory is for. Other lands
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -187,12 +186,10 @@ def judge_memory(
             rows[days].append({name: mean_iou(one) for name, one in counts.items()})
     if not request.judged:
         return None
-    return [{"days": float(days), **_means(found)} for days, found in rows.items()]
-
-
-def _means(rows: Iterable[dict[str, float]]) -> dict[str, float]:
-    found = list(rows)
-    return {name: float(np.mean([row[name] for row in found])) for name in found[0]}
+    return [
+        {"days": float(days), **{name: float(np.mean([row[name] for row in found])) for name in found[0]}}
+        for days, found in rows.items()
+    ]
 
 
 def run_remember(request: MemoryRequest, console: Console) -> dict[str, Any]:
