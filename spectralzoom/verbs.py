@@ -164,7 +164,7 @@ def train(
     command = f"spectralzoom.train({', '.join([repr(Path(dataset).name), *(f'{k}={v!r}' for k, v in asked.items())])})"
     sizes, choices = _taken(asked, TOKENS), _taken(asked, OF_ONE_SCENE)
     own = _taken(asked, [one.name for one in fields(how)])
-    own.setdefault("crop", train_command.usual_crop(str(dataset), asked.get("preset", "two-scale")))
+    own.setdefault("crop", train_command.usual_crop(str(dataset)))
     if "hold_out" in asked:
         asked["hold_out"] = tuple(_several(asked["hold_out"]))
     if asked.get("init") is not None:

@@ -67,7 +67,6 @@ def train(
     patch: int | None = None,
     factor: int = 4,
     columns: int = 24,
-    preset: Literal["two-scale", "paper", "dense", "upsampled", "coarser"] = "two-scale",
     positions: Literal["2d", "paper"] = "2d",
     init: Path | None = None,
     remember: Path | None = None,
@@ -117,10 +116,6 @@ def train(
         How many times coarser the coarse pass is than the fine one.
     columns
         How many numbers a pixel's spectrum is brought to, whatever bands a camera has.
-    preset
-        Which network: `two-scale`, what surveys are made with, or a control to set beside it:
-        `paper`, the network of the paper; `dense`, one of ours that reads all of the scene finely, without a coarse
-        pass; `upsampled`, the same given the coarse pass alone; `coarser`, the same given a grid coarser by 2.
     positions
         How patches are told their places: `2d`, by row and column, or `paper`, by one running number.
     init
@@ -144,7 +139,7 @@ def train(
     mlp_ratio
         How many times wider the middle of its MLPs is.
     crop
-        Size of the crops [px]; by default 256 for the farm, 384 for files, whole scenes for the paper's network.
+        Size of the crops [px]; by default 256 for the farm, 384 for files.
     batch
         Crops a step; half as many in the last 30 % of the run, where crops have twice the area if scenes are large
         enough.
@@ -188,7 +183,7 @@ def train(
         if as_json:
             print_json(known)
         return 0
-    size = crop if crop is not None else usual_crop(dataset, preset)
+    size = crop if crop is not None else usual_crop(dataset)
     request = TrainRequest(
         dataset,
         out,
@@ -199,7 +194,6 @@ def train(
         factor,
         columns,
         positions=positions,
-        preset=preset,
         tokens={"dim": dim, "layers": layers, "heads": heads, "mlp_ratio": mlp_ratio},
         init=init,
         choices=choices,

@@ -151,12 +151,6 @@ def open_candidates(paths: tuple[Path, ...]) -> list[Candidate]:
         raise SettingsError("evaluate needs --weights FILE; train some with: spectralzoom train DATASET -o FILE")
     found = [Candidate.of(path) for path in paths]
     first = found[0].described
-    for other in found:
-        if other.described.config.preset != "two-scale":
-            raise SettingsError(
-                f"{other.path} holds the control network {other.described.config.preset!r}, which reads no patches; "
-                "give weights of two scales, such as `train` makes without --preset"
-            )
     for other in found[1:]:
         if other.camera != found[0].camera:
             raise SettingsError(

@@ -14,15 +14,7 @@ from flows.settings.survey_settings import BUILT_IN_SCENES, Settings
 from flows.settings.values import UNKNOWN_AUTO, UNKNOWN_OFF
 from models.network.machine import choose_device
 from models.policies.vgg_file import VggFile
-from models.weights.files import (
-    Description,
-    Weights,
-    check_two_scale,
-    describe_weights,
-    load_familiar,
-    load_reader,
-    load_weights,
-)
+from models.weights.files import Description, Weights, describe_weights, load_familiar, load_reader, load_weights
 from models.weights.parts import TRAINED_ON, FamiliarPart, TrainedOn
 from pipeline.errors import SettingsError, WeightsError
 from pipeline.geometry.grid import SceneGrid
@@ -53,7 +45,6 @@ class SurveyModel:
         machine lacks the device.
         """
         described, load = describe_weights(path), Once(lambda: load_weights(path).on(choose_device(settings.device)))
-        check_two_scale(described.config, path)
         model = SurveyModel(path, described, load, vgg_file(settings))
         if not planning:
             load()

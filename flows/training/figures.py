@@ -20,43 +20,25 @@ from models.evaluation.metrics import (
     iou_per_class,
     mean_iou,
 )
-from models.evaluation.placement import CONTROL_SHARE, RANDOM_DRAWS, Controls, Counts, agreement_of_draws, run_controls
-from models.network.segmenter import Segmenter
+from models.evaluation.placement import CONTROL_SHARE, Controls, Counts, run_controls
 from models.network.spectral import patches_of
-from models.policies.policies import score_seats
-from models.reading.control_maps import draw_with_control
-from models.reading.inference import Glance, glance_of_columns, segment
+from models.reading.inference import glance_of_columns, segment
 from models.training.examples import Example
 from models.training.looks import REFERENCE_MS, Looks
-from models.weights.files import AnyWeights, Weights
+from models.weights.files import Weights
 from pipeline.geometry.grid import UNLABELLED, SceneGrid
-from pipeline.planning.selection import frame_seats
 
 Show = Callable[[str], None]
 Patches = NDArray[np.float32]  # (seat, p, p, column) of every seat of the padded grid
 
 
-def validate(weights: AnyWeights, examples: Iterable[Example], seed: int, show: Show) -> dict[str, Any] | None:
-    """`agreement` over all scenes together, at one share of the seats; None without a scene.
-
-    Of a control, those rows that it has: the paper's network is drawn with no seat, random ones, those with edges and
-    all; `upsampled` sees none and stands as `none`; `dense` and `coarser` see all of the scene and stand as `all`.
-    """
-    if not isinstance(weights.network, Segmenter):
-        scenes = [_control_rows(weights, one, seed, show) for one in examples]
-        told: dict[str, Any] = {"scenes": len(scenes), "share_of_seats": CONTROL_SHARE}
-        for name in scenes[0] if scenes else ():
-            draws = [_added(list(parts)) for parts in zip(*(scene[name] for scene in scenes), strict=True)]
-            told[name] = agreement(draws[0]) if name in ("none", "all") else agreement_of_draws(draws)
-        return told if scenes else None
-    two_scale = Weights(
-        weights.network, weights.basis, weights.normalisation, weights.class_names, weights.class_colours
-    )
+def validate(weights: Weights, examples: Iterable[Example], seed: int, show: Show) -> dict[str, Any] | None:
+    """`agreement` over all scenes together, at one share of the seats; None without a scene."""
     rows = []
     for example in examples:
-        grid, cells, labels = _parts(two_scale, example)
-        seen = glance_of_columns(two_scale, example.coarse, grid)
-        rows.append(run_controls(two_scale, seen, cells, labels, share=CONTROL_SHARE, seed=seed, report=show))
+        grid, cells, labels = _parts(weights, example)
+        seen = glance_of_columns(weights, example.coarse, grid)
+        rows.append(run_controls(weights, seen, cells, labels, share=CONTROL_SHARE, seed=seed, report=show))
     if not rows:
         return None
     whole = Controls(
@@ -167,36 +149,9 @@ def _scanned(
     return _JudgedScan(confusion(labels, drawn.classes, classes), sure, expected)
 
 
-def _parts(weights: AnyWeights, example: Example) -> tuple[SceneGrid, Patches, NDArray[np.uint8]]:
+def _parts(weights: Weights, example: Example) -> tuple[SceneGrid, Patches, NDArray[np.uint8]]:
     grid = SceneGrid(*example.shape, weights.config.patch, weights.config.factor)
     return grid, patches_of(example.fine, grid.patch).astype(np.float32), example.labels[: grid.height, : grid.width]
-
-
-def _control_rows(weights: AnyWeights, example: Example, seed: int, show: Show) -> dict[str, list[Counts]]:
-    """Confusion counts of each row that a control has, one for each random draw."""
-    grid, cells, labels = _parts(weights, example)
-    # these policies ask the coarse image and the place of a seat, not a glance's classes
-    look = Glance(grid, np.ascontiguousarray(example.coarse, np.float32), np.empty((0, 0, 0), np.float32))
-    valid = grid.valid_seats()
-
-    def counts(name: str, seats: NDArray[np.integer]) -> Counts:
-        show(name)
-        return confusion(labels, draw_with_control(weights, look, cells[seats], seats).classes, weights.config.classes)
-
-    def placed(policy: str, number: int = 0) -> NDArray[np.integer]:
-        worth = score_seats(policy, look, seed=seed + number)
-        return frame_seats(worth, CONTROL_SHARE, grid.valid_share().ravel() > 0).seats
-
-    if weights.config.preset == "upsampled":
-        return {"none": [counts("none", valid[:0])]}
-    if weights.config.design == "dense":
-        return {"all": [counts("all", valid)]}
-    return {
-        "none": [counts("none", valid[:0])],
-        "random": [counts("random", placed("random", 1000 * (draw + 1))) for draw in range(RANDOM_DRAWS)],
-        "sobel": [counts("sobel", placed("sobel"))],
-        "all": [counts("all", valid)],
-    }
 
 
 def _added(parts: list[Counts]) -> Counts:

@@ -16,9 +16,10 @@ from rich.console import Console
 from rich.markup import escape
 
 from flows.cli.app import AsJson, Switch, stderr
+from flows.terminal.figures import counted
 from flows.terminal.processes import DONE, writing
 from flows.terminal.progress import StageProgress, put_out
-from flows.training.survey_draft import draft_sweeps, set_aside, show_survey_draft, write_survey_draft
+from flows.training.survey_draft import draft_sweeps, printable, set_aside, show_survey_draft, write_survey_draft
 from pipeline.readings import MOST_VALUE
 from storage.archive.whole_files import write_whole
 from storage.readers.label_files import is_store, listed_names
@@ -66,7 +67,7 @@ def run_init(source: str, console: Console, *, force: bool = False) -> dict[str,
         # The lines of a scene.toml, each with a comment on where it comes from.
         parts = [
             [
-                f"# What {_counted(len(draft.files.images), 'image')} here cannot say, as `spectralzoom init` saw it.",
+                f"# What {counted(len(draft.files.images), 'image')} here cannot say, as `spectralzoom init` saw it.",
                 "# Any line may be changed or taken away; what comes after a # is a comment.",
             ],
             _label_lines(draft),
@@ -98,8 +99,8 @@ def _label_lines(draft: SceneDraft) -> list[str]:
     if draft.pattern is None:
         pair = next(iter(labels.items()))
         return [
-            f"# {len(labels)} of {len(images)} images have labels, found by their names: {_said(pair[0].name)}"
-            f" has {_said(pair[1].name)}"
+            f"# {len(labels)} of {len(images)} images have labels, found by their names: {printable(pair[0].name)}"
+            f" has {printable(pair[1].name)}"
         ]
     return [f"labels = {_quoted(draft.pattern)}   # of {len(labels)} of {len(images)} images"]
 
@@ -113,7 +114,7 @@ def _wavelength_lines(draft: SceneDraft) -> list[str]:
         ]
     if "assumed" not in draft.wavelength_origin:
         low, high = draft.wavelength_nm.min(), draft.wavelength_nm.max()
-        return [f"# {bands} bands, {low:g}-{high:g} nm: {_said(draft.wavelength_origin)}"]
+        return [f"# {bands} bands, {low:g}-{high:g} nm: {printable(draft.wavelength_origin)}"]
     listed = ", ".join(repr(float(nm)) for nm in draft.wavelength_nm)
     return [f"# wavelengths_nm = [{listed}]   # assumed of its colours: if you know better, take away the first #"]
 
@@ -143,16 +144,12 @@ def _class_lines(draft: SceneDraft) -> list[str]:
         f"# unlabelled = {_value(one)}   # if it stands for no class: take away the #, and its line below"
         for one in guess[:1]
     ]
-    named = f"names from {_said(legend.name)}" if legend is not None else "rename them as you like"
+    named = f"names from {printable(legend.name)}" if legend is not None else "rename them as you like"
     told = f"name = value in the label files, share of all pixels; {named}"
     if all(is_polygon_file(label) for label in draft.files.labels.values()):
         told = "name = number, share of the labelled pixels; polygons say the name or the number"
     lines += ["", f"[classes]   # {told}"]
     return lines + [f"{_key(one.name)} = {_value(one)}   # {one.share:.1%}" for one in classes if one not in void[:1]]
-
-
-def _counted(count: int, what: str) -> str:
-    return f"{count} {what}{'s' if count != 1 else ''}"
 
 
 def _value(one: FoundClass) -> str:
@@ -167,21 +164,16 @@ def _quoted(text: str) -> str:
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
-def _said(text: str) -> str:
-    """Words in a comment, which ends with its line."""
-    return "".join(letter if letter.isprintable() else "?" for letter in text)
-
-
 def _unseen(draft: SceneDraft) -> list[str]:
     """What somebody has to look at: what could not be told from the files, or does not fit."""
     found, told = draft.files, []
     if found.labels and found.bare:
-        images = _counted(len(found.bare), "image")
+        images = counted(len(found.bare), "image")
         told.append(f"labels of {images}, left out of the training: {listed_names(found.bare)}")
     if not found.labels:
         told.append("label files: beside an image NAME.png they are called NAME_mask.png, or labels/NAME.png")
     if found.alone:
-        told.append(f"the image of {_counted(len(found.alone), 'label file')}: {listed_names(found.alone)}")
+        told.append(f"the image of {counted(len(found.alone), 'label file')}: {listed_names(found.alone)}")
     if draft.wavelength_nm is None:
         told.append(f"the wavelengths of {draft.shape[2]} bands: write wavelengths_nm into {SETTINGS_NAME}")
     if len(draft.classes) == 1:
@@ -200,7 +192,7 @@ def _next(source: str, draft: SceneDraft) -> str:
 
 def _show(record: dict[str, Any], console: Console) -> None:
     height, width, bands = record["shape"]
-    images = _counted(record["images"], "image")
+    images = counted(record["images"], "image")
     names = ", ".join(one["name"] for one in record["classes"][:8])
     more = f" and {len(record['classes']) - 8} more" if len(record["classes"]) > 8 else ""
     console.print(f"{images}, {record['labelled']} with labels; the first has {height} x {width} px, {bands} bands")

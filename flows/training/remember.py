@@ -6,7 +6,6 @@ would have shown it, and read by the weights that the memory is for. Other lands
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ from models.evaluation.metrics import confusion, mean_iou
 from models.network.memory_reader import MemoryReader
 from models.network.spectral import patches_of
 from models.reading.inference import glance_of_columns, segment
-from models.reading.remembered import Belief, Looked, Remembered, first_belief, recall
+from models.reading.remembered import Looked, Remembered, first_belief, recall
 from models.training.looks import REFERENCE_MS, ColumnNoise, Looks, drawn_step
 from models.training.memory import MemoryTraining, PastLook, Visit, train_reader
 from models.training.train import Progress
@@ -183,19 +182,14 @@ def judge_memory(
                 "remembered": recall(remembered, now, reader),
                 "anew": first_belief(anew),
             }
-            rows[days].append({name: _score(belief, later.labels) for name, belief in beliefs.items()})
+            counts = {name: confusion(later.labels, one.classes()[0], len(CLASSES)) for name, one in beliefs.items()}
+            rows[days].append({name: mean_iou(one) for name, one in counts.items()})
     if not request.judged:
         return None
-    return [{"days": float(days), **_means(found)} for days, found in rows.items()]
-
-
-def _score(belief: Belief, labels: NDArray[np.uint8]) -> float:
-    return mean_iou(confusion(labels, belief.classes()[0], len(CLASSES)))
-
-
-def _means(rows: Iterable[dict[str, float]]) -> dict[str, float]:
-    found = list(rows)
-    return {name: float(np.mean([row[name] for row in found])) for name in found[0]}
+    return [
+        {"days": float(days), **{name: float(np.mean([row[name] for row in found])) for name in found[0]}}
+        for days, found in rows.items()
+    ]
 
 
 def run_remember(request: MemoryRequest, console: Console) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 
+from flows.terminal.figures import counted
 from flows.terminal.processes import writing
 from pipeline.errors import PipelineError, SettingsError
 from storage.archive.whole_files import write_whole
@@ -58,7 +59,7 @@ def write_survey_draft(draft: SweepsDraft, *, force: bool = False) -> dict[str, 
                 "# A survey of the recorded sweeps in this folder, as `spectralzoom init` saw them.",
                 "# Any line may be changed or taken away; what comes after a # is a comment.",
             ],
-            ['source = "recorded"', f'sweeps = "."   # {_counted(len(draft.cubes), "cube")}: {_listed(draft)}'],
+            ['source = "recorded"', f'sweeps = "."   # {counted(len(draft.cubes), "cube")}: {_listed(draft)}'],
             _pointing_lines(draft),
             _frame_lines(draft),
             _band_lines(draft),
@@ -81,10 +82,10 @@ def write_survey_draft(draft: SweepsDraft, *, force: bool = False) -> dict[str, 
 
 def _pointing_lines(draft: SweepsDraft) -> list[str]:
     recording = draft.recording
-    found = [one for one in draft.pointing if any(one.name.startswith(f"{_stem(cube)}.") for cube in draft.cubes)]
+    found = [one for one in draft.pointing if any(one.name.startswith(f"{cube.stem}.") for cube in draft.cubes)]
     if found:
         more = " and so on, by the cubes' names" if found[1:] else ""
-        return [f"# pointing is taken from {_said(found[0].name)}{more}"]
+        return [f"# pointing is taken from {printable(found[0].name)}{more}"]
     if draft.pointing:
         return [f"pointing = {json.dumps(draft.pointing[0].name)}   # a row for each line"]
     assumed = "" if recording is None else "; without it one straight, even scan is assumed"
@@ -111,27 +112,19 @@ def _band_lines(draft: SweepsDraft) -> list[str]:
 
 
 def _listed(draft: SweepsDraft) -> str:
-    names = [_said(cube.name) for cube in draft.cubes[:4]]
+    names = [printable(cube.name) for cube in draft.cubes[:4]]
     return ", ".join(names) + (", ..." if len(draft.cubes) > len(names) else "")
 
 
-def _said(text: str) -> str:
-    """Words in a comment, which ends with its line."""
+def printable(text: str) -> str:
+    """Give words for a comment, which ends with its line: what cannot be printed is a question mark."""
     return "".join(letter if letter.isprintable() else "?" for letter in text)
-
-
-def _stem(cube: Path) -> str:
-    return cube.name.removesuffix(cube.suffix)
-
-
-def _counted(count: int, what: str) -> str:
-    return f"{count} {what}{'s' if count != 1 else ''}"
 
 
 def show_survey_draft(record: Mapping[str, Any], console: Console) -> None:
     """Print what was found and written, and the next command."""
     lines = "" if record["lines"] is None else f" with {record['lines']} lines"
-    console.print(escape(f"{_counted(len(record['sweeps']), 'sweep')}{lines}, {record['bands']} bands"), soft_wrap=True)
+    console.print(escape(f"{counted(len(record['sweeps']), 'sweep')}{lines}, {record['bands']} bands"), soft_wrap=True)
     for note in record["notes"]:
         console.print(escape(f"note: {note}"), soft_wrap=True)
     for words in record["unseen"]:
@@ -173,7 +166,8 @@ def draft_sweeps(folder: Path) -> SweepsDraft | None:
         return None
     if any(source.dtype.name not in CAMERA_NUMBERS for source in sources):
         return None
-    pointing = tuple(sorted(one for one in folder.iterdir() if one.name.lower().endswith(_pointing_names())))
+    endings = tuple(f"pointing{ending}" for ending in ENDINGS)
+    pointing = tuple(sorted(one for one in folder.iterdir() if one.name.lower().endswith(endings)))
     frames = any(find_reference(folder, kind) is not None for kind in ("dark", "white"))
     beside = any(folder.glob("*.dark.hdr")) or any(folder.glob("*.white.hdr"))
     unplaced_envi = all(
@@ -190,7 +184,3 @@ def draft_sweeps(folder: Path) -> SweepsDraft | None:
     first = sources[0]
     known = all(source.bands.wavelength_nm is not None for source in sources)
     return SweepsDraft(folder, tuple(cubes), pointing, recording, first.shape[2], known, problem)
-
-
-def _pointing_names() -> tuple[str, ...]:
-    return tuple(f"pointing{ending}" for ending in ENDINGS)

@@ -20,14 +20,13 @@ from flows.training.figures import judge_scans, validate
 from flows.training.train_scenes import About, TrainRequest, as_read, network_config, observe_all, question_labels
 from models.evaluation.expected_scores import MapScores
 from models.network.machine import choose_device
-from models.network.segmenter import Segmenter
-from models.network.sizes import Preset, SegmenterConfig
+from models.network.sizes import SegmenterConfig
 from models.network.spectral import Normalisation
 from models.training.examples import Example, measured_normalisation
 from models.training.looks import REFERENCE_MS, Looks
 from models.training.start_weights import Start, StartFile
 from models.training.train import Progress, train
-from models.weights.files import CALIBRATION, AnyWeights, Weights, save_weights, with_record
+from models.weights.files import CALIBRATION, Weights, save_weights, with_record
 from models.weights.parts import MAP_SCORES, TRAINED_ON
 from models.weights.sealed_files import read_checkpoint
 from pipeline.errors import SettingsError, ShapeError
@@ -35,7 +34,6 @@ from pipeline.simulator.scenes.farm.farm_scene import FARM_NAMES
 
 Split = dict[str, Any]
 FRAME_CROP, FARM_CROP = 384, 256  # px
-WHOLE_CROP = 1024  # px; the paper's network counts its places along the whole scene, a crop's would be others
 
 
 def train_weights(
@@ -53,7 +51,7 @@ def train_weights(
     _check_places(request.out, checkpoint)
     read_checkpoint(checkpoint)  # refuses a damaged one before minutes are spent
     device = choose_device(request.device)
-    start = open_start(request.init, request.tokens, request.preset)
+    start = open_start(request.init, request.tokens)
     data = open_training_data(
         request.dataset,
         request.validation,
@@ -90,11 +88,9 @@ def train_weights(
     }
     save_weights(with_record(weights, **record), request.out)
     checkpoint.unlink(missing_ok=True)
-    if isinstance(weights.network, Segmenter):
-        own = {"command": request.command, **({} if scores is None else {MAP_SCORES: scores.as_dict()})}
-        why = measure_and_add(_two_scale(weights), request.out, whole, told, own, report)
-        record = record if why is None else {**record, "familiar": why}
-    return record
+    own = {"command": request.command, **({} if scores is None else {MAP_SCORES: scores.as_dict()})}
+    why = measure_and_add(weights, request.out, whole, told, own, report)
+    return record if why is None else {**record, "familiar": why}
 
 
 @dataclass(frozen=True)
@@ -127,7 +123,7 @@ def _lesson(
 
 def _learned(
     request: TrainRequest, lesson: Lesson, checkpoint: Path, report: Report
-) -> tuple[AnyWeights, dict[str, float | int]]:
+) -> tuple[Weights, dict[str, float | int]]:
     """Train the network; weights, and a summary of the training."""
 
     def progress(now: Progress) -> None:
@@ -145,27 +141,18 @@ def _learned(
         device=choose_device(request.device),
     )
     about = lesson.about
-    return AnyWeights(model, about.basis, lesson.normalisation, about.names, about.colours), summary
-
-
-def _two_scale(weights: AnyWeights, **entries: Any) -> Weights:
-    """Weights of a segmenter as what they are, with entries in their record."""
-    assert isinstance(weights.network, Segmenter)
-    own = (weights.basis, weights.normalisation, weights.class_names, weights.class_colours)
-    return Weights(weights.network, *own, entries)
+    return Weights(model, about.basis, lesson.normalisation, about.names, about.colours), summary
 
 
 def _figures(
-    weights: AnyWeights, frames: list[Example], looks: Looks | None, seed: int, report: Report
+    weights: Weights, frames: list[Example], looks: Looks | None, seed: int, report: Report
 ) -> tuple[dict[str, Any], MapScores | None]:
     """What the record says of scenes kept for validation; of plain scans too, where training saw such looks."""
     figures = {"validation": validate(weights, frames, seed, lambda row: report("validating", 0.0, row))}
-    if not isinstance(weights.network, Segmenter):
-        return figures, None
-    calibration = measured_calibration(_two_scale(weights), frames, seed)
-    figures |= {} if calibration is None else {CALIBRATION: calibration}
-    two_scale = _two_scale(weights, calibration=calibration or {})
-    scans = judge_scans(two_scale, frames, looks, seed, report)
+    if (calibration := measured_calibration(weights, frames, seed)) is not None:
+        figures[CALIBRATION] = calibration
+        weights = with_record(weights, calibration=calibration)
+    scans = judge_scans(weights, frames, looks, seed, report)
     return (figures, None) if scans is None else (figures | {"scans": scans.record}, scans.scores)
 
 
@@ -182,12 +169,10 @@ def _check_places(out: Path, checkpoint: Path) -> None:
             )
 
 
-def open_start(init: Path | None, tokens: Mapping[str, Any], preset: Preset) -> StartFile | None:
+def open_start(init: Path | None, tokens: Mapping[str, Any]) -> StartFile | None:
     """The file to begin from, if any. SettingsError: not there, or another network; WeightsError: no known kind."""
     if init is None:
         return None
-    if preset != "two-scale":
-        raise SettingsError(f"--init is for the two-scale network, got --preset {preset}; leave one of both out")
     start = StartFile(init)
     try:
         start.check(SegmenterConfig(2, **tokens))
@@ -224,9 +209,9 @@ def joined_split(split: Split, start: StartFile | None) -> Split:
     return split | {"train": own | more, "pixels": {key: mask for key, mask in masks.items() if key not in whole}}
 
 
-def usual_crop(dataset: str, preset: Preset) -> int:
-    """Size of the crops to train on [px]: whole scenes for the paper's network, as far as they are square."""
-    return WHOLE_CROP if preset == "paper" else FARM_CROP if dataset in FARM_NAMES else FRAME_CROP
+def usual_crop(dataset: str) -> int:
+    """Size of the crops to train on [px]."""
+    return FARM_CROP if dataset in FARM_NAMES else FRAME_CROP
 
 
 def run_train(request: TrainRequest, console: Console) -> dict[str, Any]:
@@ -267,10 +252,6 @@ def _check_counts(request: TrainRequest) -> None:
             f"--darkest-ms must be above 0 and at most {REFERENCE_MS:g}, the exposure that scenes are looked at with,"
             f" got {settings.darkest_ms}"
         )
-    if request.positions == "paper" and request.preset not in ("two-scale", "paper"):
-        raise SettingsError(
-            f"--positions paper is not for --preset {request.preset}, which reads one scale; leave it out"
-        )
 
 
 def asked_command() -> str:
@@ -285,9 +266,6 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
     if "familiar" in record:
         console.print(record["familiar"], markup=False, soft_wrap=True)
     figures = record["validation"]
-    if figures is None and request.preset != "two-scale":
-        console.print("no scene was kept for validation, so that this control network is not judged")
-        return
     if figures is None:
         console.print(
             "no scene was kept for validation; to judge the weights on scenes that they were not trained on: "
@@ -301,8 +279,7 @@ def _print_figures(record: dict[str, Any], request: TrainRequest, console: Conso
     caption = f"none: the coarse pass alone; all: fine everywhere; else fine at {figures['share_of_seats']:.0%}"
     table = Table("placement", "mIoU", "overall", title=title, caption=caption)
     for name in ("none", "random", "sobel", "entropy", "gain", "all"):
-        if name in figures:  # a control has some of them
-            table.add_row(name, *(f"{figures[name][figure]:.1%}" for figure in ("miou", "overall_accuracy")))
+        table.add_row(name, *(f"{figures[name][figure]:.1%}" for figure in ("miou", "overall_accuracy")))
     console.print(table)
 
 

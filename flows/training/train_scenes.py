@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from flows.training.data import Report, TrainingData, alike_notes, only_class, pack_mask, trained_pixels
 from flows.training.look import observe_scene
 from models.network.machine import PROCESSOR
-from models.network.sizes import PRESETS, Positions, Preset, SegmenterConfig
+from models.network.sizes import Positions, SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
 from models.training.examples import Example, Observation, normalised
 from models.training.train import TrainingSettings
@@ -38,7 +38,6 @@ class TrainRequest:
     columns: int = 24
     width: int = 24
     positions: Positions = "2d"
-    preset: Preset = "two-scale"
     tokens: dict[str, Any] = field(default_factory=dict)  # dim, layers, heads, mlp_ratio, where not the usual ones
     init: Path | None = None  # weights to begin from
     choices: dict[str, Any] = field(default_factory=dict)  # of load_data_set: labels, bands, wavelengths, masks
@@ -139,8 +138,8 @@ def network_config(request: TrainRequest, about: About) -> SegmenterConfig:
             patch=about.patch,
             factor=request.factor,
             width=request.width,
+            positions=request.positions,
             **request.tokens,
-            **{"positions": request.positions, **PRESETS[request.preset]},
         )
     except ValueError as error:
         raise SettingsError(f"{error}; choose another --patch or --factor, --dim or --heads") from error

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from models.evaluation.metrics import iou_per_class, labelled_classes, mean_iou
@@ -59,7 +60,7 @@ def expected_score(counts: Floats, bias: Floats, error: float = LEAST_ERROR) -> 
     NaN where nothing is known of any class.
     """
     area = counts.sum(axis=1)
-    iou = _from_logit(_logit(np.nan_to_num(iou_per_class(counts))) + bias)
+    iou = scipy.special.expit(_logit(iou_per_class(counts)) + bias)
     there = area**2 / (area**2 + THERE_PX**2)
     number = float(there.sum())
     if not number > 0:
@@ -86,7 +87,7 @@ def fitted_bias(maps: Sequence[ScoredMap]) -> Floats:
     expected = np.stack([one.expected for one in maps])
     counts = np.stack([one.counts for one in maps])
     weight = np.minimum(expected.sum(axis=-1), SURE_PX) * labelled_classes(counts)
-    came, said = (_logit(np.nan_to_num(iou_per_class(one))) for one in (counts, expected))
+    came, said = (_logit(iou_per_class(one)) for one in (counts, expected))
     bias: Floats = ((came - said) * weight).sum(axis=0) / (weight.sum(axis=0) + SURE_PX)
     return bias
 
@@ -156,11 +157,6 @@ class MapScores:
 
 
 def _logit(share: Floats) -> Floats:
-    inner = np.clip(share, LEAST_IOU, 1 - LEAST_IOU)
-    found: Floats = np.log(inner / (1 - inner))
+    """Logits of shares 0..1, kept from both ends; a share that is NaN counts as 0."""
+    found: Floats = scipy.special.logit(np.clip(np.nan_to_num(share), LEAST_IOU, 1 - LEAST_IOU))
     return found
-
-
-def _from_logit(value: Floats) -> Floats:
-    share: Floats = 1 / (1 + np.exp(-value))
-    return share

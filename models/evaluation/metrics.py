@@ -87,8 +87,8 @@ def overall_accuracy(counts: NDArray[np.int64]) -> float:
 
 def average_accuracy(counts: NDArray[np.int64]) -> float:
     """Mean over the labelled classes of the share of their pixels found; NaN when nothing is labelled."""
-    support = counts.sum(axis=1)
-    return _mean_of_known(np.divide(np.diag(counts), support, out=np.full(len(counts), np.nan), where=support > 0))
+    held = labelled_classes(counts)
+    return float((np.diag(counts)[held] / counts.sum(axis=1)[held]).mean()) if held.any() else float("nan")
 
 
 def kappa(counts: NDArray[np.int64]) -> float:
@@ -105,11 +105,6 @@ def gap_closed(reached: float, none: float, all_seats: float) -> float | None:
     """Share of the way from no fine seat to every fine seat; None where that way is not one point up or more."""
     way = all_seats - none
     return (reached - none) / way if way >= 0.01 else None  # NaN is None too
-
-
-def _mean_of_known(values: NDArray[np.float64]) -> float:
-    known = values[~np.isnan(values)]
-    return float(known.mean()) if known.size else float("nan")
 
 
 CONFIDENCE_BINS = 20

@@ -58,7 +58,7 @@ def oracle_gain(
         numbers = torch.from_numpy(seats).to(model.device)
         for after in model.read_fine_packed([reading], [patches], [numbers], [origin_of(seen)]):
             some = seats[first : first + len(after)]
-            before = model.seat_windows(reading.logits, numbers[first : first + len(after)][None])
+            before = model.bring_up(model.around_seats(reading.logits, numbers[first : first + len(after)][None]))
             lower = _losses(before.cpu().numpy(), truth[some]) - _losses(after.cpu().numpy(), truth[some])
             gain[some] = lower.sum(axis=(1, 2)) / p**2
             first += len(after)

@@ -81,16 +81,12 @@ class TokenAttention(nn.Module):
         self.query_norm = nn.RMSNorm(dim // heads, eps=1e-6)
         self.key_norm = nn.RMSNorm(dim // heads, eps=1e-6)
 
-    def forward(self, x: Tensor, before: Memory | None, kept: Tensor | None) -> tuple[Tensor, Memory]:
-        """(B, N, d) tokens that read ``before`` and each other -> (B, N, d), and their own keys and values.
-
-        ``kept`` (B, keys) is False where a key is to be left out.
-        """
+    def forward(self, x: Tensor, before: Memory | None) -> tuple[Tensor, Memory]:
+        """(B, N, d) tokens that read ``before`` and each other -> (B, N, d), and their own keys and values."""
         b, n, d = x.shape
         q, own = self.ask(x)
         keys, values = own if before is None else (torch.cat(pair, dim=2) for pair in zip(before, own, strict=True))
-        mask = None if kept is None else kept[:, None, None, :].expand(b, 1, n, kept.shape[1])
-        mixed = F.scaled_dot_product_attention(q, keys, values, attn_mask=mask)
+        mixed = F.scaled_dot_product_attention(q, keys, values)
         joined: Tensor = self.out(mixed.transpose(1, 2).reshape(b, n, d))
         return joined, own
 
@@ -114,8 +110,8 @@ class EncoderBlock(nn.Module):
         self.norm2 = nn.LayerNorm(dim)
         self.mlp = nn.Sequential(nn.Linear(dim, mlp_ratio * dim), nn.GELU(), nn.Linear(mlp_ratio * dim, dim))
 
-    def forward(self, x: Tensor, before: Memory | None, kept: Tensor | None) -> tuple[Tensor, Memory]:
-        read, own = self.attention(self.norm1(x), before, kept)
+    def forward(self, x: Tensor, before: Memory | None) -> tuple[Tensor, Memory]:
+        read, own = self.attention(self.norm1(x), before)
         x = x + read
         return x + self.mlp(self.norm2(x)), own
 
@@ -128,24 +124,13 @@ class Encoder(nn.Module):
         self.blocks = nn.ModuleList(EncoderBlock(dim, heads, mlp_ratio) for _ in range(layers))
         self.norm = nn.LayerNorm(dim)
 
-    def forward(
-        self, x: Tensor, before: list[Memory] | None = None, valid: Tensor | None = None
-    ) -> tuple[Tensor, list[Memory]]:
-        """Encode (B, N, d) tokens that read ``before`` (one entry a layer) and each other.
-
-        Tokens that are not ``valid`` (B, N) leave as zeros; what they hold, NaN included, reaches no other token.
-        """
-        kept = None
-        if valid is not None:
-            x = x.masked_fill(~valid[..., None], 0)
-            there = x.new_ones(x.shape[0], 0 if before is None else before[0][0].shape[2], dtype=torch.bool)
-            kept = torch.cat([there, valid], dim=1)
+    def forward(self, x: Tensor, before: list[Memory] | None = None) -> tuple[Tensor, list[Memory]]:
+        """Encode (B, N, d) tokens that read ``before`` (one entry a layer) and each other."""
         memory: list[Memory] = []
         for layer, block in enumerate(self.blocks):
-            x, own = block(x, None if before is None else before[layer], kept)
+            x, own = block(x, None if before is None else before[layer])
             memory.append(own)
-        x = self.norm(x)
-        return x if valid is None else x.masked_fill(~valid[..., None], 0), memory
+        return self.norm(x), memory
 
 
 def encode_packed(

@@ -219,15 +219,12 @@ class Segmenter(nn.Module):
         """The coarse features under each seat at the width of the fine ones, (B * K, width, p, p)."""
         return self.bring_up(self.under(self.around_seats(canvas, seats)))
 
-    def seat_windows(self, image: Tensor, seats: Tensor) -> Tensor:
-        """The window of each seat of a coarse image, (B, c, H/s, W/s) -> (B * K, c, p, p).
-
-        Equal to the window of the whole image brought up bilinearly, without making that.
-        """
-        return self.bring_up(self.around_seats(image, seats))
-
     def around_seats(self, image: Tensor, seats: Tensor) -> Tensor:
-        """The coarse pixels under each seat and one more on every side, (B * K, c, p/s + 2, p/s + 2)."""
+        """The pixels under each seat of a coarse image (B, c, H/s, W/s) and one more on every side.
+
+        Given as (B * K, c, p/s + 2, p/s + 2): ``bring_up`` makes of them the window of each seat, equal to that of the
+        whole image brought up bilinearly.
+        """
         p, s = self.config.patch, self.config.factor
         cells = p // s
         padded = F.pad(image, (1, 1, 1, 1), mode="replicate")

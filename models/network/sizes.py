@@ -9,23 +9,12 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from numbers import Integral
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import SceneGrid
 
 Positions = Literal["2d", "paper"]
-Design = Literal["two-scale", "dense", "paper"]
-Sight = Literal["fine", "coarse", "halved"]
-Preset = Literal["two-scale", "paper", "dense", "upsampled", "coarser"]
-# What a preset fixes. The two-scale network is the product; the others are trained to be compared with it.
-PRESETS: dict[Preset, dict[str, Any]] = {
-    "two-scale": {},
-    "paper": {"design": "paper", "positions": "paper"},
-    "dense": {"design": "dense"},
-    "upsampled": {"design": "dense", "sight": "coarse"},
-    "coarser": {"design": "dense", "sight": "halved"},
-}
 MOST_CLASSES = 255  # maps are uint8 and 255 stands for unlabelled
 # What nobody builds: sizes beyond these are damage, or an attempt to have memory filled.
 MOST = {
@@ -81,8 +70,6 @@ class SegmenterConfig:
     mlp_ratio: int = 3
     positions: Positions = "2d"
     patch_kernel: bool = False  # columns also go straight to tokens, as in a vision transformer that was begun from
-    design: Design = "two-scale"  # which network; see models.network.controls
-    sight: Sight = "fine"  # what a dense network reads: the fine image, the coarse one brought up, or 2 x 2 means
 
     def __post_init__(self) -> None:
         for name in ("classes", *MOST):
@@ -99,24 +86,10 @@ class SegmenterConfig:
             raise ShapeError(f"patch {self.patch} must divide by the factor {self.factor}")
         if self.dim % 4 or self.dim % self.heads:
             raise ShapeError(f"token width {self.dim} must divide by 4 and by its {self.heads} heads")
-        for name, kinds in (("design", Design), ("positions", Positions), ("sight", Sight)):
-            if (value := getattr(self, name)) not in get_args(kinds):
-                raise ShapeError(f"{name} of a segmenter is one of {', '.join(get_args(kinds))}, got {value!r}")
-        if self.design != "dense" and self.sight != "fine":
-            raise ShapeError(f"only a dense network may read the {self.sight} image, this one is {self.design}")
-        if self.design != "two-scale" and self.positions != ("paper" if self.design == "paper" else "2d"):
-            raise ShapeError(f"a {self.design} network cannot have {self.positions} positions")
-        if self.sight == "halved" and self.factor % 2:
-            raise ShapeError(f"a grid coarser by 2 needs an even factor, got {self.factor}")
-
-    @property
-    def preset(self) -> Preset:
-        """Name of the kind of network: ``two-scale``, or which control it is."""
-        return next(
-            name
-            for name, fixed in PRESETS.items()
-            if (self.design, self.sight) == (fixed.get("design", "two-scale"), fixed.get("sight", "fine"))
-        )
+        if self.positions not in get_args(Positions):
+            raise ShapeError(
+                f"positions of a segmenter is one of {', '.join(get_args(Positions))}, got {self.positions!r}"
+            )
 
     @property
     def token_side(self) -> int:
@@ -124,10 +97,8 @@ class SegmenterConfig:
         return max(1, self.patch // TOKEN_PX)
 
     def as_dict(self) -> dict[str, int | str]:
-        """Plain values for a checkpoint; a two-scale network's do not name its design, as they never did."""
+        """Plain values for a checkpoint."""
         values = asdict(self)
-        if self.design == "two-scale":
-            del values["design"], values["sight"]
         if not self.patch_kernel:
             del values["patch_kernel"]
         return values
@@ -239,8 +210,8 @@ class MultiplyAdds:
 
     glance: int  # the coarse pass read alone, its part of the map with it
     score: int  # the policy (`models.policies.policies.score_multiply_adds`)
-    encode: int  # fine patches to tokens, and the transformer over these (a control's: over all that it reads)
-    decode: int  # the map at captured seats (a control's: all of it)
+    encode: int  # fine patches to tokens, and the transformer over these
+    decode: int  # the map at captured seats
 
     @property
     def total(self) -> int:
@@ -264,26 +235,6 @@ def multiply_adds(config: SegmenterConfig, grid: SceneGrid, seats: int, bands: i
     under = (p // s + 2) ** 2 * narrow * wide
     decode = seats * (_head(config, wide) + under + pixels * (11 * wide**2 + wide * config.classes))
     return MultiplyAdds(glance, score, encode, decode)
-
-
-def control_multiply_adds(config: SegmenterConfig, grid: SceneGrid, seats: int, bands: int) -> MultiplyAdds:
-    """Count the map of one scene drawn by a control; ``seats`` fine patches are for the paper's network alone.
-
-    A dense network reads every valid seat, whatever was asked for. A policy is not counted.
-    """
-    p, s = config.patch, config.factor
-    cells = grid.padded_shape[0] // (p * s) * (grid.padded_shape[1] // (p * s))
-    if config.design == "paper":
-        tokens = cells + seats
-        patch = p * p * (bands * config.columns + config.columns * config.dim)
-        return MultiplyAdds(0, 0, tokens * patch + _transformer(config, tokens, 0), cells * config.dim * config.classes)
-    step = 2 if config.sight == "halved" else 1
-    patches = -(-grid.height // (p * step)) * -(-grid.width // (p * step))
-    looked_at = cells if config.sight == "coarse" else patches
-    encode = looked_at * p * p * bands * config.columns + patches * _stem(config, config.width)
-    encode += _transformer(config, patches * config.token_side**2, 0)
-    last = p * p * (9 * config.width**2 + config.width * config.classes)
-    return MultiplyAdds(0, 0, encode, patches * (_head(config, config.width) + last))
 
 
 def _levels(config: SegmenterConfig, width: int) -> list[tuple[int, int]]:

@@ -1,1 +1,1 @@
-"""Trained weights on a scene: glance, regions of a large field, maps of controls."""
+"""Trained weights on a scene: glance, regions of a large field."""

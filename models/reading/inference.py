@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from models.network.self_attention import TokenReading, queries_kept
 from models.network.sizes import SegmenterConfig
 from models.network.spectral import all_alive, dead_pixels, fill_dead, patches_of, readable
-from models.weights.files import AnyWeights, Weights
+from models.weights.files import Weights
 from pipeline.errors import ShapeError
 from pipeline.geometry.grid import UNLABELLED, SceneGrid, pad_by_reflection
 from pipeline.lazy import deferred
@@ -105,7 +105,7 @@ def glance(
 
 
 def look_coarsely(
-    weights: AnyWeights,
+    weights: Weights,
     strips: Iterable[NDArray[np.floating]],
     wavelength_nm: NDArray[np.floating],
     grid: SceneGrid,

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from models.evaluation.metrics import confusion, kappa, overall_accuracy
 from pipeline.geometry.grid import UNLABELLED
 from pipeline.lazy import deferred
 
@@ -77,13 +78,8 @@ class Remembered:
 def first_belief(looked: Looked) -> Belief:
     """What is known of a field that nobody looked at before: what was seen today, be it coarsely."""
     kept = np.maximum(looked.log_probability, np.float32(FAINTEST))  # NaN stays
-    return Belief(kept, _ages(kept, np.zeros(looked.seen.shape, np.float32)), _own_light(looked))
-
-
-def _own_light(looked: Looked) -> Floats:
-    """What today's look adds to the light that a memory rests on, (y, x)."""
-    own: Floats = np.where(looked.seen, looked.light / looked.step**2, 0).astype(np.float32)
-    return own
+    light = np.where(looked.seen, looked.light / looked.step**2, 0).astype(np.float32)
+    return Belief(kept, _ages(kept, np.zeros(looked.seen.shape, np.float32)), light)
 
 
 def recall(memory: Remembered, looked: Looked, reader: MemoryReader | None) -> Belief:
@@ -246,18 +242,12 @@ class MemoryAgreement:
     @property
     def agreement(self) -> float:
         """Share of the pixels that the look shows as they are remembered; NaN where there are none."""
-        total = self.looked.sum()
-        return float(np.trace(self.looked) / total) if total else math.nan
+        return overall_accuracy(self.looked)
 
     @property
     def is_of_another_field(self) -> bool:
         """Whether memory and look have hardly more in common than any two fields."""
-        total = self.looked.sum()
-        if not total:
-            return False
-        chance = float(self.looked.sum(axis=0) / total @ (self.looked.sum(axis=1) / total))
-        kappa = 1.0 if chance >= 1 else (self.agreement - chance) / (1 - chance)
-        return self.agreement < LEAST_AGREEMENT and kappa < LEAST_KAPPA
+        return self.agreement < LEAST_AGREEMENT and kappa(self.looked) < LEAST_KAPPA  # NaN is not
 
 
 def compare(memory: Remembered, looked: Looked, after: Belief, part: tuple[slice, slice]) -> MemoryAgreement:
@@ -272,12 +262,8 @@ def compare(memory: Remembered, looked: Looked, after: Belief, part: tuple[slice
     least = math.log(CERTAIN)
     sure = known & (before.max(axis=-1) > least) & (now.max(axis=-1) > least)
     return MemoryAgreement(
-        *(_counted(old[where], other[where], classes) for where, other in ((known, shown), (sure, new)))
+        *(confusion(old[where], other[where], classes) for where, other in ((known, shown), (sure, new)))
     )
-
-
-def _counted(rows: NDArray[np.intp], columns: NDArray[np.intp], classes: int) -> NDArray[np.int64]:
-    return np.bincount(rows * classes + columns, minlength=classes**2).reshape(classes, classes).astype(np.int64)
 
 
 def changed_from(memory: Remembered, after: Belief) -> NDArray[np.uint8]:

@@ -119,7 +119,13 @@ def components(pixels: Spectra, classes: Classes, seed: int) -> tuple[Exact, Exa
     if len(pixels) < LEAST_SPECTRA:
         raise SceneError(f"{len(pixels)} labelled pixels are too few to say what is familiar; it takes {LEAST_SPECTRA}")
     exact, columns = pixels.astype(np.float64), pixels.shape[1]
-    first = np.concatenate([_middles(exact[classes == number], seed + int(number)) for number in np.unique(classes)])
+    middles = []
+    for number in np.unique(classes):
+        own = exact[classes == number]
+        count = min(OF_A_CLASS, 1 + len(own) // (4 * columns))  # fewer of few spectra
+        rng = np.random.default_rng(seed + int(number))
+        middles.append(scipy.cluster.vq.kmeans2(own, count, minit="++", rng=rng)[0])
+    first = np.concatenate(middles)
     near = (exact @ first.T - 0.5 * (first**2).sum(axis=1)).argmax(axis=1)
     parts = [exact[near == number] for number in np.unique(near)]
     centres = [part.mean(axis=0) for part in parts]
@@ -134,13 +140,6 @@ def components(pixels: Spectra, classes: Classes, seed: int) -> tuple[Exact, Exa
         usual = float(np.quantile((apart**2).sum(axis=0), USUAL))
         covariance.append(mixed * max(usual / columns, 1.0))
     return np.stack(centres), np.stack(covariance)
-
-
-def _middles(spectra: Exact, seed: int) -> Exact:
-    """Middles of groups of one class, fewer of few spectra."""
-    count = min(OF_A_CLASS, 1 + len(spectra) // (4 * spectra.shape[1]))
-    found, _ = scipy.cluster.vq.kmeans2(spectra, count, minit="++", rng=np.random.default_rng(seed))
-    return np.asarray(found)
 
 
 def measured_limits(

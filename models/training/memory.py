@@ -22,7 +22,7 @@ from torch import Tensor
 from models.network.memory_reader import MemoryReader
 from models.network.sizes import MemorySizes
 from models.reading.remembered import FAINTEST, LIGHT_FADES_DAYS
-from models.training.objective import map_loss, weights_of_classes
+from models.training.objective import class_weights, map_loss
 from models.training.train import Progress
 from pipeline.geometry.grid import UNLABELLED
 
@@ -43,11 +43,6 @@ class PastLook:
     light: float  # exposure as a share of the reference
     probability: NDArray[np.float16]  # (y, x, class)
     coarse: NDArray[np.float16]  # (y / s, x / s, column) normalised
-
-    @property
-    def light_a_pixel(self) -> float:
-        """What a memory of it rests on."""
-        return self.light / self.step**2
 
 
 @dataclass(frozen=True)
@@ -103,7 +98,7 @@ def train_reader(
         reader = MemoryReader(sizes).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     averaged = copy.deepcopy(reader).eval()
     labels = [visit.labels for land in lands for visit in land]
-    weight = weights_of_classes(labels, sizes.classes, settings.weight_cap)
+    weight = class_weights(labels, sizes.classes, settings.weight_cap)
     rng = np.random.default_rng([settings.seed, 0x3E3])
     optimiser = torch.optim.AdamW(reader.parameters(), settings.learning_rate, weight_decay=settings.weight_decay)
     started, step, loss = time.monotonic(), 0, math.nan
@@ -200,7 +195,7 @@ def _sequence(
     for number, visit in enumerate(visits):
         look = visit.looks[int(rng.integers(len(visit.looks)))]
         if number == 0 and rng.random() < 0.5:  # memories are often of the best look there was
-            look = max(visit.looks, key=lambda one: one.light_a_pixel)
+            look = max(visit.looks, key=lambda one: one.light / one.step**2)
         images = (
             np.log(np.maximum(look.probability[fine].astype(np.float32), FAINT)),
             look.coarse[small].astype(np.float32),

@@ -4,9 +4,6 @@ A crop is read twice: with no fine seat, and with a share of the seats drawn fro
 a captured seat is what the scorer learns to tell; a seat without a label tells it nothing. Three phases follow each
 other: seats are placed at random and by the entropy of the first reading; then also by the scorer; then in larger
 crops, of which fewer make a batch, as far as the scenes have larger ones.
-
-A control (``models.network.controls``) has one map and no scorer: it is asked for that map's loss alone, from the
-same crops.
 """
 
 from __future__ import annotations
@@ -20,10 +17,9 @@ import torch.nn.functional as F  # noqa: N812 - its usual name
 from numpy.typing import NDArray
 from torch import Tensor
 
-from models.network.controls import Control, Network
 from models.network.segmenter import Segmenter
 from models.network.sizes import MOST_GAIN, SegmenterConfig
-from models.training.examples import Batch, Example
+from models.training.examples import Batch
 from pipeline.geometry.grid import UNLABELLED
 
 GLANCE_WEIGHT, SCORER_WEIGHT = 0.4, 1.0  # of the map without a seat, and of the scorer, beside the map with seats
@@ -31,7 +27,6 @@ SHARES = ((0.05, 0.15), (0.1, 0.25), (0.2, 0.25), (0.35, 0.15), (0.5, 0.1), (1.0
 HUBER_NAT = 0.1  # errors of the scorer above this count linearly
 RANK_WEIGHT = 0.2
 RANK_NAT = 0.05  # two seats that differ by less are hardly put in order
-WITHOUT_SEATS = 0.1  # how often the paper's network, which has no map of a glance beside, gets no seat at all
 
 
 @dataclass(frozen=True)
@@ -53,12 +48,7 @@ def phase_at(done: float) -> Phase:
     return next((phase for phase in PHASES if done < phase.until), PHASES[-1])
 
 
-def class_weights(examples: list[Example], classes: int, cap: float) -> Tensor:
-    """Weights of the classes that scenes show, as `weights_of_classes`."""
-    return weights_of_classes([example.labels for example in examples], classes, cap)
-
-
-def weights_of_classes(labels: Iterable[NDArray[np.uint8]], classes: int, cap: float) -> Tensor:
+def class_weights(labels: Iterable[NDArray[np.uint8]], classes: int, cap: float) -> Tensor:
     """Weights 1 / sqrt(frequency), mean 1 over the labelled pixels' classes, capped; 0 for a class without a pixel."""
     counts = np.zeros(classes)
     for image in labels:
@@ -70,11 +60,9 @@ def weights_of_classes(labels: Iterable[NDArray[np.uint8]], classes: int, cap: f
 
 
 def batch_loss(
-    model: Network, batch: Batch, weight: Tensor, rng: np.random.Generator, phase: Phase, *, soft_dice: bool
+    model: Segmenter, batch: Batch, weight: Tensor, rng: np.random.Generator, phase: Phase, *, soft_dice: bool
 ) -> Tensor:
     """Loss of one batch: the map with a drawn share of seats, the glance alone, and what the scorer said of them."""
-    if not isinstance(model, Segmenter):
-        return control_loss(model, batch, weight, rng, soft_dice=soft_dice)
     reading = model.read_coarse(batch.coarse, batch.origin)
     score = model.score(reading).flatten(1)
     seats = draw_seats(reading.logits.detach(), score.detach(), model.config, rng, phase)
@@ -91,37 +79,6 @@ def batch_loss(
         for logits, losses in zip(drawn, (with_seats, without), strict=True)
     ]
     return maps[0] + GLANCE_WEIGHT * maps[1] + SCORER_WEIGHT * scoring
-
-
-def control_loss(model: Control, batch: Batch, weight: Tensor, rng: np.random.Generator, *, soft_dice: bool) -> Tensor:
-    """Loss of a control's map of one batch, drawn with some of the seats where it asks for them, else with each one."""
-    count, every = batch.fine.shape[:2]
-    if model.uses_seats:
-        seats = draw_paper_seats(batch.coarse, every, model.config, rng)
-        fine = batch.fine.gather(1, seats[:, :, None, None, None].expand(-1, -1, *batch.fine.shape[2:]))
-    else:
-        seats, fine = torch.arange(every, device=batch.fine.device).expand(count, -1), batch.fine
-    logits = model.draw(batch.coarse, fine, seats, batch.origin)
-    return map_loss(logits, pixel_losses(logits, batch.labels), batch.labels, weight, soft_dice=soft_dice)
-
-
-def draw_paper_seats(coarse: Tensor, every: int, config: SegmenterConfig, rng: np.random.Generator) -> Tensor:
-    """Draw some of ``every`` seats for the paper's network, (B, K): half the time where the image has edges.
-
-    Edges of ``coarse`` (B, J, H/s, W/s) are those of the policy ``sobel``, the paper's ED; the shares are those of the
-    two-scale segmenter.
-    """
-    shares, odds = zip(*SHARES, strict=True)
-    share = 0.0 if rng.random() < WITHOUT_SEATS else float(rng.choice(shares, p=odds))
-    worth = torch.from_numpy(rng.random((len(coarse), every))).float().to(coarse.device)
-    if rng.random() < 0.5:
-        down = coarse.new_tensor([[-1.0, -2.0, -1.0], [0.0, 0.0, 0.0], [1.0, 2.0, 1.0]])
-        brightness = F.pad(coarse.mean(dim=1, keepdim=True), (1, 1, 1, 1), mode="replicate")
-        gradient = F.conv2d(brightness, torch.stack([down, down.T])[:, None])
-        size = gradient.square().sum(dim=1, keepdim=True).sqrt()
-        edges = F.avg_pool2d(size, config.patch // config.factor).flatten(1)
-        worth = edges + 0.1 * edges.mean() * worth
-    return worth.argsort(dim=1, descending=True, stable=True)[:, : round(share * every)]
 
 
 def draw_seats(

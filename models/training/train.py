@@ -1,4 +1,4 @@
-"""Training of a network on crops, the two-scale segmenter or a control: steps, averages, checkpoints."""
+"""Training of the two-scale segmenter on crops: steps, averages, checkpoints."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from models.network.controls import Network, build_network
 from models.network.machine import PROCESSOR, keep_freed_memory
+from models.network.segmenter import Segmenter
 from models.network.sizes import SegmenterConfig
 from models.training.examples import Batch, CropSampler, Example
 from models.training.looks import REFERENCE_MS, Looks
@@ -90,11 +90,11 @@ class Trainer:
         self.rng = np.random.default_rng([settings.seed, 0x7EA])
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(settings.seed)
-            self.model = build_network(config)
+            self.model = Segmenter(config)
         if start is not None:
             strange = self.model.load_state_dict(start, strict=False).unexpected_keys
             if strange:
-                raise WeightsError(f"{config.preset} has no place for {len(strange)} tensors, the first {strange[0]}")
+                raise WeightsError(f"the network has no place for {len(strange)} tensors, the first {strange[0]}")
         self.model.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.averaged = copy.deepcopy(self.model).eval()
         parameters = list(self.model.parameters())  # matrices and kernels decay, gains and shifts do not
@@ -109,7 +109,7 @@ class Trainer:
             self.samplers[larger] = CropSampler(
                 examples, config.patch, config.factor, crop, noise=settings.noise, looks=looks
             )
-        self.weight = class_weights(examples, config.classes, settings.weight_cap).to(device)
+        self.weight = class_weights([one.labels for one in examples], config.classes, settings.weight_cap).to(device)
         self.course = Course()
         self.batch: Batch | None = None  # of the last step
         self._started, self._worked = time.monotonic(), time.process_time()
@@ -222,8 +222,8 @@ def train(
     checkpoint: Path | None = None,
     keep_every_s: float = KEEP_EVERY_S,
     device: str = PROCESSOR,
-) -> tuple[Network, dict[str, float | int]]:
-    """Train the network that ``config`` names; give its averaged weights and a summary (steps, last loss, seconds).
+) -> tuple[Segmenter, dict[str, float | int]]:
+    """Train a segmenter of these sizes; give its averaged weights and a summary (steps, last loss, seconds).
 
     The same settings and examples start from the same weights and draw the same crops and seats. What follows is equal
     to rounding only: sums differ in their last bit with where memory lies, and ``minutes`` may end the run elsewhere.

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,14 +39,13 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-    from models.network import controls, memory_reader
-    from models.network.controls import Network
+    from models.network import memory_reader, segmenter
     from models.network.memory_reader import MemoryReader
     from models.network.segmenter import Segmenter
 else:
     torch = deferred("torch")
-    controls = deferred("models.network.controls")
     memory_reader = deferred("models.network.memory_reader")
+    segmenter = deferred("models.network.segmenter")
 
 NORMALISATION = ("centre", "spread", "whitening")
 FORMAT = "spectralzoom-weights/3"
@@ -55,7 +54,6 @@ OF_LIMITS = ("rates", "light", "fine", "coarse")
 SPREAD = "normalisation.spread"
 CALIBRATION = "calibration"  # of a record: how sure of themselves maps may be, and the temperature, where one is needed
 KINDS = {"F32": "torch.float32", "U8": "torch.uint8"}  # by safetensors' names
-Learned = TypeVar("Learned", bound="AnyWeights")
 
 
 @dataclass(frozen=True)
@@ -73,10 +71,10 @@ class Description:
 
 
 @dataclass(frozen=True)
-class AnyWeights:
-    """A network of any design with all it needs: basis, normalisation, classes, and the record of its training."""
+class Weights:
+    """A two-scale segmenter with all it needs: basis, normalisation, classes, and the record of its training."""
 
-    network: Network
+    segmenter: Segmenter
     basis: SpectralBasis
     normalisation: Normalisation
     class_names: tuple[str, ...]
@@ -85,8 +83,8 @@ class AnyWeights:
 
     @property
     def config(self) -> SegmenterConfig:
-        """Sizes of the network, and which one it is."""
-        return self.network.config
+        """Sizes of the network."""
+        return self.segmenter.config
 
     @property
     def temperature(self) -> float:
@@ -107,30 +105,18 @@ class AnyWeights:
         columns[~np.isfinite(seen[..., reached]).any(axis=-1)] = np.nan
         return columns
 
-
-@dataclass(frozen=True)
-class Weights(AnyWeights):
-    """Those of a two-scale segmenter, which surveys are made with."""
-
-    network: Segmenter
-
     def on(self, device: str) -> Weights:
         """The same where it computes on a device of this machine, by `models.network.machine.choose_device`."""
-        self.network.to(device)
+        self.segmenter.to(device)
         return self
 
-    @property
-    def segmenter(self) -> Segmenter:
-        """The network."""
-        return self.network
 
-
-def save_weights(weights: AnyWeights, path: Path) -> None:
+def save_weights(weights: Weights, path: Path) -> None:
     """Write the file, sealed, by a temporary name and a rename, so that it is whole or absent.
 
     Raises WeightsError where the disk refuses.
     """
-    tensors = dict(weights.network.state_dict())
+    tensors = dict(weights.segmenter.state_dict())
     for name in NORMALISATION:
         tensors[f"normalisation.{name}"] = torch.from_numpy(getattr(weights.normalisation, name).copy())
     tensors["class_colours"] = torch.from_numpy(weights.class_colours.copy())
@@ -244,37 +230,17 @@ def content_key(path: Path) -> str:
 
 
 def load_weights(path: Path) -> Weights:
-    """Read a file that ``save_weights`` wrote of a two-scale segmenter. No pickle is involved.
+    """Read a file that ``save_weights`` wrote. No pickle is involved.
 
-    Raises WeightsError where it is missing, of another format or a control, or where a tensor (named) is not the one
-    that was written, does not fit its config, or holds what is no finite number.
+    Raises WeightsError where it is missing or of another format, or where a tensor (named) is not the one that was
+    written, does not fit its config, or holds what is no finite number.
     """
     described = describe_weights(path)
-    check_two_scale(described.config, path)
-    return Weights(**vars(_read(path, described)))
-
-
-def load_any_weights(path: Path) -> AnyWeights:
-    """Read ``Weights`` of a two-scale segmenter, otherwise those of a control; raises WeightsError likewise."""
-    described = describe_weights(path)
-    return load_weights(path) if described.config.design == "two-scale" else _read(path, described)
-
-
-def check_two_scale(config: SegmenterConfig, path: Path) -> None:
-    """Refuse a control where a survey is to be made (WeightsError)."""
-    if config.design != "two-scale":
-        raise WeightsError(
-            f"{path} holds the control '{config.preset}', which is there to be compared with; a survey needs weights of"
-            " two scales: train some with: spectralzoom train DATASET -o WEIGHTS (without --preset)"
-        )
-
-
-def _read(path: Path, described: Description) -> AnyWeights:
     tensors = read_tensors(path, described)
-    network = _network(described.config, "cpu")
+    network = segmenter.Segmenter(described.config)
     network.load_state_dict({name: tensors[name] for name in network.state_dict()})
     normalisation = Normalisation(*(tensors[f"normalisation.{name}"].numpy() for name in NORMALISATION))
-    return AnyWeights(
+    return Weights(
         network.eval(),
         described.basis,
         normalisation,
@@ -282,11 +248,6 @@ def _read(path: Path, described: Description) -> AnyWeights:
         tensors["class_colours"].numpy(),
         described.record,
     )
-
-
-def _network(config: SegmenterConfig, device: str) -> Network:
-    with torch.device(device):
-        return controls.build_network(config)
 
 
 def read_tensors(path: Path, described: Description) -> dict[str, Tensor]:
@@ -347,7 +308,7 @@ def _opened(path: Path, framework: str) -> Iterator[Any]:
         raise WeightsError(f"{path} is not a readable safetensors file ({error}); train or copy it again") from error
 
 
-def with_record(weights: Learned, **entries: Any) -> Learned:
+def with_record(weights: Weights, **entries: Any) -> Weights:
     """Give the same weights with entries added to their record."""
     return replace(weights, record={**weights.record, **entries})
 
@@ -359,7 +320,9 @@ def misfit(config: SegmenterConfig, claimed: Mapping[str, Any]) -> str:
     device, where tensors have a size and no memory.
     """
     one, all_pairs = (config.columns,), (config.columns, config.columns)
-    wanted = {name: (tuple(value.shape), "F32") for name, value in _network(config, "meta").state_dict().items()}
+    with torch.device("meta"):
+        network = segmenter.Segmenter(config)
+    wanted = {name: (tuple(value.shape), "F32") for name, value in network.state_dict().items()}
     wanted |= {"normalisation.centre": (one, "F32"), SPREAD: (one, "F32")}
     wanted |= {"normalisation.whitening": (all_pairs, "F32"), "class_colours": ((config.classes, 3), "U8")}
     for name, (shape, kind) in wanted.items():

@@ -18,7 +18,7 @@ from typing import Any
 import torch
 
 from models.training.start_weights import StartFile
-from models.weights.files import content_key, load_any_weights, save_weights
+from models.weights.files import content_key, load_weights, save_weights
 from models.weights.sealed_files import load_checkpoint, save_checkpoint
 from pipeline.errors import WeightsError
 from storage.archive.archive import Archive
@@ -33,9 +33,9 @@ Read = Callable[[Path], Content]
 
 
 def _weights(path: Path) -> Content:
-    found = load_any_weights(path)
+    found = load_weights(path)
     normal = {name: torch.from_numpy(value) for name, value in vars(found.normalisation).items()}
-    tensors = {**found.network.state_dict(), **normal, "colours": torch.from_numpy(found.class_colours)}
+    tensors = {**found.segmenter.state_dict(), **normal, "colours": torch.from_numpy(found.class_colours)}
     return (found.config, found.basis, found.class_names, found.record, content_key(path)), tensors
 
 

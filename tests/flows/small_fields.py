@@ -11,11 +11,10 @@ import numpy as np
 from PIL import Image
 
 from flows.evaluate.frames import Look, look_at, open_frames
-from models.network.sizes import PRESETS, Preset
-from models.weights.files import AnyWeights, Weights, load_weights, save_weights
+from models.weights.files import Weights, load_weights, save_weights
 from pipeline.geometry.camera import LineCamera
 from pipeline.simulator.scenes.scene import RasterScene
-from tests.models.conftest import make_any_weights
+from tests.models.conftest import make_weights
 
 FRAMES = ("001", "002", "003")
 NAMES = ("soil", "crop")
@@ -38,10 +37,10 @@ def write_field(root: Path, size: tuple[int, int] = (24, 40), names: Sequence[st
     return root
 
 
-def write_weights(path: Path, seed: int = 0, preset: Preset = "two-scale", factor: int = 2, **record: Any) -> Path:
-    """Small random weights of any design for the field's two classes."""
-    made: AnyWeights = make_any_weights(seed, classes=2, columns=3, factor=factor, **PRESETS[preset])
-    for name, tensor in made.network.state_dict().items():
+def write_weights(path: Path, seed: int = 0, factor: int = 2, **record: Any) -> Path:
+    """Small random weights for the field's two classes."""
+    made = make_weights(seed, classes=2, columns=3, factor=factor)
+    for name, tensor in made.segmenter.state_dict().items():
         if name.endswith("classes.weight"):
             tensor *= 0.01  # else logits are in the hundreds, and gains all at their clip
     save_weights(replace(made, class_names=NAMES, record={"seed": seed, **record}), path)

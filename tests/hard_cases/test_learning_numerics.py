@@ -72,7 +72,7 @@ def test_13_norms_of_nothing_are_nothing(size: float):
 def test_13_an_encoder_of_zero_tokens_has_finite_gradients():
     """Attention over tokens that are all 0 is finite forward and backward."""
     attention, x = TokenAttention(16, 2), torch.zeros(1, 5, 16, requires_grad=True)
-    attention(x, None, None)[0].square().sum().backward()
+    attention(x, None)[0].square().sum().backward()
     assert x.grad is not None
     assert x.grad.isfinite().all()
     assert all(p.grad is None or p.grad.isfinite().all() for p in attention.parameters())

@@ -11,13 +11,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from models.network.controls import build_network
-from models.network.sizes import PRESETS, Preset, SegmenterConfig
+from models.network.segmenter import Segmenter
+from models.network.sizes import SegmenterConfig
 from models.network.spectral import Normalisation, SpectralBasis
 from models.reading.inference import CoarseLook
 from models.training.examples import Example
 from models.training.train import Progress
-from models.weights.files import AnyWeights, Weights
+from models.weights.files import Weights
 from pipeline.geometry.grid import SceneGrid
 
 SMALL: dict[str, Any] = {"classes": 3, "columns": 4, "patch": 8, "factor": 2, "width": 8, "coarse_width": 8} | {
@@ -26,7 +26,6 @@ SMALL: dict[str, Any] = {"classes": 3, "columns": 4, "patch": 8, "factor": 2, "w
     "layers": 1,
 }
 Maker = Callable[..., Weights]
-ControlMaker = Callable[..., AnyWeights]
 
 
 def noise(seed: int, *shape: int) -> Tensor:
@@ -40,7 +39,7 @@ def scene_tensors(config: SegmenterConfig, rows: int = 2, columns: int = 3) -> t
     return noise(0, 1, j, rows * p, columns * p), noise(1, 1, count, j, p, p), torch.arange(count)[None]
 
 
-def scene_columns(weights: AnyWeights, height: int, width: int, seed: int = 0) -> tuple[CoarseLook, np.ndarray]:
+def scene_columns(weights: Weights, height: int, width: int, seed: int = 0) -> tuple[CoarseLook, np.ndarray]:
     """A look at a scene of noise, and a patch for every seat of its padded grid."""
     p, s, columns = weights.config.patch, weights.config.factor, weights.config.columns
     grid, rng = SceneGrid(height, width, p, s), np.random.default_rng(seed)
@@ -69,20 +68,15 @@ def killed_after(step: int) -> Callable[[Progress], None]:
     return report
 
 
-def make_network(seed: int = 0, **sizes: Any) -> Any:
+def make_network(seed: int = 0, **sizes: Any) -> Segmenter:
     """A small network of the given sizes; whatever training starts from zero is drawn too, so that nothing is idle."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        model = build_network(SegmenterConfig(**{**SMALL, **sizes})).eval()
+        model = Segmenter(SegmenterConfig(**{**SMALL, **sizes})).eval()
         for parameter in model.parameters():
             if not parameter.any():
                 torch.nn.init.normal_(parameter, std=0.3)
     return model
-
-
-def make_weights(seed: int = 0, **sizes: Any) -> Weights:
-    """Random weights of a two-scale segmenter."""
-    return Weights(**vars(make_any_weights(seed, **sizes)))
 
 
 def plain_weights(**sizes: Any) -> Weights:
@@ -92,13 +86,13 @@ def plain_weights(**sizes: Any) -> Weights:
     return replace(made, normalisation=Normalisation(0.3 * one, 0.1 * one, np.diag(one)))
 
 
-def make_any_weights(seed: int = 0, **sizes: Any) -> AnyWeights:
-    """Random weights of the network that the sizes name."""
+def make_weights(seed: int = 0, **sizes: Any) -> Weights:
+    """Random weights of a segmenter of these sizes."""
     model = make_network(seed, **sizes)
     columns = model.config.columns
     centre, spread = np.linspace(0.2, 0.4, columns), np.linspace(0.05, 0.1, columns)
     whitening = np.eye(columns) + 0.1
-    return AnyWeights(
+    return Weights(
         model,
         SpectralBasis(400.0, 1000.0, columns),
         Normalisation(*(array.astype(np.float32) for array in (centre, spread, whitening))),
@@ -112,13 +106,3 @@ def make_any_weights(seed: int = 0, **sizes: Any) -> AnyWeights:
 def tiny() -> Maker:
     """Maker of small random weights: ``tiny(seed, classes=..., patch=..., factor=..., positions=...)``."""
     return make_weights
-
-
-@pytest.fixture
-def make_control() -> Callable[..., AnyWeights]:
-    """Maker of small random weights of a control: ``make_control(preset, seed, classes=..., patch=...)``."""
-
-    def make(preset: Preset, seed: int = 0, **sizes: Any) -> AnyWeights:
-        return make_any_weights(seed, **sizes, **PRESETS[preset])
-
-    return make

@@ -22,15 +22,14 @@ from flows.training import train as flow
 from flows.training import train_scenes
 from flows.training.data import pack_mask, unpack_mask
 from flows.training.familiarity import FamiliarRequest, measure_familiar
-from flows.training.train import joined_split, run_train, train_weights, usual_crop
-from flows.training.train_scenes import TrainRequest, suggested_patch
+from flows.training.train import joined_split, run_train, train_weights
+from flows.training.train_scenes import TrainRequest, observe_all, suggested_patch
 from models.evaluation.expected_scores import MapScores
-from models.network.sizes import PRESETS, Preset
 from models.training.start_weights import StartFile
 from models.training.train import TrainingSettings
-from models.weights.files import describe_weights, load_any_weights, load_familiar, load_weights
+from models.weights.files import describe_weights, load_familiar, load_weights
 from models.weights.parts import TrainedOn
-from pipeline.errors import SceneError, SettingsError, WeightsError
+from pipeline.errors import SceneError, SettingsError
 from tests.flows.small_fields import write_field
 
 SETTINGS = TrainingSettings(steps=1, batch=1, crop=16)
@@ -107,9 +106,7 @@ def test_new_weights_say_what_they_saw_and_know_what_is_familiar(tmp_path: Path)
         ({"patch": 24}, "choose another --patch or --factor"),
         ({"patch": 8, "factor": 16}, "choose another --patch or --factor"),
         ({"factor": 0}, "choose another --patch or --factor"),
-        ({"preset": "coarser", "factor": 1}, "needs an even factor, got 1; choose another --patch or --factor"),
         ({"init": True}, r"has --dim 16 --heads 2 .* pass --dim 64 --heads 1 --mlp-ratio 4 \(and"),
-        ({"init": True, "preset": "dense"}, "--init is for the two-scale network, got --preset dense"),
         ({"init": True, "tokens": {**TOKENS, "dim": 18}}, r"token width 18 .*choose another --dim or --heads"),
     ],
 )
@@ -122,14 +119,6 @@ def test_networks_that_cannot_be_are_refused_before_the_first_look(
     monkeypatch.setattr(*opened, lambda *given, **named: pytest.fail("a scene was looked at"))
     with pytest.raises(SettingsError, match=words):
         train_weights(_begun(folder, out, **{**choices, **begun}))
-
-
-def test_positions_and_crops_follow_the_preset(folder: Path, out: Path):
-    """Flags that do not fit are refused; the paper's network reads whole scenes."""
-    with pytest.raises(SettingsError, match="--positions paper is not for --preset coarser"):
-        run_train(_request(folder, out, preset="coarser", positions="paper"), Console(quiet=True))
-    assert usual_crop("farm", "paper") == usual_crop("frames", "paper") == 1024
-    assert [usual_crop("farm", "dense"), usual_crop("frames", "two-scale")] == [256, 384]
 
 
 @pytest.mark.parametrize("ending", ["", ".part", ".checkpoint", ".checkpoint.part"])
@@ -150,11 +139,11 @@ def test_scenes_of_other_bands_are_not_mixed(folder: Path, out: Path):
     """One camera's scenes make one set of weights: the scene that differs is named."""
     request = _request(folder, out)
     data = flow.open_training_data(request.dataset, 0, None, request.camera)
-    first, second = data.scenes(data.train[:2])
-    common = train_scenes._common(request, first)
-    train_scenes._check_alike(second, common)
+    first, second = data.train[:2]
+    _, about = observe_all(request, data, (first,), "looking", lambda what, done, figure: None)
+    about.wavelength_nm = about.wavelength_nm + 10
     with pytest.raises(SceneError, match=r"scene 002.* has other bands"):
-        train_scenes._check_alike(replace(second, wavelength_nm=second.wavelength_nm + 10), common)
+        observe_all(request, data, (second,), "looking", lambda what, done, figure: None, about)
 
 
 @pytest.mark.parametrize(
@@ -166,49 +155,17 @@ def test_patches_follow_the_size_of_scenes(shape: tuple[int, int], built_in: boo
     assert suggested_patch(shape, built_in=built_in) == patch
 
 
-ROWS = {
-    "two-scale": {"none", "random", "sobel", "entropy", "gain", "all"},
-    "paper": {"none", "random", "sobel", "all"},
-    "dense": {"all"},
-    "upsampled": {"none"},
-    "coarser": {"all"},
-}
-
-
-@pytest.mark.parametrize("preset", PRESETS)
-def test_every_preset_trains_and_shows_the_rows_it_has(folder: Path, out: Path, preset: Preset):
-    """The file holds the network that was asked for; its figures are those that it can give."""
-    shown = io.StringIO()
-    figures = run_train(_request(folder, out, validation=1, preset=preset), Console(file=shown, width=100))[
-        "validation"
-    ]
-    assert load_any_weights(out).config.preset == preset
-    assert set(figures) - {"scenes", "share_of_seats"} == ROWS[preset]
-    for name in ROWS[preset]:
+@pytest.mark.parametrize("positions", ["2d", "paper"])
+def test_training_shows_the_figures_of_validation(folder: Path, out: Path, positions: str):
+    """The file holds the network that was asked for; the table has a row for each placement."""
+    shown, rows = io.StringIO(), {"none", "random", "sobel", "entropy", "gain", "all"}
+    request = _request(folder, out, validation=1, positions=positions)
+    figures = run_train(request, Console(file=shown, width=100))["validation"]
+    assert load_weights(out).config.positions == positions
+    assert set(figures) - {"scenes", "share_of_seats"} == rows
+    for name in rows:
         assert all(0 <= figures[name][figure] <= 1 for figure in ("miou", "overall_accuracy"))
         assert name in shown.getvalue()
-
-
-def test_without_validation_scenes_a_control_is_not_judged(folder: Path, out: Path):
-    """Nothing stands in the record where no scene was kept, and the last line says so."""
-    shown = io.StringIO()
-    request = _request(folder, out, validation=0, preset="dense")
-    assert run_train(request, Console(file=shown, width=100))["validation"] is None
-    assert "this control network is not judged" in shown.getvalue()
-
-
-def test_a_survey_with_a_control_is_refused(folder: Path, out: Path):
-    """Before the scene is opened: weights of a control make no survey."""
-    train_weights(_request(folder, out, validation=0, preset="paper"))
-    flags = {
-        "scene": str(folder / "images" / "001_image.png"),
-        "source": "sim",
-        "weights": str(out),
-        "out": str(out.parent / "a"),
-    }
-    for planning in (False, True):
-        with pytest.raises(WeightsError, match=r"holds the control 'paper'.*a survey needs weights of two scales"):
-            open_run(load_settings(None, flags), planning=planning)
 
 
 def test_a_survey_says_that_a_scene_was_trained_on(folder: Path, out: Path) -> None:
@@ -339,7 +296,7 @@ def test_masks_of_what_was_seen_add_up(earlier: Path, monkeypatch: pytest.Monkey
 
 
 def test_weights_for_short_exposures_have_a_record_of_plain_scans(folder: Path, out: Path):
-    """mIoU by step and exposure from the darkest up, and beside it what maps expect; else, and of a control, none."""
+    """mIoU by step and exposure from the darkest up, and beside it what maps expect; else none."""
     settings = replace(SETTINGS, darkest_ms=6.0)
     record = train_weights(_request(folder, out, validation=2, settings=settings))
     scans = describe_weights(out).record["scans"]
@@ -355,8 +312,6 @@ def test_weights_for_short_exposures_have_a_record_of_plain_scans(folder: Path, 
     np.testing.assert_allclose(_map_scores(out).bias, scores.bias, atol=0.05)
     assert "scans" not in train_weights(_request(folder, out, validation=2))
     assert "scans" not in train_weights(_request(folder, out, validation=0, settings=settings))
-    dense = _request(folder, out, validation=2, settings=settings, preset="dense")
-    assert "scans" not in train_weights(dense)
 
 
 def test_the_record_of_plain_scans_ends_with_the_darkest_that_was_trained(folder: Path, out: Path):
@@ -367,15 +322,11 @@ def test_the_record_of_plain_scans_ends_with_the_darkest_that_was_trained(folder
     assert np.shape(scans["miou"]) == (2, 5)
 
 
-@pytest.mark.parametrize(
-    ("darkest_ms", "preset", "said"), [(3.0, "two-scale", True), (100.0, "two-scale", False), (3.0, "dense", False)]
-)
-def test_weights_that_will_choose_no_scan_say_so(
-    folder: Path, out: Path, darkest_ms: float, preset: Preset, said: bool
-):
+@pytest.mark.parametrize(("darkest_ms", "said"), [(3.0, True), (100.0, False)])
+def test_weights_that_will_choose_no_scan_say_so(folder: Path, out: Path, darkest_ms: float, said: bool):
     """Short exposures without scenes to judge scans on: told as training ends, not first by a survey."""
     shown, settings = io.StringIO(), replace(SETTINGS, darkest_ms=darkest_ms)
-    request = _request(folder, out, validation=0, settings=settings, preset=preset)
+    request = _request(folder, out, validation=0, settings=settings)
     run_train(request, Console(file=shown, width=100))
     assert ("nor has the file a record of plain scans" in shown.getvalue()) == said
 
@@ -385,7 +336,7 @@ def test_whitening_knows_the_noise_of_short_exposures(folder: Path, out: Path):
     sizes = []
     for darkest_ms in (100.0, 3.0):
         train_weights(_request(folder, out, validation=0, settings=replace(SETTINGS, darkest_ms=darkest_ms)))
-        sizes.append(np.linalg.norm(load_any_weights(out).normalisation.whitening, 2))
+        sizes.append(np.linalg.norm(load_weights(out).normalisation.whitening, 2))
     assert sizes[1] < sizes[0]
 
 

@@ -146,16 +146,6 @@ def test_maps_of_any_integer_type_are_counted(kind: type):
     assert confusion(labels, np.array([254, 200, 3, 200], np.uint8), 255)[254].sum() == 2
 
 
-@pytest.mark.parametrize(
-    ("labels", "drawn", "words"),
-    [([0, 3], [0, 0], "label 3 is none of the 3"), ([0, 1], [0, 7], "prediction 7"), ([-1, 0], [0, 0], "label -1")],
-)
-def test_classes_that_are_none_are_refused(labels: list[int], drawn: list[int], words: str):
-    """The message names the number and how many classes there are."""
-    with pytest.raises(ShapeError, match=words):
-        confusion(np.array(labels), np.array(drawn), 3)
-
-
 def test_a_map_of_another_size_is_refused():
     """The message names both sizes."""
     with pytest.raises(ShapeError, match=r"labels are \(2, 3\), the class map is \(3, 2\)"):

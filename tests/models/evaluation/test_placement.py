@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from models.evaluation.metrics import agreement, confusion, mean_iou
+from models.evaluation.metrics import agreement, mean_iou
 from models.evaluation.placement import RANDOM_DRAWS, Controls, captured_gain, gain_sums, oracle_gain, run_controls
 from models.reading.inference import Glance, glance_of_columns, segment
 from models.weights.files import Weights
@@ -91,15 +91,6 @@ def test_the_ends_do_not_depend_on_the_share(tiny: Maker):
     for row in [*every.policies.values(), *every.random]:
         assert np.abs(row - every.every).sum() <= 2  # a tie may fall either way
     assert (none.every == every.every).all()
-
-
-def test_rows_are_those_of_the_survey(tiny: Maker):
-    """No seat and every seat are the maps that a survey draws with them."""
-    weights = tiny()
-    seen, fine, labels = _scene(weights)
-    seats = seen.grid.valid_seats()
-    drawn = segment(weights, seen, fine[seats], seats)
-    assert (_run(weights).every == confusion(labels, drawn.classes, 3)).all()
 
 
 def test_random_rows_follow_the_seed(tiny: Maker):

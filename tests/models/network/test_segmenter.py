@@ -60,16 +60,6 @@ def test_tokens_are_counted_as_in_the_paper(tiny: Maker, positions: str, seats: 
 
 
 @torch.inference_mode()
-def test_fine_patches_change_nothing_of_the_glance(tiny: Maker):
-    """What the coarse pass says stands, bit by bit, however many places are looked at again."""
-    model = tiny().segmenter
-    coarse, fine, _ = scene_tensors(model.config)
-    alone, _ = model(coarse, fine[:, :0], torch.zeros(1, 0, dtype=torch.int64))
-    joint, _ = model(coarse, fine[:, :5], torch.arange(5)[None])
-    assert (alone == joint).all()
-
-
-@torch.inference_mode()
 def test_fine_patches_read_the_glance_and_each_other(tiny: Maker):
     """A patch is read otherwise beside another patch, and above another coarse pass."""
     model = tiny().segmenter

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-import torch.nn.functional as F  # noqa: N812 - its usual name
 
 from models.reading.inference import Glance, glance, look_coarsely, read_glance, segment
 from models.weights.files import Weights
@@ -27,11 +26,6 @@ def _look(weights: Weights, height: int, width: int, seed: int = 0) -> tuple[Gla
     return seen, rng.normal(0, 1, (count, p, p, columns)).astype(np.float32)
 
 
-def _blank(weights: Weights) -> np.ndarray:
-    p = weights.config.patch
-    return np.empty((0, p, p, weights.config.columns), np.float32)
-
-
 @pytest.mark.parametrize("size", [(37, 53), (1, 1), (16, 16), (17, 1), (1, 40), (48, 15)])
 @pytest.mark.parametrize("factor", [1, 2, 4])
 def test_maps_have_the_size_of_the_scene(tiny: Maker, size: tuple[int, int], factor: int):
@@ -46,21 +40,6 @@ def test_maps_have_the_size_of_the_scene(tiny: Maker, size: tuple[int, int], fac
         assert 1 / 3 - 1e-6 <= drawn.confidence.min() <= drawn.confidence.max() <= 1
 
 
-def test_without_a_seat_the_map_is_the_glance_brought_up(tiny: Maker):
-    """Strips of rows join without a seam: the map is that of the whole image brought up at once."""
-    weights = tiny(factor=4)
-    seen, _ = _look(weights, 90, 70)
-    drawn = segment(weights, seen, _blank(weights), NONE)
-    model = weights.segmenter
-    with torch.inference_mode():
-        coarse = torch.from_numpy(seen.columns).permute(2, 0, 1)[None]
-        logits, _ = model(coarse, torch.zeros(1, 0, 4, 8, 8), torch.zeros(1, 0, dtype=torch.int64))
-        whole = F.interpolate(logits, scale_factor=4, mode="bilinear", align_corners=False)[0].softmax(dim=0)
-    confidence, classes = (array.numpy()[:90, :70] for array in whole.max(dim=0))
-    assert np.abs(drawn.confidence - confidence).max() <= 1e-6
-    assert (drawn.classes == classes).mean() > 0.999  # a tie may fall either way
-
-
 def test_patches_lie_at_their_seats(tiny: Maker):
     """Exchanging the patches of two seats changes the map in both, and a seat's map follows its patch's pixels."""
     weights = tiny(classes=6)
@@ -69,17 +48,6 @@ def test_patches_lie_at_their_seats(tiny: Maker):
     moved = segment(weights, seen, fine[:2], np.array([12, 3]))
     changed = np.abs(drawn.confidence - moved.confidence).reshape(4, 8, 4, 8).max(axis=(1, 3))
     assert sorted(np.argsort(changed, axis=None)[-2:].tolist()) == [3, 12]
-
-
-def test_other_bands_than_those_of_training_are_read(tiny: Maker):
-    """Bands in any number and order go in; twice as many of the same light give nearly the same glance."""
-    weights, grid = tiny(), SceneGrid(16, 16, 8, 2)
-    place = np.linspace(0, 3, 64).reshape(8, 8, 1)
-    few, many = (
-        glance(weights, 0.3 + 0.1 * np.sin(nm / 150 + place), nm, grid).probability
-        for nm in (np.linspace(1000, 400, 60), np.linspace(400, 1000, 240))
-    )
-    assert np.abs(few - many).max() < 0.01
 
 
 @pytest.mark.parametrize("bands", [NM, NM[:3]])

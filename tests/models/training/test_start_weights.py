@@ -123,7 +123,7 @@ def test_blocks_compute_here_what_they_compute_there(tmp_path: Path):
     mixed = ((q @ k.transpose(-2, -1)) * (DIM // HEADS) ** -0.5).softmax(dim=-1) @ v
     read = mixed.transpose(1, 2).reshape(1, 7, DIM) @ state["blocks.0.attn.proj.weight"].T
     with torch.inference_mode():
-        found = block.attention(norm[0], None, None)[0]
+        found = block.attention(norm[0], None)[0]
     torch.testing.assert_close(found, read + state["blocks.0.attn.proj.bias"], rtol=1e-3, atol=1e-3)
 
 

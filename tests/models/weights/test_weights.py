@@ -13,19 +13,10 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from models.network.sizes import PRESETS, Preset
-from models.weights.files import (
-    FORMAT,
-    Weights,
-    check_two_scale,
-    describe_weights,
-    load_any_weights,
-    load_weights,
-    save_weights,
-)
+from models.weights.files import FORMAT, describe_weights, load_weights, save_weights
 from models.weights.sealed_files import SEAL, TENSORS, _seal, hash_of
 from pipeline.errors import WeightsError
-from tests.models.conftest import Maker, make_any_weights
+from tests.models.conftest import Maker
 
 
 def _about(path: Path) -> dict[str, Any]:
@@ -50,13 +41,10 @@ def saved(tiny: Maker, tmp_path: Path) -> Path:
     return tmp_path / "w.safetensors"
 
 
-@pytest.mark.parametrize("preset", PRESETS)
-def test_everything_comes_back_bit_by_bit(tmp_path: Path, preset: Preset):
-    """Parameters, basis, normalisation, classes, colours and record of any design are those that were saved."""
-    path, before = tmp_path / "w.safetensors", make_any_weights(**PRESETS[preset])
-    save_weights(before, path)
-    after, described = load_any_weights(path), describe_weights(path)
-    old, new = before.network.state_dict(), after.network.state_dict()
+def test_everything_comes_back_bit_by_bit(tiny: Maker, saved: Path):
+    """Parameters, basis, normalisation, classes, colours and record are those that were saved."""
+    before, after, described = tiny(), load_weights(saved), describe_weights(saved)
+    old, new = before.segmenter.state_dict(), after.segmenter.state_dict()
     assert list(old) == list(new)
     assert all(torch.equal(old[name], new[name]) for name in old)
     for one in (after, described):
@@ -65,7 +53,7 @@ def test_everything_comes_back_bit_by_bit(tmp_path: Path, preset: Preset):
     for name in ("centre", "spread", "whitening"):
         assert (getattr(after.normalisation, name) == getattr(before.normalisation, name)).all()
     assert (after.class_colours == before.class_colours).all()
-    assert (isinstance(after, Weights), after.network.training) == (preset == "two-scale", False)
+    assert not after.segmenter.training
 
 
 def test_saving_twice_gives_equal_files(tiny: Maker, saved: Path, tmp_path: Path):
@@ -113,10 +101,11 @@ def test_another_format_is_named(saved: Path):
         ({"layers": 10_000_000}, "description is damaged.*layers of a segmenter must be at least 1 and at most 256"),
         ({"dim": 2**40}, "description is damaged.*dim of a segmenter must be at least 1 and at most 16384"),
         ({"dim": 16384, "layers": 256}, r"tensor scale_code should be \(2, 16384\), the file has \(2, 16\)"),
+        ({"positions": "3d"}, "description is damaged.*positions of a segmenter is one of 2d, paper, got '3d'"),
         ({"layers": 1.0}, "description is damaged.*layers of a segmenter must be a whole number, got 1.0"),
     ],
 )
-def test_sizes_that_do_not_fit_are_named(saved: Path, changes: dict[str, int], words: str):
+def test_sizes_that_do_not_fit_are_named(saved: Path, changes: dict[str, Any], words: str):
     """A configuration that cannot be built, or that its tensors do not fit, is refused by name."""
     about = _about(saved)
     _rewritten(saved, {**about, "config": {**about["config"], **changes}})
@@ -190,7 +179,7 @@ def test_numbers_that_are_not_finite_are_refused(tiny: Maker, tmp_path: Path, va
         weights.segmenter.fine_classes.bias[1] = value
     save_weights(weights, path)
     with pytest.raises(WeightsError, match=r"1 of 3 numbers of tensor fine_classes.bias are not finite; copy or train"):
-        load_any_weights(path)
+        load_weights(path)
 
 
 def test_a_spread_of_nothing_is_refused(tiny: Maker, tmp_path: Path):
@@ -220,14 +209,3 @@ def test_a_header_of_petabytes_is_refused_unread(saved: Path):
     saved.write_bytes(len(text).to_bytes(8, "little") + text + bytes(64))
     with pytest.raises(WeightsError, match="not a readable safetensors file"):
         load_weights(saved)
-
-
-@pytest.mark.parametrize("preset", [preset for preset in PRESETS if preset != "two-scale"])
-def test_a_survey_refuses_a_control(preset: Preset, tmp_path: Path):
-    """The message names the file, the control in it, and how weights for a survey are made."""
-    path = tmp_path / "w.safetensors"
-    save_weights(make_any_weights(**PRESETS[preset]), path)
-    with pytest.raises(WeightsError, match=f"w.safetensors holds the control '{preset}'.*spectralzoom train DATASET"):
-        load_weights(path)
-    with pytest.raises(WeightsError, match="a survey needs weights of two scales"):
-        check_two_scale(describe_weights(path).config, path)
