@@ -7,6 +7,7 @@ import os
 import re
 import signal
 import tempfile
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -61,7 +62,8 @@ removed.update(
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 UNITS_S = {"s": 1, "m": 60, "h": 3600, "d": 86400}
 LEAST, MOST = timedelta(minutes=1), timedelta(days=366)
-STOPPED_AGAIN_S = 15.0  # after which a runner that was asked to stop is asked again; pausing takes less than one
+STOPPED_AGAIN_S = 15.0  # after which a runner that was asked to stop is asked again
+PAUSE_TRIES = 5
 AGAIN_S = 2.0  # between two tries to reach a server that has gone
 
 
@@ -257,31 +259,54 @@ def _serve(fields: Sequence[ServedField], schedule: Any, limit: int) -> None:
     outs = dict.fromkeys(str(one.settings.out) for one in fields)
     again = [reprocess_flow.deployment(out, number) for number, out in enumerate(outs, 1)]
     _prepare([one.name for one in fields])
-    while True:
-        try:
-            asyncio.run(_run([*surveys, *again], limit))
-        except asyncio.CancelledError:
-            raise KeyboardInterrupt from None
-        except Exception as error:  # Prefect's runner gives up after three tries
-            _say(f"Prefect's server does not answer ({type(error).__name__}); serving goes on when it does")
-            _wait_for_server()
+    asked_to_stop = threading.Event()
+    try:
+        while not asked_to_stop.is_set():
+            try:
+                asyncio.run(_run([*surveys, *again], limit, asked_to_stop))
+            except asyncio.CancelledError:
+                break
+            except Exception as error:  # Prefect's runner gives up after three tries, also while it stops
+                if not asked_to_stop.is_set():
+                    _say(f"Prefect's server does not answer ({type(error).__name__}); serving goes on when it does")
+                    with terminable():  # the loop that ended took its handler of SIGTERM along
+                        _wait_for_server()
+        raise KeyboardInterrupt
+    finally:
+        _pause([one.name for one in fields])
 
 
-async def _run(deployments: Sequence[Any], limit: int) -> None:
+async def _run(deployments: Sequence[Any], limit: int, asked_to_stop: threading.Event) -> None:
     """Have Prefect's runner begin what is due, until it is interrupted."""
-    runner = prefect_runner.Runner(pause_on_shutdown=True, limit=limit)
+    runner = prefect_runner.Runner(pause_on_shutdown=False, limit=limit)
     for one in deployments:
         await runner.aadd_deployment(one)
     running = asyncio.ensure_future(runner.start())
-    await asyncio.sleep(0)  # here it takes SIGTERM for itself, and would end without having paused the schedules
+    await asyncio.sleep(0)  # here the runner takes SIGTERM for itself
     loop = asyncio.get_running_loop()
 
     def stop() -> None:
+        asked_to_stop.set()
         running.cancel()
         loop.call_later(STOPPED_AGAIN_S, stop)  # the runner's observer of cancelled runs may swallow the first one
 
     loop.add_signal_handler(signal.SIGTERM, stop)  # SIGINT may be ignored here
     await running
+
+
+def _pause(fields: Sequence[str]) -> None:
+    """Pause the schedules of the fields; where the server does not answer, say so after some tries."""
+    for left in reversed(range(PAUSE_TRIES)):
+        try:
+            with prefect_client.get_client(sync_client=True) as client:
+                for name in fields:
+                    client.pause_deployment(client.read_deployment_by_name(f"survey/{name}").id)
+            return
+        except Exception as error:
+            if left == 0:
+                _say(f"the schedules could not be paused ({type(error).__name__}); runs that are due start late")
+            else:
+                time.sleep(AGAIN_S)
 
 
 def _prepare(fields: Sequence[str]) -> None:
