@@ -56,6 +56,7 @@ DISTRIBUTIONS = {
     "skimage": "scikit-image",
     "odc": "odc-geo",
     "cv2": "opencv-contrib-python-headless",
+    "mpl_toolkits": "matplotlib",
 }
 FILE_MODULES = {"pathlib", "shutil", "tempfile", "glob", "io", "fileinput"}
 READS = {"open", "read_text", "read_bytes", "getenv", "load_dotenv", "read_csv", "loadtxt", "load_file"}

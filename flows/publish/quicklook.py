@@ -232,7 +232,9 @@ def _frame(axes: Axes, shape: tuple[int, ...]) -> None:
 def _caption(axes: Axes, title: str, words: str) -> None:
     """Write a bold title over a line of words."""
     axes.set_title(f"{title}\n")
-    axes.annotate(words, (0, 1), (0, 7), xycoords="axes fraction", textcoords="offset points", color=MUTED, size=12)
+    placed: Any = {"xycoords": "axes fraction", "textcoords": "offset points"}
+    line = axes.annotate(words, (0, 1), (0, 7), color=MUTED, size=12, **placed)
+    line.set_in_layout(False)  # the title leaves room above; words wider than a narrow panel take none from it
 
 
 def _heat_key(image: AxesImage, ends: tuple[str, str]) -> None:

@@ -155,6 +155,14 @@ def test_palette_colours_are_all_different(count):
     np.testing.assert_array_equal(class_palette(1, given), [[0, 1, 0]])
 
 
+@pytest.mark.parametrize("shape", [(8, 40), (1, 1), (300, 2), (2, 300), (40, 23), (100, 51), (33, 96)])
+@pytest.mark.parametrize("policy", ["gain", None])
+def test_fields_of_any_shape_are_drawn(tmp_path: Path, shape: tuple[int, int], policy: str | None):
+    """Panels keep a size, however narrow, whatever stands above them (a warning is an error)."""
+    quicklook.draw_quicklook(tmp_path / "a.png", replace(make_data(*shape), policy=policy))
+    assert (tmp_path / "a.png").stat().st_size > 0
+
+
 @pytest.mark.parametrize(("width", "length"), [(1, 1), (7, 1), (39, 5), (640, 100), (1280, 200), (2400, 500)])
 def test_scale_bar_is_a_round_number_of_at_most_a_quarter(width, length):
     """The largest of 1, 2, 5 times a power of ten, one pixel at least."""
