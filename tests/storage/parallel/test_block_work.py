@@ -83,10 +83,10 @@ def test_processes_give_results_in_order(processes: Crew) -> None:
 
 def test_workers_are_kept_and_have_one_thread(processes: Crew) -> None:
     """While a crew is open the same processes work for every call, none of them this one, one thread each."""
-    first, second = ({*run_blocks(threads_here, range(8), processes)} for _ in range(2))
-    assert first | second == first
-    assert {threads for _, threads in first} == {"1"}
-    assert os.getpid() not in {process for process, _ in first}
+    seen = {one for _ in range(4) for one in run_blocks(threads_here, range(8), processes)}
+    assert len({process for process, _ in seen}) <= processes.count  # one may do all blocks of a call
+    assert {threads for _, threads in seen} == {"1"}
+    assert os.getpid() not in {process for process, _ in seen}
 
 
 @pytest.mark.parametrize("workers", [2, 5])
