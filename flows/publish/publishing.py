@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from flows.publish.receipt import Receipt, is_pending
 from flows.publish.receipt_table import cost_rows, finding_rows, headline
 from flows.publish.report import render_markdown
-from flows.publish.run_folder import Published, asked_settings, extend_with_accuracy, load_receipt, publish_run
+from flows.publish.run_folder import Published, asked_settings, extend_with_accuracy, publish_run
 from flows.settings.survey_settings import OF_THE_MACHINE
 from flows.tasks.observer import artifact_key
 from flows.tasks.open_survey import JUDGED, STAGES, OpenSurvey, RunRef
@@ -52,7 +52,7 @@ def _publish(plan: OpenSurvey, *products: StageRef) -> RunRef:
     if stopped is not None:
         plan.observer.note(f"published before: {stopped.folder}; its accuracy is added to it")
         return stopped
-    judged = _has_labels(plan)
+    judged = plan.run.scene.labelled and plan.run.settings.accuracy
     if judged and _accuracy_is_stored(plan):
         plan(evaluate.name, *plan.products.there(*JUDGED))
         judged = False
@@ -74,10 +74,6 @@ def _add_accuracy(plan: OpenSurvey, run: RunRef, accuracy: StageRef) -> RunRef:
 
 def _ref(published: Published, *, pending: bool = False) -> RunRef:
     return RunRef(f"runs/{published.folder.name}", published.folder, published.captured_again, pending)
-
-
-def _has_labels(plan: OpenSurvey) -> bool:
-    return plan.run.scene.labelled and plan.run.settings.accuracy
 
 
 def _accuracy_is_stored(plan: OpenSurvey) -> bool:
@@ -169,8 +165,3 @@ def small_jpeg(png: bytes) -> bytes:
         if len(file.getvalue()) * 4 / 3 <= MOST_BYTES - 4:
             break
     return file.getvalue()
-
-
-def published_run(run: RunRef) -> Published:
-    """Return a published run with its receipt (IncompleteStoreError: it is not as it was published)."""
-    return Published(load_receipt(run.folder), run.folder, run.captured_again)

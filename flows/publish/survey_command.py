@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.markup import escape
 
-from flows.publish.publishing import published_run
 from flows.publish.receipt_table import headline, print_table
-from flows.publish.run_folder import Published
+from flows.publish.run_folder import Published, load_receipt
 from flows.settings.parameters import SurveySettings
 from flows.settings.survey_settings import Settings
 from flows.tasks.captures import opened_first
@@ -54,7 +53,7 @@ def run_survey(settings: Settings, console: Console) -> Published:
 
         with observed_by(Observer(progress.watch, note, progress.say)), opened_first(settings):
             run = _survey(settings, console)
-    published = published_run(run)
+    published = Published(load_receipt(run.folder), run.folder, run.captured_again)
     show_published(published, settings.out, console)
     return published
 

@@ -268,7 +268,9 @@ def _serve(fields: Sequence[ServedField], schedule: Any, limit: int) -> None:
                 break
             except Exception as error:  # Prefect's runner gives up after three tries, also while it stops
                 if not asked_to_stop.is_set():
-                    _say(f"Prefect's server does not answer ({type(error).__name__}); serving goes on when it does")
+                    _say(
+                        f"Prefect's server does not answer ({type(error).__name__}); serving continues when it answers"
+                    )
                     with terminable():  # the loop that ended took its handler of SIGTERM along
                         _wait_for_server()
         raise KeyboardInterrupt

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import signal
+import threading
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -125,3 +127,26 @@ def test_an_interval_counts_from_1970(tmp_path: Path) -> None:
     schedule = schedule_of(None, "90m", None)
     assert schedule.interval == timedelta(minutes=90)
     assert schedule.anchor_date == datetime(1970, 1, 1, tzinfo=UTC)
+
+
+@pytest.mark.parametrize("ending", [asyncio.CancelledError, ConnectionError])
+def test_a_serve_that_is_asked_to_stop_ends_whatever_its_runner_fails_with(
+    monkeypatch: pytest.MonkeyPatch, ending: type[BaseException]
+) -> None:
+    """A runner that fails before that is begun again when the server answers; the schedules are paused at last."""
+    happened: list[str] = []
+
+    async def run(deployments: Sequence[Any], limit: int, asked_to_stop: threading.Event) -> None:
+        happened.append("run")
+        if len(happened) == 1:
+            raise ConnectionError
+        asked_to_stop.set()
+        raise ending
+
+    monkeypatch.setattr(serve_command, "_prepare", lambda fields: None)
+    monkeypatch.setattr(serve_command, "_run", run)
+    monkeypatch.setattr(serve_command, "_wait_for_server", lambda: happened.append("waited"))
+    monkeypatch.setattr(serve_command, "_pause", lambda fields: happened.append("paused"))
+    with pytest.raises(KeyboardInterrupt):
+        serve_command._serve([], None, 1)
+    assert happened == ["run", "waited", "run", "paused"]
